@@ -1,0 +1,21 @@
+"""pathjax: a differentiable Monte Carlo path tracer in pure JAX."""
+
+from pathjax import runtime  # first: sets XLA up before a backend starts
+from pathjax.errors import InputError
+from pathjax.render import render
+from pathjax.scene import Scene, parameters, with_parameters
+
+__version__ = "0.1.0"
+__all__ = ["InputError", "Scene", "__version__", "parameters", "render", "runtime", "with_parameters"]
+
+
+def load_scene(file, **parameters) -> Scene:
+    """Load a Mitsuba 3 XML scene; keywords replace the file's `$parameters`.
+
+    Raises:
+        InputError: names the file, the line, what is wrong and what to do.
+    """
+    from pathjax import scene
+    from pathjax.io import mitsuba_xml
+
+    return scene.build(mitsuba_xml.load(file, **parameters))

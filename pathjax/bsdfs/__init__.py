@@ -1,0 +1,81 @@
+"""How surfaces scatter: a file a kind, and the dispatch over the kinds that a scene holds.
+
+A material has a front and a back, each a bsdf or nothing (which absorbs). A bsdf is a kind and a row in the table of
+that kind. Reflectors see `wi` in a frame turned towards it; a dielectric keeps the frame, whose normal tells inside
+from outside.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from pathjax.bsdfs import conductor, dielectric, diffuse
+from pathjax.bsdfs.conductor import ConductorTable
+from pathjax.bsdfs.dielectric import DielectricTable
+from pathjax.bsdfs.diffuse import DiffuseTable
+from pathjax.core.math import at
+from pathjax.core.types import BSDFSample
+
+MODULES = {DiffuseTable: diffuse, DielectricTable: dielectric, ConductorTable: conductor}
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Materials:
+    tables: tuple  # one entry per kind of bsdf present
+    sides: jax.Array  # (S, 2, 2) int32 of each shape: front and back; kind (-1: absorbs), row
+
+
+def any_smooth(materials: Materials) -> bool:
+    """Whether some kind present has a density, so that light sampling makes sense."""
+    return any(MODULES[type(table)].SMOOTH for table in materials.tables)
+
+
+def select(materials: Materials, shape, front):
+    """Kind and row, () int32 each, of the side of a shape."""
+    kind, row = at(materials.sides, shape, jnp.where(front, 0, 1))
+    return kind, row
+
+
+def is_smooth(materials: Materials, kind):
+    """() bool: this bsdf has a density."""
+    flags = [MODULES[type(table)].SMOOTH for table in materials.tables]
+    if all(flags):
+        return kind >= 0
+    return at(jnp.array(flags), jnp.maximum(kind, 0)) & (kind >= 0)
+
+
+def is_two_sided_medium(materials: Materials, kind):
+    """() bool: this bsdf lies between two media and tells its sides apart; the others reflect in front of them."""
+    flags = [isinstance(table, DielectricTable) for table in materials.tables]
+    if not any(flags):
+        return jnp.bool_(False)
+    return at(jnp.array(flags), jnp.maximum(kind, 0))
+
+
+def evaluate(materials: Materials, kind, row, uv, wi, wo):
+    """f |cos theta_o| (3,) and pdf () of a smooth bsdf; 0 for the others."""
+    smooth = [(i, table) for i, table in enumerate(materials.tables) if MODULES[type(table)].SMOOTH]
+
+    def of(table):
+        return lambda: MODULES[type(table)].evaluate(table, row, uv, wi, wo)
+
+    if len(smooth) == 1:
+        return of(smooth[0][1])()
+    index = sum((kind >= i).astype(jnp.int32) for i, _ in smooth[1:])
+    return lax.switch(index, [of(table) for _, table in smooth])
+
+
+def sample(materials: Materials, kind, row, uv, wi, u) -> BSDFSample:
+    """Draw `wo` and its weight from the bsdf. u: (2,)."""
+
+    def of(table):
+        return lambda: MODULES[type(table)].sample(table, row, uv, wi, u)
+
+    if len(materials.tables) == 1:
+        return of(materials.tables[0])()
+    return lax.switch(jnp.maximum(kind, 0), [of(table) for table in materials.tables])

@@ -1,0 +1,55 @@
+"""Small pytrees that pass between the parts of the renderer. All of them describe one ray or one path.
+
+Integers are int32, reals are the scene's dtype (float32 unless the scene was built in float64).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+
+
+class Ray(NamedTuple):
+    o: jax.Array  # (3,) origin
+    d: jax.Array  # (3,) unit direction
+    t_max: jax.Array  # () hits beyond are not looked for
+    exclude: jax.Array  # () int32 primitive that the ray starts on; -1: none
+
+
+class Hit(NamedTuple):
+    t: jax.Array  # () distance; inf: a miss
+    primitive: jax.Array  # () int32, counted over all kinds of shape; -1: a miss
+    shape: jax.Array  # () int32, place of the shape in the scene file; -1: a miss
+
+
+class Frame(NamedTuple):
+    s: jax.Array  # (3,)
+    t: jax.Array  # (3,)
+    n: jax.Array  # (3,) the normal; right-handed, orthonormal
+
+
+class Surface(NamedTuple):
+    """What a ray sees where it hits; Mitsuba's `si`."""
+
+    p: jax.Array  # (3,) the point
+    n: jax.Array  # (3,) unit geometric normal
+    margin: jax.Array  # () how far along n the rounding error of p may reach
+    shading_n: jax.Array  # (3,) unit shading normal
+    uv: jax.Array  # (2,)
+
+
+class BSDFSample(NamedTuple):
+    wo: jax.Array  # (3,) unit, local frame
+    weight: jax.Array  # (3,) f |cos theta_o| / pdf
+    pdf: jax.Array  # () 1/sr; of a Dirac lobe: its discrete probability
+    delta: jax.Array  # () bool, a Dirac lobe
+    eta: jax.Array  # () relative IOR along the path: 1 where reflected
+
+
+class EmitterSample(NamedTuple):
+    d: jax.Array  # (3,) unit, from the shaded point
+    distance: jax.Array  # () to the light; inf: a background
+    primitive: jax.Array  # () int32 primitive of the light, which does not shadow itself; -1: a background
+    Le: jax.Array  # (3,) radiance towards the shaded point, W m^-2 sr^-1
+    pdf: jax.Array  # () 1/sr, the choice of the light included; 0: no sample

@@ -1,0 +1,78 @@
+"""Uniform numbers to points and directions, each beside its density."""
+
+from __future__ import annotations
+
+import math
+
+import jax.numpy as jnp
+
+from pathjax.core.math import safe_sqrt
+
+
+def square_to_disk(u):
+    """Concentric map of [0, 1)^2 to the unit disk (Shirley and Chiu 1997): (2,) -> (2,), density 1/pi."""
+    x, y = 2 * u[0] - 1, 2 * u[1] - 1
+    flat = jnp.abs(x) > jnp.abs(y)
+    r = jnp.where(flat, x, y)
+    ratio = jnp.where(flat, y, x) / jnp.where(r == 0, 1, r)
+    # The angle is at most pi/4 off the longer axis, so both functions are called on a short interval only.
+    angle = ratio * (math.pi / 4)
+    c, s = r * jnp.cos(angle), r * jnp.sin(angle)
+    return jnp.stack([jnp.where(flat, c, s), jnp.where(flat, s, c)])
+
+
+def square_to_cosine_hemisphere(u):
+    """(2,) -> (3,) unit, z >= 0."""
+    p = square_to_disk(u)
+    return jnp.stack([p[0], p[1], safe_sqrt(1 - p[0] * p[0] - p[1] * p[1])])
+
+
+def square_to_cosine_hemisphere_pdf(w):
+    """1/sr."""
+    return jnp.maximum(w[2], 0) / math.pi
+
+
+def square_to_sphere(u):
+    """(2,) -> (3,) unit."""
+    z = 1 - 2 * u[1]
+    r = safe_sqrt(1 - z * z)
+    phi = (2 * math.pi) * u[0]
+    return jnp.stack([r * jnp.cos(phi), r * jnp.sin(phi), z])
+
+
+SPHERE_PDF = 1 / (4 * math.pi)
+
+
+def square_to_cone(u, one_minus_cos):
+    """Uniform directions around +z up to the angle whose 1 - cos is given: (2,) -> (3,) unit.
+
+    1 - cos instead of cos, so that a small distant light keeps its digits.
+    """
+    h = u[0] * one_minus_cos
+    r = safe_sqrt(h * (2 - h))
+    phi = (2 * math.pi) * u[1]
+    return jnp.stack([r * jnp.cos(phi), r * jnp.sin(phi), 1 - h])
+
+
+def cone_pdf(one_minus_cos):
+    """1/sr inside the cone."""
+    return 1 / ((2 * math.pi) * one_minus_cos)
+
+
+def square_to_triangle(u):
+    """Barycentric (b1, b2) of a uniform point (Heitz 2019, "A low-distortion map"): (2,) -> (2,), density 1/area."""
+    x, y = u[0], u[1]
+    above = y > x
+    b1 = jnp.where(above, x / 2, x - y / 2)
+    b2 = jnp.where(above, y - x / 2, y / 2)
+    return jnp.stack([b1, b2])
+
+
+def tent(u):
+    """[0, 1) -> [-1, 1], density 1 - |x|."""
+    low = u < 0.5
+    return jnp.where(low, safe_sqrt(2 * u) - 1, 1 - safe_sqrt(2 - 2 * u))
+
+
+def tent_pdf(x):
+    return jnp.maximum(1 - jnp.abs(x), 0)

@@ -1,0 +1,183 @@
+"""The path tracer: L = Le + T L, estimated along one path at a time (Kajiya 1986; Veach 1997, chapter 10)."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from pathjax import bsdfs, emitters
+from pathjax.core import sampler
+from pathjax.core.math import at, frame_from_normal, larger, smaller, spawn_ray, to_local, to_world
+from pathjax.core.types import Ray, Surface
+from pathjax.emitters import Choice
+from pathjax.shapes import geometry
+
+STRATEGIES = ("mis", "light", "bsdf")
+# Bounces whose numbers come from Sobol' pairs; a path's first decisions carry most of its variance.
+SOBOL_BOUNCES = 3
+# Roulette never spares a path for certain, so that every path ends even between perfect mirrors.
+MAX_SURVIVAL = 0.95
+
+
+class Path(NamedTuple):
+    """What a path carries from one vertex to the next."""
+
+    ray: Ray  # from the last vertex to the next
+    L: jax.Array  # (3,) radiance gathered so far
+    throughput: jax.Array  # (3,) product of the weights so far
+    pdf: jax.Array  # () density [1/sr] of ray.d by bsdf sampling; inf from a camera or a Dirac lobe
+    eta: jax.Array  # () product of the relative IORs so far, which roulette takes out of the throughput
+    depth: jax.Array  # () int32 vertices so far
+    alive: jax.Array  # () bool
+
+
+class Bounce(NamedTuple):
+    """Random numbers of one vertex."""
+
+    light: jax.Array  # (2,)
+    bsdf: jax.Array  # (2,)
+    triangle: jax.Array  # () chooses within a mesh that emits
+    roulette: jax.Array  # ()
+
+
+def radiance(scene, choice: Choice | None, ray: Ray, numbers, strategy: str):
+    """Radiance that arrives along a camera ray.
+
+    Args:
+        scene: Scene.
+        choice: how lights are chosen, of `emitters.choice`.
+        ray: Ray.
+        numbers: depth -> Bounce.
+        strategy: "mis", or for experiments "light" (next-event estimation alone) or "bsdf" (without it).
+    Returns:
+        (3,), unbiased up to max_depth.
+    """
+    shapes, materials = scene.geometry, scene.materials
+    sample_lights = strategy != "bsdf" and choice is not None and bsdfs.any_smooth(materials)
+
+    def extend(path: Path) -> Path:
+        ray = path.ray
+        hit = geometry.closest_hit(shapes, ray)
+        found = hit.primitive >= 0
+
+        def at_surface():
+            surface = geometry.surface(shapes, ray, hit)
+            Le, pdf_light = emitters.hit(scene.emitters, shapes, choice, ray, hit, surface)
+            return surface, Le, pdf_light
+
+        def at_infinity():
+            return _nowhere(ray), *emitters.background(scene.emitters, choice, ray.d)
+
+        # ---- emission: bsdf sampling's share of the light that the ray ends on --------------------------------------
+        if shapes.tables:
+            surface, Le, pdf_light = lax.cond(found, at_surface, at_infinity)
+        else:
+            surface, Le, pdf_light = at_infinity()
+        if strategy == "mis":
+            share = mis_weight(path.pdf, pdf_light)
+        else:
+            share = jnp.where((strategy == "light") & sample_lights & jnp.isfinite(path.pdf) & (pdf_light > 0), 0, 1)
+        if scene.hide_emitters:
+            share = jnp.where(path.depth == 0, 0, share)
+        path = path._replace(L=path.L + path.throughput * Le * share, depth=path.depth + 1)
+
+        def scatter(path: Path) -> Path:
+            u = numbers(path.depth - 1)
+            frame = frame_from_normal(surface.shading_n)
+            wi = to_local(frame, -ray.d)
+            kind, row = bsdfs.select(materials, hit.shape, wi[2] > 0)
+            # Reflectors see either side as their front; glass tells its sides apart.
+            side = jnp.where(bsdfs.is_two_sided_medium(materials, kind) | (wi[2] > 0), 1, -1).astype(wi.dtype)
+            wi = wi.at[2].multiply(side)
+
+            # ---- light sample -------------------------------------------------------------------------------------
+            L = path.L
+            if sample_lights:
+
+                def direct():
+                    drawn = emitters.sample(scene.emitters, shapes, choice, surface.p, u.light, u.triangle)
+                    wo = to_local(frame, drawn.d).at[2].multiply(side)
+                    f, pdf_bsdf = bsdfs.evaluate(materials, kind, row, surface.uv, wi, wo)
+                    share = mis_weight(drawn.pdf, pdf_bsdf) if strategy == "mis" else 1
+                    possible = (drawn.pdf > 0) & (pdf_bsdf > 0)
+                    contribution = f * drawn.Le * (share / jnp.where(possible, drawn.pdf, 1))
+                    shadow_ray = spawn_ray(surface, drawn.d, hit.primitive)._replace(t_max=drawn.distance)
+                    visible = lax.cond(
+                        possible & jnp.any(contribution > 0),
+                        lambda: ~geometry.occluded(shapes, shadow_ray, drawn.primitive),
+                        lambda: jnp.bool_(False),
+                    )
+                    return jnp.where(visible, contribution, 0)
+
+                smooth = bsdfs.is_smooth(materials, kind)
+                L = L + path.throughput * lax.cond(smooth, direct, lambda: jnp.zeros_like(L))
+
+            # ---- bsdf sample --------------------------------------------------------------------------------------
+            drawn = bsdfs.sample(materials, kind, row, surface.uv, wi, u.bsdf)
+            d = to_world(frame, drawn.wo.at[2].multiply(side))
+            throughput = path.throughput * drawn.weight
+            eta = path.eta * drawn.eta
+
+            # ---- roulette -----------------------------------------------------------------------------------------
+            # Refraction scales radiance, not importance: without eta^2, paths inside glass would end too soon.
+            largest = larger(larger(throughput[0], throughput[1]), throughput[2])
+            survival = smaller(largest * eta * eta, jnp.full_like(largest, MAX_SURVIVAL))
+            survival = jnp.where(path.depth >= scene.rr_depth, survival, 1)
+            # A direction of density 0 (a random number of exactly 0 can give one) carries nothing.
+            alive = (kind >= 0) & (drawn.pdf > 0) & (largest > 0) & (u.roulette < survival)
+            throughput = throughput / jnp.where(survival > 0, survival, 1)
+            pdf = jnp.where(drawn.delta, jnp.inf, drawn.pdf)
+            return Path(spawn_ray(surface, d, hit.primitive), L, throughput, pdf, eta, path.depth, alive)
+
+        if not shapes.tables:
+            return path._replace(alive=jnp.bool_(False))
+        goes_on = found & (path.depth < scene.max_depth)
+        return lax.cond(goes_on, scatter, lambda path: path._replace(alive=jnp.bool_(False)), path)
+
+    one = jnp.ones_like(ray.t_max)
+    zero3 = jnp.zeros_like(ray.o)
+    start = Path(ray, zero3, zero3 + 1, one * jnp.inf, one, jnp.int32(0), scene.max_depth > 0)
+    return lax.while_loop(lambda path: path.alive, extend, start).L
+
+
+def mis_weight(pdf, other_pdf):
+    """Power heuristic for a sample of density `pdf` > 0 that the other technique finds with `other_pdf`."""
+    ratio = other_pdf / pdf
+    return 1 / (1 + ratio * ratio)
+
+
+def sample_numbers(scene, stream, sample):
+    """Random numbers of one path.
+
+    Args:
+        stream: () uint32 of `sampler.pixel_stream`; sample: () uint32 number of the sample.
+    Returns:
+        film (2,), lens (2,), and a function depth -> Bounce.
+    """
+    dtype = scene.camera.origin.dtype
+    pairs = sampler.sobol_pairs(stream, sample, 2 + 2 * SOBOL_BOUNCES).astype(dtype)
+    pairs = lax.optimization_barrier(pairs)
+
+    def numbers(depth):
+        hashed = sampler.hashed(stream, sample, depth * 8, 8).astype(dtype)
+
+        def early():
+            return at(pairs, 2 + 2 * depth), at(pairs, 3 + 2 * depth)
+
+        def late():
+            return hashed[0:2], hashed[2:4]
+
+        light, bsdf = lax.cond(depth < SOBOL_BOUNCES, early, late)
+        return Bounce(light, bsdf, hashed[4], hashed[5])
+
+    return pairs[0], pairs[1], numbers
+
+
+def _nowhere(ray: Ray) -> Surface:
+    zero = jnp.zeros_like(ray.t_max)
+    return Surface(ray.o, ray.d, zero, ray.d, jnp.zeros_like(ray.o[:2]))
+
+

@@ -1,0 +1,1 @@
+"""Files in and out: Mitsuba scene files, meshes, images. Plain NumPy; nothing here knows JAX."""

@@ -1,0 +1,118 @@
+"""The only module that touches XLA or devices: how a function of one ray becomes a native kernel over millions.
+
+XLA:CPU dispatches a kernel for every operation of a loop's body, every trip, unless the loop touches less than a
+threshold of bytes: then it compiles the whole nest into one LLVM function. Raising that threshold turns `lax.map` over
+single-ray code into a native loop, some twenty times faster than `vmap` over wavefronts. The option is read once,
+when the backend starts, so this module sets it on import.
+
+Side effect on other code in the process: a user's own JAX loop over large element-wise arrays is then compiled for
+one thread. `PATHJAX_NATIVE_LOOPS=0` in the environment opts out; pathjax still works, slowly.
+"""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections.abc import Callable
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.sharding import Mesh, PartitionSpec
+
+_OPTION = "xla_cpu_small_while_loop_byte_threshold"
+_FLAG = f"--xla_backend_extra_options={_OPTION}=1000000000000"
+_DEVICE_FLAG = "xla_force_host_platform_device_count"
+# Bytes of live values that one lane of a vmapped path keeps; sizes the chunks on an accelerator.
+_BYTES_PER_LANE = 4096
+_CHUNK_BYTES = 1 << 30
+
+
+def _set_up() -> None:
+    flags = os.environ.get("XLA_FLAGS", "")
+    native = os.environ.get("PATHJAX_NATIVE_LOOPS", "1") != "0"
+    wanted = native and _OPTION not in flags
+    if wanted:
+        os.environ["XLA_FLAGS"] = f"{flags} {_FLAG}".strip()
+    devices_chosen = _DEVICE_FLAG in flags or jax.config.jax_num_cpu_devices >= 0
+    try:
+        if not devices_chosen:
+            jax.config.update("jax_num_cpu_devices", len(os.sched_getaffinity(0)) if _has_affinity() else os.cpu_count())
+        elif wanted:
+            # The update refuses a started backend: the one public way to ask whether it has started.
+            chosen = jax.config.jax_num_cpu_devices
+            jax.config.update("jax_num_cpu_devices", chosen + 1)
+            jax.config.update("jax_num_cpu_devices", chosen)
+    except RuntimeError:
+        if wanted:
+            os.environ["XLA_FLAGS"] = flags
+            warnings.warn(
+                "JAX's backend was started before pathjax was imported, so renders will be about 20 times slower. "
+                "Import pathjax before the first JAX array or jax.devices(), or set in the environment "
+                f"XLA_FLAGS={_FLAG}",
+                stacklevel=3,
+            )
+
+
+def _has_affinity() -> bool:
+    return hasattr(os, "sched_getaffinity")  # Linux only
+
+
+_set_up()
+
+
+def native() -> bool:
+    """Whether loops over rays become native code here: on CPUs, unless the user opted out."""
+    return jax.default_backend() == "cpu" and _OPTION in os.environ.get("XLA_FLAGS", "")
+
+
+def native_map(f: Callable, xs, *shared, form: str | None = None):
+    """`f(x, *shared)` for every x of `xs`, on all local devices.
+
+    Args:
+        f: pure function of one item, with real control flow.
+        xs: pytree of arrays (N, ...).
+        shared: pytrees that every item sees whole.
+        form: "loop" (one native sequential loop a device), "vmap" (chunks of vectorised lanes), or None: what suits
+            the backend. Both give the same results up to rounding.
+    Returns:
+        pytree of arrays (N, ...); bitwise the same for every number of devices.
+    """
+    count = jax.tree.leaves(xs)[0].shape[0]
+    form = form or ("loop" if native() else "vmap")
+    devices = jax.local_devices()
+    each = -(-count // len(devices))
+    run = _loop if form == "loop" else partial(_vmap_chunks, chunk=_CHUNK_BYTES // _BYTES_PER_LANE)
+    if len(devices) == 1:
+        return run(f, xs, shared)
+
+    # Device i takes items i, i + D, i + 2 D, ...: each gets its share of the expensive part of an image.
+    def deal(x):
+        x = jnp.concatenate([x, jnp.broadcast_to(x[:1], (each * len(devices) - count, *x.shape[1:]))])
+        return x.reshape(each, len(devices), *x.shape[1:]).swapaxes(0, 1)
+
+    def gather(y):
+        return y.swapaxes(0, 1).reshape(each * len(devices), *y.shape[2:])[:count]
+
+    def on_one_device(xs, *shared):
+        return jax.tree.map(lambda y: y[None], run(f, jax.tree.map(lambda x: x[0], xs), shared))
+
+    spec = PartitionSpec("device")
+    mapped = jax.shard_map(
+        on_one_device,
+        mesh=Mesh(np.array(devices), ("device",)),
+        in_specs=(spec, *(PartitionSpec() for _ in shared)),
+        out_specs=spec,
+        check_vma=False,
+    )
+    return jax.tree.map(gather, mapped(jax.tree.map(deal, xs), *shared))
+
+
+def _loop(f, xs, shared):
+    return lax.map(lambda x: f(x, *shared), xs)
+
+
+def _vmap_chunks(f, xs, shared, chunk):
+    return lax.map(lambda x: f(x, *shared), xs, batch_size=min(chunk, jax.tree.leaves(xs)[0].shape[0]))

@@ -1,0 +1,426 @@
+"""The scene: a pytree whose structure says what occurs, so that only that is compiled; parameters by name."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from pathjax import camera as camera_module
+from pathjax import description as desc
+from pathjax import film as film_module
+from pathjax.bsdfs import ConductorTable, DielectricTable, DiffuseTable, Materials
+from pathjax.bsdfs.texture import WRAPS, Bitmaps, Textures
+from pathjax.camera import Camera
+from pathjax.emitters import Emitters
+from pathjax.emitters.area import AreaLights
+from pathjax.emitters.constant import Constant
+from pathjax.errors import InputError
+from pathjax.film import Film
+from pathjax.shapes import geometry as geometry_module
+from pathjax.shapes import planar, sphere, triangle
+from pathjax.shapes.bvh_build import Tree as BuiltTree
+from pathjax.shapes.geometry import Geometry
+from pathjax.shapes.planar import Planar
+from pathjax.shapes.sphere import Spheres
+from pathjax.shapes.triangle import Triangles
+
+# Depth that stands for "no limit": more bounces than any path survives roulette.
+UNBOUNDED = 1 << 30
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """Where a parameter lives: attributes and tuple places down to an array, and the entry in it."""
+
+    path: tuple[str | int, ...]
+    index: tuple[int, ...]
+    shape: tuple[int, ...]
+    bounds: tuple[float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class About:
+    """What people ask of a scene and kernels do not: names, the file, reports. Compared by identity."""
+
+    description: desc.Description
+    parameters: Mapping[str, Parameter]
+    trees: Mapping[str, BuiltTree]  # kind of shape -> its hierarchy, for reports
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Scene:
+    """Arrays of a scene. Scenes of the same structure and array shapes share one compiled kernel."""
+
+    camera: Camera
+    film: Film
+    geometry: Geometry
+    materials: Materials
+    emitters: Emitters
+    max_depth: jax.Array  # () int32 vertices of the longest path; 1: emission only
+    rr_depth: jax.Array  # () int32 vertices before roulette begins
+    hide_emitters: bool = field(metadata={"static": True})  # from the camera
+    about: About | None = field(metadata={"static": True})
+
+
+def build(description: desc.Description, dtype=jnp.float32, split_rule: str = "sah") -> Scene:
+    """Compile a description into tables grouped by kind.
+
+    Args:
+        dtype: of all reals; float64 needs `jax_enable_x64`.
+        split_rule: of the hierarchy: "sah", "equal" or "middle".
+    """
+    parameters: dict[str, Parameter] = {}
+    materials = _build_materials(description, dtype, parameters)
+    geometry, emitters, trees = _build_shapes(description, dtype, parameters, split_rule)
+    integrator = description.integrator
+    max_depth = UNBOUNDED if integrator.max_depth < 0 else integrator.max_depth
+    return Scene(
+        camera_module.build(description.camera, description.film, dtype),
+        film_module.build(description.film, dtype),
+        geometry,
+        materials,
+        emitters,
+        jnp.int32(max_depth),
+        jnp.int32(integrator.rr_depth),
+        integrator.hide_emitters,
+        About(description, parameters, trees),
+    )
+
+
+# ---- materials ----------------------------------------------------------------------------------------------------
+
+
+def _build_materials(description, dtype, parameters) -> Materials:
+    rows: dict[type, list] = {}  # kind of bsdf -> its bsdfs, in order of appearance
+
+    def place(bsdf):
+        same_kind = rows.setdefault(type(bsdf), [])
+        for row, other in enumerate(same_kind):
+            if other is bsdf:
+                return type(bsdf), row
+        same_kind.append(bsdf)
+        return type(bsdf), len(same_kind) - 1
+
+    sides = []
+    for shape in description.shapes:
+        match shape.bsdf:
+            case desc.Twosided(front=front, back=back):
+                sides.append((place(front), place(back)))
+            case desc.Dielectric() as glass:
+                sides.append((place(glass), place(glass)))
+            case reflector:
+                sides.append((place(reflector), None))
+
+    tables, kinds = [], {}
+    for kind, make in ((desc.Diffuse, _diffuse), (desc.Conductor, _conductor), (desc.Dielectric, _dielectric)):
+        if kind in rows:
+            kinds[kind] = len(tables)
+            path = ("materials", "tables", len(tables))
+            tables.append(make(rows[kind], dtype, parameters, path))
+    codes = [[(-1, 0) if side is None else (kinds[side[0]], side[1]) for side in pair] for pair in sides]
+    return Materials(tuple(tables), jnp.asarray(np.reshape(codes, (-1, 2, 2)), jnp.int32))
+
+
+def _diffuse(bsdfs, dtype, parameters, path) -> DiffuseTable:
+    reflectance = np.zeros((len(bsdfs), 3))
+    textures, texture_of = [], np.full(len(bsdfs), -1, np.int32)
+    for row, bsdf in enumerate(bsdfs):
+        if isinstance(bsdf.reflectance, desc.Bitmap | desc.Checkerboard):
+            known = [i for i, texture in enumerate(textures) if texture is bsdf.reflectance]
+            texture_of[row] = known[0] if known else len(textures)
+            if not known:
+                textures.append(bsdf.reflectance)
+        else:
+            reflectance[row] = bsdf.reflectance
+            parameters[f"{bsdf.name}.reflectance"] = Parameter((*path, "reflectance"), (row,), (3,), (0, 1))
+    if not textures:
+        return DiffuseTable(jnp.asarray(reflectance, dtype), None, None)
+    table = _textures(textures, dtype, parameters, (*path, "textures"))
+    return DiffuseTable(jnp.asarray(reflectance, dtype), jnp.asarray(texture_of), table)
+
+
+def _textures(textures, dtype, parameters, path) -> Textures:
+    to_uv = np.stack([texture.to_uv[:2] for texture in textures])
+    colors = np.zeros((len(textures), 2, 3))
+    images, first, size, nearest, wrap = [], [], [], [], []
+    for row, texture in enumerate(textures):
+        bitmap = isinstance(texture, desc.Bitmap)
+        first.append(sum(len(image) for image in images))
+        size.append(texture.texels.shape[:2] if bitmap else (0, 0))
+        nearest.append(bitmap and texture.interpolation == "nearest")
+        wrap.append(WRAPS.index(texture.wrap) if bitmap else 0)
+        if bitmap:
+            images.append(texture.texels.reshape(-1, 3))
+        else:
+            colors[row] = texture.color0, texture.color1
+            for place in (0, 1):
+                parameter = Parameter((*path, "colors"), (row, place), (3,), (0, 1))
+                parameters[f"{texture.name}.color{place}"] = parameter
+    bitmaps = None
+    if images:
+        bitmaps = Bitmaps(
+            jnp.asarray(np.concatenate(images), dtype),
+            jnp.asarray(first, jnp.int32),
+            jnp.asarray(size, jnp.int32),
+            jnp.asarray(nearest),
+            jnp.asarray(wrap, jnp.int32),
+        )
+    checkers = any(isinstance(texture, desc.Checkerboard) for texture in textures)
+    return Textures(jnp.asarray(to_uv, dtype), jnp.asarray(colors, dtype) if checkers else None, bitmaps)
+
+
+def _conductor(bsdfs, dtype, parameters, path) -> ConductorTable:
+    ideal = np.array([bsdf.eta is None for bsdf in bsdfs])
+    # Rows of ideal mirrors hold some metal's numbers, which nothing reads.
+    eta = np.stack([np.ones(3) if bsdf.eta is None else bsdf.eta for bsdf in bsdfs])
+    k = np.stack([np.ones(3) if bsdf.k is None else bsdf.k for bsdf in bsdfs])
+    for row, bsdf in enumerate(bsdfs):
+        specular = Parameter((*path, "specular_reflectance"), (row,), (3,), (0, 1))
+        parameters[f"{bsdf.name}.specular_reflectance"] = specular
+        if bsdf.eta is not None:
+            parameters[f"{bsdf.name}.eta"] = Parameter((*path, "eta"), (row,), (3,), (0, np.inf))
+            parameters[f"{bsdf.name}.k"] = Parameter((*path, "k"), (row,), (3,), (0, np.inf))
+    specular = jnp.asarray(np.stack([bsdf.specular_reflectance for bsdf in bsdfs]), dtype)
+    if ideal.all():
+        return ConductorTable(specular, None, None, None)
+    return ConductorTable(specular, jnp.asarray(eta, dtype), jnp.asarray(k, dtype), jnp.asarray(ideal))
+
+
+def _dielectric(bsdfs, dtype, parameters, path) -> DielectricTable:
+    for row, bsdf in enumerate(bsdfs):
+        for name in ("int_ior", "ext_ior"):
+            parameters[f"{bsdf.name}.{name}"] = Parameter((*path, name), (row,), (), (np.finfo(np.float32).tiny, np.inf))
+    int_ior, ext_ior = (np.array([getattr(bsdf, name) for bsdf in bsdfs]) for name in ("int_ior", "ext_ior"))
+    return DielectricTable(jnp.asarray(int_ior, dtype), jnp.asarray(ext_ior, dtype))
+
+
+# ---- shapes and lights --------------------------------------------------------------------------------------------
+
+# Faces of the cube [-1, 1]^3: centre, directions of u and v, normal; uv as Mitsuba's cube has it.
+_CUBE = np.array(
+    [
+        [[0, -1, 0], [0, 0, 1], [1, 0, 0], [0, -1, 0]],
+        [[0, 1, 0], [-1, 0, 0], [0, 0, -1], [0, 1, 0]],
+        [[1, 0, 0], [0, 1, 0], [0, 0, -1], [1, 0, 0]],
+        [[0, 0, 1], [0, 1, 0], [1, 0, 0], [0, 0, 1]],
+        [[-1, 0, 0], [0, 1, 0], [0, 0, 1], [-1, 0, 0]],
+        [[0, 0, -1], [0, -1, 0], [1, 0, 0], [0, 0, -1]],
+    ],
+    float,
+)
+_FLAT = np.array([[[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]], float)
+
+
+def _planar_frames(local, to_world, flip):
+    """(P, 4, 3) centre, u, v and unit normal in world space."""
+    linear = to_world[:3, :3]
+    points = local[:, :1] @ linear.T + to_world[:3, 3]
+    directions = local[:, 1:3] @ linear.T
+    normals = local[:, 3:] @ np.linalg.inv(linear)
+    normals = normals / np.linalg.norm(normals, axis=-1, keepdims=True) * (-1 if flip else 1)
+    return np.concatenate([points, directions, normals], 1)
+
+
+def _mesh_arrays(mesh: desc.Mesh, flip):
+    """Vertices, normals or None, uv or None, each (F, 3, ...) by triangle."""
+    faces = mesh.faces[:, ::-1] if flip else mesh.faces
+    normals = None if mesh.normals is None else mesh.normals[faces] * (-1 if flip else 1)
+    return mesh.vertices[faces], normals, None if mesh.uv is None else mesh.uv[faces]
+
+
+@dataclass
+class _Kind:
+    """Primitives of one kind while they are gathered: arrays by shape, and where they come from."""
+
+    parts: list = field(default_factory=list)
+    shape: list = field(default_factory=list)  # for each primitive, its shape
+    light: list = field(default_factory=list)  # for each primitive, its light or -1
+
+
+def _build_shapes(description, dtype, parameters, split_rule):
+    kinds = {name: _Kind() for name in ("sphere", "rectangle", "disk", "triangle")}
+    radiance, lights = [], []  # lights: emitter, area, kind, first row, count
+
+    for number, shape in enumerate(description.shapes):
+        match shape.geometry:
+            case desc.Sphere() as ball:
+                name, part = "sphere", [(ball, shape.flip_normals)]
+                areas = sphere.area(np.array([[*ball.center, ball.radius]]))
+            case desc.Rectangle(to_world=m) | desc.Cube(to_world=m):
+                local = _CUBE if isinstance(shape.geometry, desc.Cube) else _FLAT
+                name, part = "rectangle", _planar_frames(local, m, shape.flip_normals)
+                areas = planar.area(part, disk=False)
+            case desc.Disk(to_world=m):
+                name, part = "disk", _planar_frames(_FLAT, m, shape.flip_normals)
+                areas = planar.area(part, disk=True)
+            case desc.Mesh() as mesh:
+                name, part = "triangle", _mesh_arrays(mesh, shape.flip_normals)
+                areas = triangle.area(part[0])
+        kind, count = kinds[name], len(areas)
+        light = np.full(count, -1)
+        if shape.radiance is not None:
+            emitter = len(radiance)
+            radiance.append(shape.radiance)
+            index = ("emitters", "area", "radiance")
+            parameters[f"{shape.emitter_name}.radiance"] = Parameter(index, (emitter,), (3,), (0, np.inf))
+            first = len(kind.shape)
+            if name == "triangle":
+                light[:] = len(lights)
+                lights.append((emitter, areas.sum(), name, first, count, areas))
+            else:
+                light[:] = len(lights) + np.arange(count)
+                lights.extend((emitter, a, name, first + i, 1, None) for i, a in enumerate(areas))
+        kind.parts.append(part)
+        kind.shape.extend([number] * count)
+        kind.light.extend(light.tolist())
+
+    tables, trees, names = [], {}, []
+    for name, make in (("sphere", _spheres), ("rectangle", _planars), ("disk", _planars), ("triangle", _triangles)):
+        if kinds[name].shape:
+            table, trees[name] = make(kinds[name].parts, name, dtype, split_rule)
+            tables.append(table)
+            names.append(name)
+    geometry = Geometry(
+        tuple(tables),
+        jnp.asarray([s for name in names for s in kinds[name].shape], jnp.int32),
+        jnp.asarray([i for name in names for i in kinds[name].light], jnp.int32),
+    )
+    constant = None
+    if description.background is not None:
+        constant = Constant(jnp.asarray(description.background, dtype))
+        index = ("emitters", "constant", "radiance")
+        parameters[f"{description.background_name}.radiance"] = Parameter(index, (), (3,), (0, np.inf))
+    area = _area_lights(radiance, lights, names, dtype) if lights else None
+    return geometry, Emitters(area, constant), {k: tree for k, tree in trees.items() if tree is not None}
+
+
+def _area_lights(radiance, lights, names, dtype) -> AreaLights:
+    emitter, area, kind, first, count, areas = zip(*lights, strict=True)
+    cdf, cdf_first = None, None
+    if any(a is not None for a in areas):
+        sizes = [0 if a is None else len(a) for a in areas]
+        cdf_first = jnp.asarray(np.cumsum([0, *sizes[:-1]]), jnp.int32)
+        cdf = jnp.asarray(np.cumsum(np.concatenate([a for a in areas if a is not None])), dtype)
+    return AreaLights(
+        jnp.asarray(np.stack(radiance), dtype),
+        jnp.asarray(emitter, jnp.int32),
+        jnp.asarray(area, dtype),
+        jnp.asarray([sorted(set(kind), key=names.index).index(k) for k in kind], jnp.int32),
+        jnp.asarray(first, jnp.int32),
+        jnp.asarray(count, jnp.int32),
+        cdf,
+        cdf_first,
+        tuple(names.index(k) for k in sorted(set(kind), key=names.index)),
+    )
+
+
+def _spheres(parts, name, dtype, rule):
+    balls = np.array([[*ball.center, ball.radius] for part in parts for ball, _ in part])
+    linear = np.stack([ball.to_world[:3, :3] for part in parts for ball, _ in part])
+    rotation = linear / np.linalg.norm(linear, axis=1, keepdims=True)
+    sign = np.array([-1.0 if flip else 1.0 for part in parts for _, flip in part])
+    leaves, rows, tree, built = geometry_module.leaves_of(sphere.leaf_numbers(balls), *sphere.bounds(balls), dtype, rule)
+    to_local = np.swapaxes(rotation, 1, 2)
+    arrays = (jnp.asarray(x, dtype) for x in (balls, to_local, sign))
+    return Spheres(leaves, rows, tree, *arrays), built
+
+
+def _planars(parts, name, dtype, rule):
+    frames = np.concatenate(parts)
+    disk = name == "disk"
+    bounds = planar.bounds(frames, disk)
+    leaves, rows, tree, built = geometry_module.leaves_of(planar.leaf_numbers(frames), *bounds, dtype, rule)
+    return Planar(leaves, rows, tree, jnp.asarray(frames, dtype), disk), built
+
+
+def _triangles(parts, name, dtype, rule):
+    vertices = np.concatenate([part[0] for part in parts])
+
+    def optional(place, default):
+        if all(part[place] is None for part in parts):
+            return None
+        filled = [default(part[0]) if part[place] is None else part[place] for part in parts]
+        return jnp.asarray(np.concatenate(filled), dtype)
+
+    normals = optional(1, triangle.face_normals)
+    uv = optional(2, lambda v: np.broadcast_to(np.array([[0, 0], [1, 0], [0, 1]], float), (len(v), 3, 2)))
+    bounds = triangle.bounds(vertices)
+    leaves, rows, tree, built = geometry_module.leaves_of(triangle.leaf_numbers(vertices), *bounds, dtype, rule)
+    return Triangles(leaves, rows, tree, jnp.asarray(vertices, dtype), normals, uv), built
+
+
+# ---- parameters ---------------------------------------------------------------------------------------------------
+
+
+def parameters(scene: Scene) -> dict[str, jax.Array]:
+    """All parameters of the scene by name, `ID.field`."""
+    return {name: _get(scene, p.path)[p.index] for name, p in _about(scene).parameters.items()}
+
+
+def with_parameters(scene: Scene, values: Mapping) -> Scene:
+    """The scene with other values for some of its parameters; nothing is compiled again.
+
+    Args:
+        values: name -> value of the parameter's shape (a number stands for all channels). May be traced.
+    Raises:
+        InputError: unknown name, wrong shape, or a value outside the parameter's bounds.
+    """
+    about = _about(scene)
+    for name, value in values.items():
+        if name not in about.parameters:
+            near = difflib.get_close_matches(name, about.parameters, n=3, cutoff=0.3)
+            raise InputError(f"no parameter is named {name!r}; " + _offer(near, about.parameters))
+        parameter = about.parameters[name]
+        array = _get(scene, parameter.path)
+        value = _checked(name, value, parameter, array.dtype)
+        scene = _set(scene, parameter.path, array.at[parameter.index].set(value))
+    return scene
+
+
+def _offer(near, parameters):
+    if not parameters:
+        return "this scene has none"
+    return "did you mean " + " or ".join(near) + "?" if near else "the scene has " + ", ".join(parameters)
+
+
+def _checked(name, value, parameter: Parameter, dtype):
+    try:
+        value = jnp.asarray(value, dtype)
+        value = jnp.broadcast_to(value, parameter.shape)
+    except (TypeError, ValueError):
+        wanted = f"{parameter.shape[0]} numbers" if parameter.shape else "one number"
+        raise InputError(f"{name} takes {wanted}, not {value!r}") from None
+    if not isinstance(value, jax.core.Tracer):
+        low, high = parameter.bounds
+        if not bool(jnp.all((value >= low) & (value <= high))):
+            raise InputError(f"{name} = {np.asarray(value).tolist()} lies outside its bounds [{low:g}, {high:g}]")
+    return value
+
+
+def _about(scene: Scene) -> About:
+    if scene.about is None:
+        raise InputError("this scene was stripped of its names; take the one that load_scene returned")
+    return scene.about
+
+
+def _get(tree, path):
+    for step in path:
+        tree = tree[step] if isinstance(step, int) else getattr(tree, step)
+    return tree
+
+
+def _set(tree, path, value):
+    if not path:
+        return value
+    step, rest = path[0], path[1:]
+    if isinstance(step, int):
+        return (*tree[:step], _set(tree[step], rest, value), *tree[step + 1 :])
+    return replace(tree, **{step: _set(getattr(tree, step), rest, value)})
+
+

@@ -1,0 +1,145 @@
+"""All shapes of a scene behind three questions: what does a ray hit first, is it blocked, what is there.
+
+Hits are found on detached rays; `surface` then computes the point again from the ray, differentiably.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from pathjax.core.math import at
+from pathjax.core.types import Hit, Ray, Surface
+from pathjax.shapes import bvh, bvh_build, planar, sphere, triangle
+from pathjax.shapes.bvh import NO_HIT
+from pathjax.shapes.planar import Planar
+from pathjax.shapes.sphere import Spheres
+from pathjax.shapes.triangle import Triangles
+
+# Up to here every ray tests all primitives of a kind, in registers of 8; above, a tree pays.
+FLAT_LIMIT = 48
+LEAF_WIDTH = 8
+
+_MODULES = {Triangles: triangle, Planar: planar, Spheres: sphere}
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Geometry:
+    tables: tuple  # one entry per kind of shape present; primitives are numbered through all of them in this order
+    shape: jax.Array  # (P,) int32 of each primitive, its place in the scene file
+    light: jax.Array  # (P,) int32 row in the table of lights; -1: emits nothing
+
+
+def leaves_of(numbers, lo, hi, dtype, rule="sah"):
+    """Pack primitives for intersection.
+
+    Args:
+        numbers: (P, K) what the intersection wants to know of each primitive.
+        lo, hi: (P, 3) bounds.
+    Returns:
+        leaves (L, K, W), rows (L, W) int32, tree (None for a few primitives), built tree for reports or None.
+    """
+    count = len(numbers)
+    if count <= FLAT_LIMIT:
+        built, tree = None, None
+        rows = np.full((1, -(-count // LEAF_WIDTH) * LEAF_WIDTH), -1, np.int32)
+        rows[0, :count] = np.arange(count)
+    else:
+        built = bvh_build.build(lo, hi, rule=rule, leaf_size=LEAF_WIDTH)
+        lane = np.arange(LEAF_WIDTH)
+        place = built.leaf_first[:, None] + lane
+        rows = np.where(lane < built.leaf_count[:, None], built.order[np.minimum(place, count - 1)], -1)
+        inside_out = np.array([np.inf, -np.inf])[:, None, None]
+        bounds = np.where(np.isnan(built.bounds), inside_out, built.bounds)
+        tree = bvh.Tree(jnp.asarray(bounds, dtype), jnp.asarray(built.child, jnp.int32), built.depth)
+    padded = np.concatenate([numbers, np.full((1, numbers.shape[1]), np.nan)])
+    leaves = np.moveaxis(padded[rows], 1, 2)  # row -1 is the padding
+    return jnp.asarray(leaves, dtype), jnp.asarray(rows, jnp.int32), tree, built
+
+
+def firsts(geometry: Geometry) -> list[int]:
+    """Number of the first primitive of each table."""
+    counts = [_MODULES[type(table)].count(table) for table in geometry.tables]
+    return [0, *np.cumsum(counts)[:-1].tolist()]
+
+
+def closest_hit(geometry: Geometry, ray: Ray) -> Hit:
+    """First primitive that the ray meets at 0 < t <= ray.t_max; of coincident ones the lowest."""
+    none = jnp.int32(NO_HIT)
+    ray = jax.tree.map(lax.stop_gradient, ray)
+
+    def leaf_test(distances, primitives, t, primitive):
+        hit = (distances > 0) & (distances <= t) & (primitives >= 0)
+        # Positive floats order as integers, and integer minima vectorise.
+        bits = jnp.where(hit, _bits(distances), _bits(jnp.full_like(distances, jnp.inf)))
+        nearest = jnp.min(bits)
+        candidate = jnp.min(jnp.where(hit & (bits == nearest), primitives, none))
+        found = lax.bitcast_convert_type(nearest, distances.dtype)
+        # Misses come as inf, and a ray without an end takes inf for a distance.
+        better = (found < jnp.inf) & ((found < t) | (candidate < primitive))
+        return jnp.where(better, found, t), jnp.where(better, candidate, primitive)
+
+    t, primitive = _visit(geometry, ray, leaf_test, ray.t_max, none)
+    found = primitive != none
+    shape = at(geometry.shape, jnp.where(found, primitive, 0)) if geometry.tables else none
+    return Hit(jnp.where(found, t, jnp.inf), jnp.where(found, primitive, -1), jnp.where(found, shape, -1))
+
+
+def occluded(geometry: Geometry, ray: Ray, target):
+    """() bool: whether anything but the primitive `target` lies at 0 < t < ray.t_max."""
+
+    def leaf_test(distances, primitives, t, primitive):
+        blocked = jnp.any((distances > 0) & (distances < t) & (primitives >= 0) & (primitives != target))
+        return jnp.where(blocked, -1, t), primitive
+
+    t, _ = _visit(geometry, ray, leaf_test, ray.t_max, jnp.int32(NO_HIT))
+    return t < 0
+
+
+def surface(geometry: Geometry, ray: Ray, hit: Hit) -> Surface:
+    """What the ray sees at its hit; differentiable in the ray. A miss gives the surface of some primitive."""
+    first = firsts(geometry)
+    primitive = jnp.maximum(hit.primitive, 0)
+
+    def of(table, start):
+        module = _MODULES[type(table)]
+        return lambda: module.surface(table, jnp.maximum(primitive - start, 0), ray.o, ray.d, hit.t)
+
+    return switch_by_range(primitive, first, [of(*pair) for pair in zip(geometry.tables, first, strict=True)])
+
+
+def switch_by_range(number, first: list[int], branches):
+    """Call the branch whose range, starting at first[i], holds the number. One branch is called without a test."""
+    if len(branches) == 1:
+        return branches[0]()
+    index = sum((number >= start).astype(jnp.int32) for start in first[1:])
+    return lax.switch(index, branches)
+
+
+def _visit(geometry: Geometry, ray: Ray, leaf_test, t, primitive):
+    """Give every leaf that the ray may meet to `leaf_test(distances (W,), primitives (W,), t, primitive)`."""
+    for table, first in zip(geometry.tables, firsts(geometry), strict=True):
+        module = _MODULES[type(table)]
+        prepared = lax.optimization_barrier(module.prepare(ray.o, ray.d))
+
+        def leaf(number, t, primitive, table=table, first=first, module=module, prepared=prepared):
+            rows = at(table.rows, number)
+            primitives = jnp.where(rows >= 0, rows + first, -1)
+            distances = module.intersect(table, at(table.leaves, number), prepared, primitives == ray.exclude)
+            return leaf_test(distances, primitives, t, primitive)
+
+        if table.tree is None:
+            t, primitive = leaf(0, t, primitive)
+        else:
+            t, primitive = bvh.traverse(table.tree, leaf, ray.o, ray.d, t, primitive)
+    return t, primitive
+
+
+def _bits(x):
+    """Integers that order as the positive floats x do."""
+    return lax.bitcast_convert_type(x, jnp.int64 if x.dtype == jnp.float64 else jnp.int32)

@@ -1,0 +1,115 @@
+"""Rectangles (parallelograms where sheared) and disks (ellipses): a plane, and two coordinates on it.
+
+A point of the plane is c + x a + y b; the shape is |x|, |y| <= 1 for a rectangle and x^2 + y^2 <= 1 for a disk.
+One test stands for the two triangles of a rectangle, and a disk is exact.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from pathjax.core.math import at, dot, safe_divide
+from pathjax.core.types import Surface
+from pathjax.core.warp import square_to_disk
+from pathjax.shapes.bvh import Tree
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Planar:
+    leaves: jax.Array  # (L, 16, W) of `leaf_numbers`; NaN in empty lanes
+    rows: jax.Array  # (L, W) int32 row of each lane
+    tree: Tree | None  # None: L = 1, every ray tests all
+    frames: jax.Array  # (P, 4, 3): c, a, b, unit normal
+    disk: bool = field(metadata={"static": True})
+
+
+def leaf_numbers(frames):
+    """(P, 4, 3) float64 -> (P, 16): c, normal, the dual vectors of a and b, and the rounding error of each coordinate."""
+    c, a, b, n = np.moveaxis(np.asarray(frames, np.float64), 1, 0)
+    normal = np.cross(a, b)
+    squared = (normal**2).sum(-1, keepdims=True)
+    dual_a, dual_b = np.cross(b, normal) / squared, np.cross(normal, a) / squared
+    # A coordinate is computed from o - c and t d, whose lengths differ by at most the radius: its error is bounded by
+    # |dual| (2 t + radius) roundings.
+    radius = np.sqrt((a**2).sum(-1) + (b**2).sum(-1))
+    slope_a, slope_b = np.sqrt((dual_a**2).sum(-1)), np.sqrt((dual_b**2).sum(-1))
+    errors = np.stack([slope_a * radius, slope_a, slope_b * radius, slope_b], -1)
+    return np.concatenate([c, n, dual_a, dual_b, errors], -1)
+
+
+def bounds(frames, disk):
+    """(P, 4, 3) -> two (P, 3)."""
+    c, a, b, _ = np.moveaxis(frames, 1, 0)
+    reach = np.sqrt(a**2 + b**2) if disk else np.abs(a) + np.abs(b)
+    return c - reach, c + reach
+
+
+def prepare(o, d):
+    return o, d
+
+
+def intersect(table, leaf, prepared, on_it):
+    """Distances to W of them at once: (16, W) -> (W,), NaN or inf where missed, possibly negative where behind.
+
+    on_it: (W,) bool, the ray starts on this primitive, which is flat and not hit again.
+    The border is inclusive by the rounding error of the coordinate, so faces that share an edge leave no gap.
+    """
+    o, d = prepared
+    c, n, dual_a, dual_b, errors = leaf[0:3], leaf[3:6], leaf[6:9], leaf[9:12], leaf[12:16]
+    from_c = [o[axis] - c[axis] for axis in range(3)]
+    t = -dot(n, from_c) / dot(n, d)
+    x = dot(dual_a, from_c) + t * dot(dual_a, d)
+    y = dot(dual_b, from_c) + t * dot(dual_b, d)
+    eps = 4 * np.finfo(leaf.dtype).eps
+    x_error, y_error = eps * (errors[0] + 2 * t * errors[1]), eps * (errors[2] + 2 * t * errors[3])
+    if table.disk:
+        inside = x * x + y * y <= 1 + x_error + y_error
+    else:
+        inside = (jnp.abs(x) <= 1 + x_error) & (jnp.abs(y) <= 1 + y_error)
+    return jnp.where(inside & ~on_it, t, jnp.inf)
+
+
+def count(table: Planar) -> int:
+    return table.frames.shape[0]
+
+
+def surface(table: Planar, row, o, d, t) -> Surface:
+    """Differentiable in the ray; the point lies on the plane to the last bits."""
+    c, a, b, n = at(table.frames, row)
+    from_c = o - c
+    distance = -safe_divide(dot(n, from_c), dot(n, d))
+    q = from_c + distance * d
+    aa, ab, bb = dot(a, a), dot(a, b), dot(b, b)
+    qa, qb = dot(q, a), dot(q, b)
+    scale = 1 / (aa * bb - ab * ab)
+    x, y = (bb * qa - ab * qb) * scale, (aa * qb - ab * qa) * scale
+    p = c + x * a + y * b
+    if table.disk:
+        r = jnp.sqrt(jnp.maximum(x * x + y * y, np.finfo(d.dtype).tiny))
+        angle = jnp.arctan2(y, x) / (2 * math.pi)
+        uv = jnp.stack([r, jnp.where(angle < 0, angle + 1, angle)])
+    else:
+        uv = jnp.stack([(x + 1) / 2, (y + 1) / 2])
+    return Surface(p, n, _margin(c, a, b, n), n, uv)
+
+
+def sample(table: Planar, row, u):
+    """Uniform point: u (2,) -> point (3,), unit normal (3,), rounding error along it ()."""
+    c, a, b, n = at(table.frames, row)
+    xy = square_to_disk(u) if table.disk else 2 * u - 1
+    return c + xy[0] * a + xy[1] * b, n, _margin(c, a, b, n)
+
+
+def area(frames, disk):
+    """(P, 4, 3) -> (P,)."""
+    return np.linalg.norm(np.cross(frames[:, 1], frames[:, 2]), axis=-1) * (math.pi if disk else 4)
+
+
+def _margin(c, a, b, n):
+    return dot(jnp.abs(n), jnp.abs(c) + jnp.abs(a) + jnp.abs(b)) * (4 * np.finfo(c.dtype).eps)

@@ -1,0 +1,121 @@
+"""Triangles: watertight intersection, surface, area sampling."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from pathjax.core.math import at, cross, dot, normalize, safe_divide
+from pathjax.core.types import Surface
+from pathjax.core.warp import square_to_triangle
+from pathjax.shapes.bvh import Tree
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Triangles:
+    leaves: jax.Array  # (L, 9, W) vertex 0 xyz, vertex 1 xyz, vertex 2 xyz; NaN in empty lanes
+    rows: jax.Array  # (L, W) int32 row of each lane
+    tree: Tree | None  # None: L = 1, every ray tests all
+    vertices: jax.Array  # (P, 3, 3) by row: vertex, axis
+    normals: jax.Array | None  # (P, 3, 3) at the vertices; None: no triangle of the scene is smooth
+    uv: jax.Array | None  # (P, 3, 2)
+
+
+def leaf_numbers(vertices):
+    """(P, 3, 3) -> (P, 9), what a leaf keeps of each triangle."""
+    return np.asarray(vertices).reshape(-1, 9)
+
+
+def bounds(vertices):
+    """(P, 3, 3) -> two (P, 3)."""
+    return vertices.min(1), vertices.max(1)
+
+
+def prepare(o, d):
+    """Constants of a ray: the shear that turns it into the z axis (Woop, Benthin, Wald 2013, JCGT 2(1))."""
+    z = jnp.argmax(jnp.abs(d)).astype(jnp.int32)
+    x = jnp.where(z == 2, 0, z + 1)
+    y = jnp.where(x == 2, 0, x + 1)
+    scale = 1 / at(d, z)
+    return x, y, z, at(o, x), at(o, y), at(o, z), at(d, x) * scale, at(d, y) * scale, scale
+
+
+def intersect(table, leaf, prepared, on_it):
+    """Distances to W triangles at once: (9, W) -> (W,), NaN or inf where missed, possibly negative where behind.
+
+    on_it: (W,) bool, the ray starts on this triangle, which is flat and not hit again.
+
+    Watertight: edges are inclusive by the rounding error of their edge function. (Contraction to fused multiply-adds
+    leaves the plain functions of two triangles that share an edge with different signs.)
+    """
+    kx, ky, kz, ox, oy, oz, shear_x, shear_y, scale = prepared
+    z = [at(leaf, 3 * v + kz) - oz for v in range(3)]
+    x = [at(leaf, 3 * v + kx) - ox - shear_x * z[v] for v in range(3)]
+    y = [at(leaf, 3 * v + ky) - oy - shear_y * z[v] for v in range(3)]
+    tolerance = 2 * np.finfo(leaf.dtype).eps
+
+    def edge(i, j):
+        a, b = x[i] * y[j], y[i] * x[j]
+        return a - b, tolerance * (jnp.abs(a) + jnp.abs(b))
+
+    (u, u_error), (v, v_error), (w, w_error) = edge(2, 1), edge(0, 2), edge(1, 0)
+    front = (u >= -u_error) & (v >= -v_error) & (w >= -w_error)
+    back = (u <= u_error) & (v <= v_error) & (w <= w_error)
+    t = (u * z[0] + v * z[1] + w * z[2]) * scale / (u + v + w)
+    return jnp.where((front | back) & ~on_it, t, jnp.inf)
+
+
+def count(table: Triangles) -> int:
+    return table.vertices.shape[0]
+
+
+def surface(table: Triangles, row, o, d, t) -> Surface:
+    """Differentiable in the ray; the point comes from barycentrics, so it lies on the triangle to the last bits."""
+    vertices = at(table.vertices, row)
+    edge1, edge2 = vertices[1] - vertices[0], vertices[2] - vertices[0]
+    s = o - vertices[0]
+    q = cross(s, edge1)
+    h = cross(d, edge2)
+    scale = safe_divide(1, dot(edge1, h))
+    b1 = jnp.clip(dot(s, h) * scale, 0, 1)
+    b2 = jnp.clip(dot(d, q) * scale, 0, 1 - b1)
+    b0 = 1 - b1 - b2
+    n = normalize(cross(edge1, edge2))
+
+    def interpolate(values):
+        return b0 * values[0] + b1 * values[1] + b2 * values[2]
+
+    shading_n = n
+    if table.normals is not None:
+        shading_n = normalize(interpolate(at(table.normals, row)))
+    uv = jnp.stack([b1, b2]) if table.uv is None else interpolate(at(table.uv, row))
+    return Surface(interpolate(vertices), n, dot(jnp.abs(n), _point_error(vertices)), shading_n, uv)
+
+
+def sample(table: Triangles, row, u):
+    """Uniform point of the triangle: u (2,) -> point (3,), unit normal (3,), rounding error along it ()."""
+    vertices = at(table.vertices, row)
+    b = square_to_triangle(u)
+    n = normalize(cross(vertices[1] - vertices[0], vertices[2] - vertices[0]))
+    p = vertices[0] + b[0] * (vertices[1] - vertices[0]) + b[1] * (vertices[2] - vertices[0])
+    return p, n, dot(jnp.abs(n), _point_error(vertices))
+
+
+def _point_error(vertices):
+    """(3, 3) -> (3,), bound on the rounding error of an interpolated vertex."""
+    return (4 * np.finfo(vertices.dtype).eps) * jnp.max(jnp.abs(vertices), 0)
+
+
+def face_normals(vertices):
+    """(P, 3, 3) -> (P, 3, 3), the unit normal of each triangle at its three vertices."""
+    n = np.cross(vertices[:, 1] - vertices[:, 0], vertices[:, 2] - vertices[:, 0])
+    return np.repeat((n / np.linalg.norm(n, axis=-1, keepdims=True))[:, None], 3, axis=1)
+
+
+def area(vertices):
+    """(P, 3, 3) -> (P,)."""
+    return np.linalg.norm(np.cross(vertices[:, 1] - vertices[:, 0], vertices[:, 2] - vertices[:, 0]), axis=-1) / 2

@@ -1,0 +1,143 @@
+"""The peers run in processes of their own and answer in the documented form; every scene shipped loads in Mitsuba."""
+
+import importlib.util
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pathjax.bench import embree_peer, mitsuba_peer
+
+ROOT = Path(__file__).resolve().parents[2]
+SCENES = sorted([*ROOT.glob("scenes/*.xml"), *ROOT.glob("tests/scenes/*.xml")])
+FURNACE = str(ROOT / "scenes" / "furnace.xml")
+
+needs_mitsuba = pytest.mark.skipif(not importlib.util.find_spec("mitsuba"), reason="Mitsuba is not installed")
+needs_embree = pytest.mark.skipif(not importlib.util.find_spec("embreex"), reason="embreex is not installed")
+
+
+def peer(request, tmp_path):
+    """The peer run by path, as its own documentation has it."""
+    file = tmp_path / "request.json"
+    file.write_text(json.dumps(request))
+    return subprocess.run([sys.executable, mitsuba_peer.__file__, str(file)], capture_output=True, text=True)
+
+
+@needs_mitsuba
+@pytest.mark.parametrize("scene", SCENES, ids=lambda path: path.stem)
+def test_scene_renders_in_mitsuba(scene):
+    run = {"sampler": "independent", "spp": 1, "seeds": [1]}
+    report, arrays = mitsuba_peer.call({"scene": str(scene), "variant": "scalar_rgb", "runs": [run]})
+    image = arrays["images_0"][0]
+    assert image.shape == (report["height"], report["width"], 3)
+    assert report["runs"][0]["nonfinite"] == 0
+    assert image.max() > 0
+
+
+@needs_mitsuba
+def test_report_and_arrays(tmp_path):
+    request = {
+        "scene": FURNACE,
+        "parameters": {"res": 8, "max_depth": 3},
+        "variant": "scalar_rgb",
+        "runs": [
+            {"sampler": "stratified", "spp": 15, "seeds": [1, 2, 3]},
+            {"sampler": "independent", "spp": 16, "seeds": [1, 2], "statistics": True},
+        ],
+        "reference": {"sampler": "independent", "spp": 64, "seeds": list(range(8))},
+        "output": str(tmp_path / "out.npz"),
+    }
+    done = peer(request, tmp_path)
+    assert done.returncode == 0, done.stderr
+    report = json.loads(done.stdout)
+    with np.load(tmp_path / "out.npz") as arrays:
+        assert json.loads(str(arrays["report"])) == report
+        assert arrays["images_0"].shape == (3, 8, 8, 3)
+        assert arrays["images_0"].dtype == np.float32
+        assert not np.array_equal(arrays["images_0"][0], arrays["images_0"][1])  # seeds are heard
+        assert arrays["mean_1"].dtype == np.float64
+        assert np.all(arrays["variance_of_mean_1"] >= 0)
+        # the closed form of furnace.xml; pixels are independent, so the mean over them has a known error
+        rho = np.array([0.2, 0.5, 0.8])
+        error = np.sqrt(arrays["reference_variance_of_mean"].mean((0, 1)) / 64)
+        z = (arrays["reference"].mean((0, 1)) - (1 - rho**3) / (1 - rho)) / error
+        assert np.all(np.abs(z) < 5)
+    stratified = report["runs"][0]
+    assert stratified["requested_spp"] == 15 and stratified["spp"] == 16  # rounded up, and told
+    assert len(stratified["seconds"]) == 3 and stratified["warm_up_seconds"] > 0
+    assert stratified["mpaths_per_second"] == pytest.approx(64 * stratified["spp"] / stratified["median_seconds"] / 1e6)
+
+
+@needs_mitsuba
+def test_variance_of_mean_is_that_of_the_images():
+    seeds = [1, 2, 3, 4]
+    run = {"sampler": "independent", "spp": 4, "seeds": seeds}
+    runs = [run, {**run, "statistics": True}]
+    request = {"scene": FURNACE, "parameters": {"res": 4}, "variant": "scalar_rgb", "runs": runs}
+    _, arrays = mitsuba_peer.call(request)
+    images = arrays["images_0"].astype(np.float64)
+    np.testing.assert_allclose(arrays["mean_1"], images.mean(0), rtol=1e-12)
+    np.testing.assert_allclose(arrays["variance_of_mean_1"], images.var(0, ddof=1) / len(seeds), rtol=1e-9)
+
+
+def test_wrong_requests_are_refused(tmp_path):
+    run = {"sampler": "independent", "spp": 1, "seeds": [1]}
+    good = {"scene": FURNACE, "variant": "scalar_rgb", "runs": [run], "output": str(tmp_path / "out.npz")}
+    for change, told in [
+        ({"runs": [{**run, "sampler": "sobol"}]}, "'sobol' is unknown"),
+        ({"runs": [{**run, "spp": 0}]}, "spp"),
+        ({"runs": [{**run, "statistics": True}]}, "2 at least"),
+        ({"runs": []}, "no run"),
+        ({"scenes": "x"}, "unknown keys: scenes"),
+        ({"scene": None}, "'scene'"),
+    ]:
+        with pytest.raises(mitsuba_peer.RequestError, match=told):
+            mitsuba_peer.check({**good, **change})
+    done = peer({**good, "runs": []}, tmp_path)
+    assert done.returncode == 2
+    assert len(done.stderr.splitlines()) == 1
+    assert not (tmp_path / "out.npz").exists()
+
+
+@needs_mitsuba
+def test_missing_scene_and_unknown_parameter_are_errors():
+    run = {"sampler": "independent", "spp": 1, "seeds": [1]}
+    with pytest.raises(mitsuba_peer.RequestError, match="no such file"):
+        mitsuba_peer.call({"scene": "nowhere.xml", "variant": "scalar_rgb", "runs": [run]})
+    with pytest.raises(mitsuba_peer.PeerFailed, match="colour"):
+        mitsuba_peer.call({"scene": FURNACE, "parameters": {"colour": 1}, "variant": "scalar_rgb", "runs": [run]})
+
+
+def test_llvm_versions_by_name():
+    versions = {
+        "/lib/x86_64-linux-gnu/libLLVM.so.19.1": 19,
+        "/usr/lib/libLLVM-15.so.1": 15,
+        "/usr/lib/llvm-14/lib/libLLVM-14.0.6.so.1": 14,
+        "/usr/lib/llvm-18/lib/libLLVM.so": 18,
+        "/opt/homebrew/opt/llvm@20/lib/libLLVM.dylib": 20,
+        "/usr/lib/libLLVM.so": 0,
+        "/usr/lib/llvm-14/lib/libLLVMCore.a": 14,
+    }
+    assert {name: mitsuba_peer.llvm_version(name) for name in versions} == versions
+
+
+def test_old_llvm_is_refused_with_the_remedy(monkeypatch):
+    monkeypatch.setattr(mitsuba_peer, "llvm_version", lambda library: 15)
+    with pytest.raises(mitsuba_peer.PeerMissing, match="libllvm19"):
+        mitsuba_peer.find_llvm()
+
+
+@needs_embree
+def test_embree_finds_the_nearest_triangle():
+    square = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], float)
+    vertices = np.concatenate([square, square - [0, 0, 1]])
+    faces = np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]])
+    origins = np.array([[0.7, 0.2, 2], [0.2, 0.7, 2], [0.7, 0.2, -0.5], [3, 3, 2]])
+    directions = np.tile([0.0, 0.0, -1.0], (4, 1))
+    report, primitive = embree_peer.call(vertices, faces, origins, directions, runs=3)
+    np.testing.assert_array_equal(primitive, [0, 1, 2, -1])
+    assert report["rays"] == 4 and report["triangles"] == 4
+    assert len(report["seconds"]) == 3 and report["mrays_per_second"] > 0

@@ -1,0 +1,177 @@
+"""Whatever bytes a file holds, a loader returns or raises InputError; nothing else escapes, and nothing hangs."""
+
+import re
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from pathjax.description import Description, Mesh
+from pathjax.errors import InputError
+from pathjax.io import mesh
+from pathjax.io.image import read_exr, read_rgb, write_exr, write_png
+from pathjax.io.mitsuba_xml import load
+
+SCENE = """<?xml version="1.0"?>
+<scene version="3.0.0">
+  <default name="res" value="8"/>
+  <default name="color" value="0.1, 0.2, 0.3"/>
+  <integrator type="path"><integer name="max_depth" value="4"/><integer name="rr_depth" value="5"/></integrator>
+  <sensor type="thinlens">
+    <float name="fov" value="40"/><string name="fov_axis" value="smaller"/>
+    <float name="aperture_radius" value="0.1"/><float name="focus_distance" value="3"/>
+    <transform name="to_world"><lookat origin="0,0,4" target="0,0,0" up="0,1,0"/><rotate x="1" angle="5"/></transform>
+    <film type="hdrfilm"><integer name="width" value="$res"/><integer name="height" value="$res"/>
+      <rfilter type="gaussian"><float name="stddev" value="0.4"/></rfilter></film>
+    <sampler type="independent"><integer name="sample_count" value="4"/></sampler>
+  </sensor>
+  <texture type="bitmap" id="picture"><string name="filename" value="picture.png"/>
+    <transform name="to_uv"><scale x="2" y="3"/></transform></texture>
+  <bsdf type="twosided" id="wall"><bsdf type="diffuse"><ref name="reflectance" id="picture"/></bsdf></bsdf>
+  <bsdf type="conductor" id="metal"><rgb name="eta" value="1"/><spectrum name="k" value="2"/></bsdf>
+  <shape type="sphere" id="ball"><point name="center" x="0" y="1" z="2"/><float name="radius" value="0.5"/>
+    <bsdf type="dielectric"><string name="int_ior" value="water"/></bsdf></shape>
+  <shape type="rectangle"><ref id="wall"/><emitter type="area"><rgb name="radiance" value="$color"/></emitter></shape>
+  <shape type="obj"><string name="filename" value="mesh.obj"/><boolean name="face_normals" value="false"/>
+    <transform name="to_world"><matrix value="1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1"/></transform><ref id="metal"/></shape>
+  <emitter type="constant"><rgb name="radiance" value="1"/></emitter>
+  <include filename="part.xml"/>
+</scene>
+"""
+
+OBJ = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvn 0 0 1\nf 1/1/1 2/1/1 3/1/1\n"
+PLY = (
+    "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\nproperty float u\n"
+    "property float v\nelement face 1\nproperty list uchar int vertex_indices\nend_header\n"
+    "0 0 0 0 0\n1 0 0 0 0\n0 1 0 0 0\n3 0 1 2\n"
+)
+STL = b"\0" * 80 + b"\1\0\0\0" + np.array([[0, 0, 1], [0, 0, 0], [1, 0, 0], [0, 1, 0]], "<f4").tobytes() + b"\0\0"
+GLTF = (
+    '{"asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0, "scale": [1, 1, 1]}],'
+    '"meshes": [{"primitives": [{"attributes": {"POSITION": 0}}]}], "bufferViews": [{"buffer": 0, "byteLength": 36}],'
+    '"accessors": [{"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3"}], "buffers": [{"byteLength": 36,'
+    '"uri": "data:application/octet-stream;base64,AAAAAAAAAAAAAAAAAACAPwAAAAAAAAAAAAAAAAAAgD8AAAAA"}]}'
+)
+MESHES = {"obj": OBJ.encode(), "ply": PLY.encode(), "stl": STL, "gltf": GLTF.encode()}
+
+WORDS = ["", "nan", "-1", "0", "1e999", "1e38", "true", "x", "$res", "$none", "ball", "wall", "diffuse", "bitmap", "\u0660"]
+TAGS = "scene shape bsdf texture emitter sensor film float integer rgb ref transform scale include default path z".split()
+KEYS = ["type", "id", "name", "value", "x", "filename", "foo"]
+
+
+def quickly(examples: int):
+    return settings(
+        max_examples=examples,
+        deadline=None,
+        derandomize=True,
+        database=None,
+        suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
+    )
+
+
+@pytest.fixture
+def folder(tmp_path):
+    (tmp_path / "mesh.obj").write_text(OBJ)
+    (tmp_path / "part.xml").write_text('<scene version="3.0.0"/>')
+    write_png(tmp_path / "picture.png", np.full((2, 2, 3), 0.5))
+    return tmp_path
+
+
+def load_or_refuse(folder, content: bytes) -> Description | None:
+    (folder / "scene.xml").write_bytes(content)
+    try:
+        return load(folder / "scene.xml")
+    except InputError as error:
+        assert "\n" not in str(error) and re.search(r"\.(xml|png|obj)", str(error)), error
+        return None
+
+
+@st.composite
+def mutated_scene(draw) -> str:
+    """The scene with a few attributes, tags, or whole elements changed, doubled or removed."""
+    text = SCENE
+    for _ in range(draw(st.integers(1, 3))):
+        attributes = list(re.finditer(r'(\w+)="([^"]*)"', text))
+        tags = list(re.finditer(r"<(/?)(\w+)", text))
+        elements = list(re.finditer(r"<\w+[^<>]*/>", text))
+        kind = draw(st.sampled_from(["value", "key", "tag", "remove", "double", "move"]))
+        if kind in ("value", "key"):
+            match = draw(st.sampled_from(attributes))
+            value = draw(st.sampled_from(WORDS) | st.text("0123456789.-+e ,", max_size=12)) if kind == "value" else None
+            new = f'{match[1]}="{value}"' if kind == "value" else f'{draw(st.sampled_from(KEYS))}="{match[2]}"'
+        elif kind == "tag":
+            match = draw(st.sampled_from(tags))
+            new = f"<{match[1]}{draw(st.sampled_from(TAGS))}"
+        elif elements:
+            match = draw(st.sampled_from(elements))
+            new = {"remove": "", "double": match[0] * 2, "move": draw(st.sampled_from(elements))[0]}[kind]
+        text = text[: match.start()] + new + text[match.end() :]
+    return text
+
+
+@st.composite
+def damaged(draw, data: bytes) -> bytes:
+    """Data with a few bytes replaced, inserted, or cut off."""
+    for _ in range(draw(st.integers(1, 4))):
+        at = draw(st.integers(0, len(data)))
+        until = draw(st.sampled_from([at, at + 1, at + 4, len(data)]))
+        data = data[:at] + draw(st.binary(max_size=6) | st.sampled_from([b"9999999", b"-1", b" nan ", b"\n"])) + data[until:]
+    return data
+
+
+def test_the_unchanged_files_load(folder):
+    assert load_or_refuse(folder, SCENE.encode()) is not None
+    for kind, data in MESHES.items():
+        (folder / f"m.{kind}").write_bytes(data)
+        assert len(mesh.load(folder / f"m.{kind}", kind, np.eye(4))[0].faces) == 1
+
+
+@quickly(400)
+@given(text=mutated_scene())
+def test_mutated_scenes_load_or_are_refused(folder, text):
+    load_or_refuse(folder, text.encode())
+
+
+@quickly(150)
+@given(data=damaged(SCENE.encode()))
+def test_damaged_scenes_load_or_are_refused(folder, data):
+    load_or_refuse(folder, data)
+
+
+@quickly(50)
+@given(data=st.binary(max_size=100))
+def test_random_bytes_are_no_scene(folder, data):
+    assert load_or_refuse(folder, data) is None
+
+
+@pytest.mark.parametrize("kind", MESHES)
+@quickly(120)
+@given(data=st.data())
+def test_damaged_meshes_load_sound_or_are_refused(folder, kind, data):
+    (folder / f"m.{kind}").write_bytes(data.draw(damaged(MESHES[kind]) | st.binary(max_size=200)))
+    try:
+        made, _ = mesh.load(folder / f"m.{kind}", kind, np.eye(4))
+    except InputError as error:
+        assert f"m.{kind}" in str(error)
+        return
+    assert isinstance(made, Mesh) and len(made.faces) and np.isfinite(made.vertices).all()
+    assert 0 <= made.faces.min() <= made.faces.max() < len(made.vertices)
+    if made.normals is not None:
+        np.testing.assert_allclose(np.linalg.norm(made.normals, axis=1), 1, rtol=1e-6)
+    assert made.uv is None or made.uv.shape == (len(made.vertices), 2)
+
+
+@pytest.mark.parametrize("suffix", ["exr", "png"])
+@quickly(120)
+@given(data=st.data())
+def test_damaged_images_load_or_are_refused(folder, suffix, data):
+    path = folder / f"i.{suffix}"
+    rgb = np.full((3, 4, 3), 0.5, np.float32)
+    write_exr(path, {"R": rgb[..., 0], "G": rgb[..., 1], "B": rgb[..., 2]}, {}) if suffix == "exr" else write_png(path, rgb)
+    path.write_bytes(data.draw(damaged(path.read_bytes()) | st.binary(max_size=100)))
+    for read in (read_rgb, read_exr) if suffix == "exr" else (read_rgb,):
+        try:
+            read(path)
+        except InputError as error:
+            assert str(path) in str(error)

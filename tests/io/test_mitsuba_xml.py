@@ -1,0 +1,642 @@
+"""Scene files: what they mean, and what is refused. Numbers that Mitsuba defines are compared with Mitsuba itself."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pathjax import description as d
+from pathjax.errors import InputError
+from pathjax.io.image import write_exr, write_png
+from pathjax.io.mitsuba_xml import load
+from pathjax.io.spectra import IOR
+
+CORNELL = Path(__file__).parents[2] / "scenes" / "cornell_box.xml"
+SENSOR = '<sensor type="perspective"/>'
+
+
+@pytest.fixture
+def read(tmp_path):
+    """Load a scene: the sensor on line 1, `body` from line 2 on."""
+
+    def read(body: str, sensor: str = SENSOR, **parameters) -> d.Description:
+        path = tmp_path / "scene.xml"
+        path.write_text(f'<scene version="3.0.0">{sensor}\n{body}</scene>')
+        return load(path, **parameters)
+
+    return read
+
+
+@pytest.fixture
+def refused(read):
+    """The message with which a scene is refused; it must name `line`."""
+
+    def refused(body: str, line: int = 2, **keywords) -> str:
+        with pytest.raises(InputError) as caught:
+            read(body, **keywords)
+        assert f"scene.xml:{line}: " in str(caught.value)
+        return str(caught.value)
+
+    return refused
+
+
+@pytest.fixture
+def mitsuba():
+    mi = pytest.importorskip("mitsuba")
+    mi.set_variant("scalar_rgb")
+    mi.set_log_level(mi.LogLevel.Error)
+    return mi
+
+
+def shape(inside: str = "", kind: str = "sphere", attributes: str = "") -> str:
+    return f'<shape type="{kind}" {attributes}>{inside}</shape>'
+
+
+def with_bsdf(kind: str, inside: str = "", attributes: str = "") -> str:
+    return shape(f'<bsdf type="{kind}" {attributes}>{inside}</bsdf>')
+
+
+def first_bsdf(scene: d.Description) -> d.BSDF:
+    return scene.shapes[0].bsdf
+
+
+# --- a scene as users write it
+
+
+def test_cornell_box_is_read_as_written():
+    box = load(CORNELL, res=32, spp=4)
+    assert (box.film.width, box.film.height, box.spp, box.film.filter) == (32, 32, 4, "box")
+    assert box.integrator == d.Integrator(max_depth=8, rr_depth=5)
+    assert [shape.name for shape in box.shapes][:3] == ["lamp", "floor", "ceiling"]
+    lamp, floor = box.shapes[0], box.shapes[1]
+    assert lamp.bsdf is floor.bsdf and lamp.bsdf.name == "white"
+    np.testing.assert_allclose(lamp.radiance, [18.387, 13.9873, 6.75357])
+    assert lamp.emitter_name == "light" and floor.radiance is None and floor.emitter_name == ""
+    assert (box.camera.fov, box.camera.fov_axis) == (39.3077, "smaller")
+    np.testing.assert_allclose(box.camera.to_world[:3, 3], [0, 0, 3.9])
+    np.testing.assert_allclose(floor.geometry.to_world @ [0, 0, 0, 1], [0, -1, 0, 1], atol=1e-15)
+
+
+# --- $parameters, includes, references
+
+
+def test_keyword_overrides_default_and_a_default_needs_no_use(read):
+    body = '<default name="r" value="2"/><default name="unused" value="0"/>' + shape('<float name="radius" value="$r"/>')
+    assert read(body).shapes[0].geometry.radius == 2
+    assert read(body, r=3).shapes[0].geometry.radius == 3
+    assert read(body, r=3, unused=1).shapes[0].geometry.radius == 3
+
+
+def test_first_default_wins_and_defaults_compose(read):
+    body = '<default name="a" value="2"/><default name="a" value="9"/><default name="b" value="1$a"/>'
+    assert read(body + shape('<float name="radius" value="$b"/>')).shapes[0].geometry.radius == 12
+
+
+def test_keyword_serves_a_name_without_default(read):
+    assert read(shape('<float name="radius" value="$r"/>'), r=0.5).shapes[0].geometry.radius == 0.5
+
+
+def test_keywords_that_are_lists_and_booleans_become_xml(read):
+    color = '<bsdf type="diffuse"><rgb name="reflectance" value="$c"/></bsdf>'
+    scene = read(shape(f'<boolean name="flip_normals" value="$flip"/>{color}'), flip=True, c=[0.1, 0.2, 0.3])
+    assert scene.shapes[0].flip_normals
+    np.testing.assert_array_equal(first_bsdf(scene).reflectance, [0.1, 0.2, 0.3])
+
+
+def test_unknown_keyword_lists_those_that_exist(read):
+    with pytest.raises(InputError, match=r'no parameter "rse"; it has: res; did you mean "res"\?'):
+        read('<default name="res" value="1"/>', rse=3)
+
+
+def test_undefined_name_is_refused_at_its_line(refused):
+    body = '\n<default name="radius" value="1"/>\n' + shape('<float name="radius" value="$raduis"/>')
+    message = refused(body, line=4)
+    assert "$raduis is not defined" in message and 'did you mean "radius"?' in message
+
+
+def test_defaults_that_grow_without_bound_are_refused(refused):
+    defaults = ['<default name="a0" value="0123456789"/>']
+    defaults += [f'<default name="a{k}" value="{f"$a{k - 1}" * 10}"/>' for k in range(1, 20)]
+    assert "grows" in refused("".join(defaults))
+
+
+def test_included_files_are_found_beside_the_scene_beside_the_includer_and_in_paths(read, tmp_path):
+    (tmp_path / "sub" / "deep").mkdir(parents=True)
+    (tmp_path / "sub" / "a.xml").write_text('<scene version="3.0.0"><include filename="b.xml"/></scene>')
+    (tmp_path / "sub" / "b.xml").write_text('<scene version="3.0.0"><shape type="cube" id="b"/></scene>')
+    (tmp_path / "sub" / "deep" / "c.xml").write_text('<scene version="3.0.0"><shape type="cube"/></scene>')
+    scene = read('<include filename="sub/a.xml"/><path value="sub/deep"/><include filename="c.xml"/>')
+    assert [shape.name for shape in scene.shapes] == ["b", "shape0"]
+
+
+def test_error_in_an_included_file_names_that_file(read, tmp_path):
+    (tmp_path / "part.xml").write_text('<scene version="3.0.0">\n\n<shape type="spere"/></scene>')
+    with pytest.raises(InputError, match=r'part\.xml:3: <shape type="spere"> is not supported.* mean "sphere"'):
+        read('<include filename="part.xml"/>')
+
+
+def test_include_cycle_is_refused(read, tmp_path):
+    (tmp_path / "a.xml").write_text('<scene version="3.0.0">\n\n<include filename="scene.xml"/></scene>')
+    with pytest.raises(InputError, match=r"a\.xml:3: .* includes itself"):
+        read('<include filename="a.xml"/>')
+
+
+def test_includes_that_multiply_are_refused_quickly(read, tmp_path):
+    for k in range(20):
+        twice = f'<include filename="{k + 1}.xml"/>' * 2
+        (tmp_path / f"{k}.xml").write_text(f'<scene version="3.0.0">{twice}</scene>')
+    (tmp_path / "20.xml").write_text('<scene version="3.0.0"/>')
+    with pytest.raises(InputError, match="more than 1000 included files"):
+        read('<include filename="0.xml"/>')
+
+
+def test_a_reference_may_come_before_its_object_and_shares_it(read):
+    ref = '<ref id="m"/>'
+    scene = read(shape(ref) + shape(ref) + '<bsdf type="diffuse" id="m"/>')
+    assert scene.shapes[0].bsdf is scene.shapes[1].bsdf
+
+
+@pytest.mark.parametrize(
+    ("body", "line", "words"),
+    [
+        ('<bsdf type="diffuse" id="grey"/>\n' + shape('<ref id="gray"/>'), 3, 'no such id; did you mean "grey"?'),
+        (shape(attributes='id="a"') + "\n" + shape(attributes='id="a"'), 3, 'id "a" is taken already'),
+        ('<bsdf type="twosided" id="a"><ref id="a"/></bsdf>', 2, "refers to itself"),
+        (shape('<ref id="b"/>') + shape('<ref id="x"/>', attributes='id="b"'), 2, "has no place inside"),
+        (shape('<ref name="radius" id="r"/><float id="r" name="q" value="1"/>'), 2, "which is no object"),
+        ('<include filename="nowhere.xml"/>', 2, 'no file "nowhere.xml"'),
+        ('<path value="nowhere"/>', 2, 'no folder "nowhere"'),
+        ('<alias id="a" as="b"/>', 2, "<alias"),
+    ],
+)
+def test_references_that_cannot_be_followed_are_refused(refused, body, line, words):
+    assert words in refused(body, line)
+
+
+# --- names
+
+
+def test_names_come_from_ids_then_from_what_encloses(read):
+    light = '<emitter type="area"/>'
+    scene = read(
+        shape('<bsdf type="diffuse"/>' + light, attributes='id="lamp"')
+        + shape('<bsdf type="diffuse" id="paint"/><emitter type="area" id="glow"/>')
+        + shape('<bsdf type="diffuse"/>' + light)
+        + shape()
+        + '<emitter type="constant"/>'
+    )
+    assert [shape.name for shape in scene.shapes] == ["lamp", "shape0", "shape1", "shape2"]
+    assert [shape.bsdf.name for shape in scene.shapes] == ["lamp", "paint", "bsdf0", "bsdf1"]
+    assert [shape.emitter_name for shape in scene.shapes] == ["lamp", "glow", "shape1", ""]
+    assert scene.background_name == "background"
+
+
+def test_names_that_the_file_uses_are_not_given_again(read):
+    scene = read(shape() + shape(attributes='id="shape0"') + shape(attributes='id="bsdf0"'))
+    assert [shape.name for shape in scene.shapes] == ["shape1", "shape0", "bsdf0"]
+    assert first_bsdf(scene).name == "bsdf1"
+
+
+def test_twosided_hands_its_name_down(read):
+    inner = '<bsdf type="diffuse"/>'
+    one = first_bsdf(read(with_bsdf("twosided", inner, 'id="wall"')))
+    assert one.name == one.front.name == "wall" and one.front is one.back
+    two = first_bsdf(read(with_bsdf("twosided", inner + '<bsdf type="conductor" id="metal"/>', 'id="wall"')))
+    assert (two.front.name, two.back.name) == ("wall_front", "metal")
+
+
+def test_a_texture_without_id_is_named_after_its_bsdf(read):
+    texture = '<texture name="reflectance" type="checkerboard"/>'
+    assert first_bsdf(read(with_bsdf("diffuse", texture, 'id="floor"'))).reflectance.name == "floor"
+
+
+# --- transforms
+
+TRANSFORMS = [
+    '<translate x="1" y="-2"/>',
+    '<translate value="1, 2 3"/>',
+    '<scale value="2"/><translate z="1"/>',
+    '<translate z="1"/><scale x="2" y="3"/>',
+    '<rotate x="1" angle="90"/>',
+    '<rotate value="0.6, 0, 0.8" angle="-385"/><translate y="1"/>',
+    '<matrix value="1 2 3 4  0 1 5 6  0 0 1 7  0 0 0 1"/>',
+    '<matrix value="1 2 3 4 5 6 7 8 10"/>',
+    '<lookat origin="1, 2, 3" target="4, 5, 7" up="0, 1, 0"/>',
+    '<lookat origin="1, 2, 3" target="4, 5, 7"/>',
+    '<lookat origin="0, 0, 3" target="1, 2, -4"/>',
+    '<lookat origin="0, 0, 3" target="0, 0, 0"/><scale x="-1"/>',
+]
+
+
+@pytest.mark.parametrize("steps", TRANSFORMS)
+def test_transforms_agree_with_mitsuba(read, mitsuba, steps):
+    body = shape(f'<transform name="to_world">{steps}</transform>', "rectangle")
+    theirs = mitsuba.traverse(mitsuba.load_string(f'<scene version="3.0.0">{body}</scene>').shapes()[0])["to_world"]
+    np.testing.assert_allclose(read(body).shapes[0].geometry.to_world, np.array(theirs.matrix), atol=2e-6)
+
+
+@pytest.mark.parametrize(
+    ("steps", "words"),
+    [
+        ('<scale value="0"/>', "singular"),
+        ('<scale x="1e-20"/>', "singular"),
+        ('<matrix value="1 2 3 2 4 6 0 0 1"/>', "singular"),
+        ('<matrix value="1 0 0 0 0 1 0 0 0 0 1 0 0 0 1 1"/>', "last row"),
+        ('<matrix value="1 2 3"/>', "9 or 16"),
+        ('<translate x="nan"/>', "not a finite number"),
+        ('<translate x="1e400"/>', "not a finite number"),
+        ('<scale value="1e30"/><scale value="1e30"/>', "overflow"),
+        ('<translate x="one"/>', "'one' is not a finite number"),
+        ('<translate value="1 2"/>', "1 or 3"),
+        ('<translate value="1" x="1"/>', "mixes value"),
+        ('<translate q="1"/>', 'no attribute "q"'),
+        ('<rotate angle="90"/>', "length 1"),
+        ('<rotate x="1" y="1" angle="90"/>', "length 1, has 1.41421"),
+        ('<rotate x="1"/>', 'lacks the attribute "angle"'),
+        ('<lookat origin="1, 2, 3" target="1, 2, 3"/>', "coincide"),
+        ('<lookat origin="0, 0, 0" target="0, 1, 0" up="0, 2, 0"/>', "parallel"),
+        ('<lookat target="0, 0, 1"/>', 'lacks the attribute "origin"'),
+        ('<shear x="1"/>', "use one of: translate, rotate, scale, lookat, matrix"),
+        ('<translate x="1"><scale value="2"/></translate>', "nothing inside"),
+    ],
+)
+def test_transforms_without_meaning_are_refused(refused, steps, words):
+    assert words in refused(shape(f'<transform name="to_world">\n{steps}</transform>', "cube"), line=3)
+
+
+# --- shapes
+
+
+def test_sphere_composes_center_radius_and_transform(read):
+    moved = '<scale value="2"/><rotate z="1" angle="90"/><translate x="10"/>'
+    inside = f'<point name="center" x="1" y="2" z="3"/><float name="radius" value="0.5"/>'
+    sphere = read(shape(inside + f'<transform name="to_world">{moved}</transform>')).shapes[0].geometry
+    np.testing.assert_allclose(sphere.center, [6, 2, 6])
+    assert sphere.radius == pytest.approx(1)
+    np.testing.assert_allclose(sphere.to_world[:3, :3], [[0, -1, 0], [1, 0, 0], [0, 0, 1]], atol=1e-15)
+
+
+@pytest.mark.parametrize("step", ['<scale x="2"/>', '<matrix value="1 .5 0 0 1 0 0 0 1"/>'])
+def test_a_sphere_must_stay_a_sphere(refused, step):
+    assert "must stay a sphere" in refused(shape(f'<transform name="to_world">{step}</transform>'))
+
+
+@pytest.mark.parametrize("mirror", ["1", "-1"])
+@pytest.mark.parametrize("flip", ["false", "true"])
+def test_a_mirrored_sphere_is_inside_out_as_in_mitsuba(read, mitsuba, mirror, flip):
+    mirrored = f'<transform name="to_world"><scale x="{mirror}"/></transform>'
+    body = shape(f'<boolean name="flip_normals" value="{flip}"/>{mirrored}')
+    scene = mitsuba.load_string(f'<scene version="3.0.0">{body}</scene>')
+    hit = scene.ray_intersect(mitsuba.Ray3f([0, 0, 5], [0, 0, -1]))
+    assert read(body).shapes[0].flip_normals == (hit.sh_frame.n.z < 0)
+
+
+@pytest.mark.parametrize(("kind", "made"), [("rectangle", d.Rectangle), ("cube", d.Cube), ("disk", d.Disk)])
+def test_plain_shapes_carry_their_transform(read, kind, made):
+    scene = read(shape('<transform name="to_world"><scale x="-2"/></transform>', kind))
+    assert isinstance(scene.shapes[0].geometry, made) and not scene.shapes[0].flip_normals
+    np.testing.assert_array_equal(scene.shapes[0].geometry.to_world, np.diag([-2, 1, 1, 1]))
+
+
+def test_a_shape_without_bsdf_is_grey_and_a_light_without_bsdf_is_black(read, mitsuba):
+    for body, expected in [(shape(), 0.5), (shape('<emitter type="area"/>'), 0.0)]:
+        theirs = mitsuba.load_string(f'<scene version="3.0.0">{body}</scene>').shapes()[0].bsdf()
+        assert f"value={expected:f}" in str(theirs)
+        np.testing.assert_array_equal(first_bsdf(read(body)).reflectance, np.full(3, expected))
+
+
+# --- bsdfs
+
+
+def test_ior_names_are_mitsubas(mitsuba):
+    for name, value in IOR.items():
+        bsdf = f'<bsdf type="dielectric"><string name="int_ior" value="{name}"/><float name="ext_ior" value="1"/></bsdf>'
+        scene = mitsuba.load_string(f'<scene version="3.0.0">{shape(bsdf)}</scene>')
+        assert mitsuba.traverse(scene.shapes()[0].bsdf())["eta"] == pytest.approx(value, rel=1e-6), name
+
+
+def test_dielectric_takes_numbers_and_names(read):
+    glass = first_bsdf(read(with_bsdf("dielectric")))
+    assert (glass.int_ior, glass.ext_ior) == (IOR["bk7"], IOR["air"])
+    ice = '<string name="int_ior" value="Water Ice"/><integer name="ext_ior" value="1"/>'
+    assert first_bsdf(read(with_bsdf("dielectric", ice))).int_ior == 1.31
+
+
+def test_conductor_is_an_ideal_mirror_unless_told_otherwise(read):
+    for inside in ("", '<string name="material" value="none"/>'):
+        mirror = first_bsdf(read(with_bsdf("conductor", inside)))
+        assert mirror.eta is None and mirror.k is None and (mirror.specular_reflectance == 1).all()
+    metal = first_bsdf(read(with_bsdf("conductor", '<rgb name="eta" value="1,2,3"/><spectrum name="k" value="4"/>')))
+    np.testing.assert_array_equal([metal.eta, metal.k], [[1, 2, 3], [4, 4, 4]])
+    np.testing.assert_array_equal(first_bsdf(read(with_bsdf("conductor", '<rgb name="eta" value="1"/>'))).k, np.ones(3))
+
+
+@pytest.mark.parametrize(
+    ("kind", "inside", "words"),
+    [
+        ("plastic", "", '<bsdf type="plastic"> is not supported; use one of diffuse, dielectric, conductor, twosided'),
+        ("difuse", "", 'did you mean "diffuse"?'),
+        ("diffuse", '<rgb name="reflectence" value="1"/>', 'it has: reflectance; did you mean "reflectance"?'),
+        ("diffuse", '<rgb name="reflectance" value="1.1"/>', "between 0 and 1"),
+        ("diffuse", '<float name="reflectance" value="-0.1"/>', "between 0 and 1"),
+        ("diffuse", '<rgb name="reflectance" value="nan"/>', "not a finite number"),
+        ("diffuse", '<rgb name="reflectance" value="0.1, 0.2"/>', "has 2 numbers"),
+        ("diffuse", '<rgb name="reflectance" value=""/>', "not a finite number"),
+        ("diffuse", '<rgb name="reflectance" value="#ff8000"/>', "hexadecimal"),
+        ("diffuse", '<spectrum name="reflectance" value="400:0.1, 500:0.2"/>', "give linear RGB as <rgb>"),
+        ("diffuse", '<string name="reflectance" value="red"/>', "cannot be a <string>"),
+        ("diffuse", '<rgb name="reflectance"/>', 'lacks the attribute "value"'),
+        ("diffuse", '<rgb name="reflectance" value="1" unit="m"/>', 'no attribute "unit"'),
+        ("diffuse", '<rgb value="1"/>', "lacks name="),
+        ("diffuse", '<rgb name="reflectance" value="1"/><rgb name="reflectance" value="1"/>', "given twice"),
+        ("diffuse", '<rgb name="reflectance" value="1"><float name="a" value="1"/></rgb>', "has no place inside"),
+        ("diffuse", '<bsdf type="diffuse"/>', "has no place inside"),
+        ("diffuse", '<texture type="checkerboard"/>', "lacks name="),
+        ("diffuse", "<colour/>", "<colour> is not supported inside"),
+        ("diffuse", "0.5", "stray text"),
+        ("dielectric", '<float name="int_ior" value="0"/>', "must be above 0, is 0"),
+        ("dielectric", '<float name="ext_ior" value="-1"/>', "must be above 0, is -1"),
+        ("dielectric", '<string name="int_ior" value="1.5"/>', "use a number or one of vacuum"),
+        ("dielectric", '<string name="int_ior" value="diamonds"/>', 'did you mean "diamond"?'),
+        ("dielectric", '<rgb name="specular_transmittance" value="0.9"/>', "must be 1"),
+        ("conductor", '<string name="material" value="Au"/>', "give eta and k as <rgb>"),
+        ("conductor", '<rgb name="k" value="-1"/>', "not be negative"),
+        ("twosided", "", "needs a <bsdf> inside"),
+        ("twosided", '<bsdf type="dielectric"/>', "cannot stand inside"),
+        ("twosided", '<bsdf type="twosided"><bsdf type="diffuse"/></bsdf>', "cannot stand inside"),
+        ("twosided", '<bsdf type="diffuse"/>' * 3, "at most 2 <bsdf>"),
+    ],
+)
+def test_bsdfs_that_are_not_modelled_are_refused(refused, kind, inside, words):
+    assert words in refused(with_bsdf(kind, inside))
+
+
+# --- textures
+
+
+@pytest.fixture
+def picture(tmp_path):
+    """A 4 x 2 PNG whose pixels all differ."""
+    y, x = np.mgrid[0:2, 0:4]
+    write_png(tmp_path / "picture.png", np.stack([(x + 1) / 5, (y + 1) / 3, 0.2 + 0 * x], axis=-1))
+    return '<string name="filename" value="picture.png"/>'
+
+
+def evaluated(mitsuba, body, uv):
+    """Mitsuba's reflectance of the first shape's bsdf at uv."""
+    si = mitsuba.SurfaceInteraction3f()
+    si.uv, si.wi = uv, [0, 0, 1]
+    return np.array(mitsuba.load_string(f'<scene version="3.0.0">{body}</scene>').shapes()[0].bsdf().eval_diffuse_reflectance(si))
+
+
+@pytest.mark.parametrize("raw", ["true", "false"])
+@pytest.mark.parametrize("to_uv", ["", '<scale x="0.5"/><translate x="0.25" y="0.5"/>', '<rotate z="1" angle="90"/>'])
+def test_texels_lie_where_mitsuba_finds_them(read, mitsuba, picture, tmp_path, raw, to_uv):
+    inside = (
+        f'<texture name="reflectance" type="bitmap">{picture}<string name="filter_type" value="nearest"/>'
+        f'<boolean name="raw" value="{raw}"/><transform name="to_uv">{to_uv}</transform></texture>'
+    )
+    bitmap = first_bsdf(read(with_bsdf("diffuse", inside))).reflectance
+    assert (bitmap.interpolation, bitmap.wrap) == ("nearest", "repeat")
+    there = with_bsdf("diffuse", inside).replace("picture.png", str(tmp_path / "picture.png"))
+    height, width, _ = bitmap.texels.shape
+    for uv in [(0.1, 0.1), (0.9, 0.1), (0.1, 0.9), (0.6, 0.7)]:
+        u, v, _ = bitmap.to_uv @ [*uv, 1]
+        ours = bitmap.texels[int(v % 1 * height), int(u % 1 * width)]
+        np.testing.assert_allclose(ours, evaluated(mitsuba, there, uv), atol=2e-5)
+
+
+def test_checkerboard_defaults_are_mitsubas(read, mitsuba):
+    body = with_bsdf("diffuse", '<texture name="reflectance" type="checkerboard"/>')
+    board = first_bsdf(read(body)).reflectance
+    np.testing.assert_allclose(evaluated(mitsuba, body, (0.1, 0.1)), board.color0)
+    np.testing.assert_allclose(evaluated(mitsuba, body, (0.6, 0.1)), board.color1)
+
+
+def test_a_texture_that_is_referenced_twice_is_read_once(read, picture):
+    scene = read(
+        f'<texture type="bitmap" id="t">{picture}</texture>'
+        + 2 * with_bsdf("diffuse", '<ref name="reflectance" id="t"/>')
+    )
+    assert scene.shapes[0].bsdf.reflectance is scene.shapes[1].bsdf.reflectance
+    assert first_bsdf(scene).reflectance.name == "t"
+
+
+@pytest.mark.parametrize(
+    ("kind", "inside", "words"),
+    [
+        ("wood", "", "use one of bitmap, checkerboard"),
+        ("bitmap", "", 'needs <string name="filename"'),
+        ("bitmap", '<string name="filename" value="no.png"/>', 'no file "no.png"'),
+        ("bitmap", '<string name="filename" value="picture.png"/><string name="wrap_mode" value="none"/>', "repeat or"),
+        ("checkerboard", '<rgb name="color0" value="2"/>', "between 0 and 1"),
+        ("checkerboard", '<transform name="to_uv"><matrix value="1 0 5 0 1 6 0 0 1"/></transform>', "mixes z"),
+    ],
+)
+def test_textures_that_are_not_modelled_are_refused(refused, picture, kind, inside, words):
+    texture = f'<texture name="reflectance" type="{kind}">{inside}</texture>'
+    assert words in refused(with_bsdf("diffuse", texture))
+
+
+def test_images_outside_0_to_1_are_no_reflectance(refused, tmp_path):
+    bright = np.full((2, 2), 1.5, np.float32)
+    write_exr(tmp_path / "bright.exr", {"R": bright, "G": bright, "B": bright}, {})
+    texture = '<texture name="reflectance" type="bitmap"><string name="filename" value="bright.exr"/></texture>'
+    assert "above 1" in refused(with_bsdf("diffuse", texture))
+
+
+# --- emitters
+
+
+@pytest.mark.parametrize(
+    "color",
+    ["", '<rgb name="radiance" value="3, 2, 1"/>', '<float name="radiance" value="3"/>', '<spectrum name="radiance" value="2"/>'],
+)
+def test_radiance_agrees_with_mitsuba(read, mitsuba, color):
+    body = shape(f'<emitter type="area">{color}</emitter>', "rectangle")
+    si = mitsuba.SurfaceInteraction3f()
+    si.wi, si.uv = [0, 0, 1], [0.5, 0.5]
+    theirs = mitsuba.load_string(f'<scene version="3.0.0">{body}</scene>').shapes()[0].emitter().eval(si)
+    np.testing.assert_allclose(read(body).shapes[0].radiance, np.array(theirs), rtol=1e-5)
+
+
+def test_constant_emitter_is_the_background(read):
+    scene = read('<emitter type="constant" id="sky"><rgb name="radiance" value="1, 2, 3"/></emitter>')
+    np.testing.assert_array_equal(scene.background, [1, 2, 3])
+    assert scene.background_name == "sky" and scene.shapes == ()
+    assert read("").background is None
+
+
+@pytest.mark.parametrize(
+    ("body", "words"),
+    [
+        ('<emitter type="point"/>', "use one of constant"),
+        ('<emitter type="area"/>', "use one of constant"),
+        (shape('<emitter type="constant"/>'), "use one of area"),
+        ('<emitter type="constant"/>\n' * 2, "one <emitter> is supported here"),
+        (shape('<emitter type="area"/>' * 2), "at most 1 <emitter>"),
+        (shape('<emitter type="area"><rgb name="radiance" value="-1"/></emitter>'), "not be negative"),
+        (shape('<emitter type="area"><texture name="radiance" type="checkerboard"/></emitter>'), "cannot be a <texture>"),
+        (shape('<emitter type="area"><rgb name="intensity" value="1"/></emitter>'), "it has: radiance"),
+    ],
+)
+def test_emitters_that_are_not_modelled_are_refused(refused, body, words):
+    assert words in refused(body, line=3 if body.endswith("\n") else 2)
+
+
+# --- sensor, film, sampler, integrator
+
+
+def test_defaults_of_sensor_film_and_integrator_are_mitsubas(read, mitsuba):
+    scene = read("")
+    sensor = mitsuba.load_string(f'<scene version="3.0.0">{SENSOR}</scene>').sensors()[0]
+    params = mitsuba.traverse(sensor)
+    assert (scene.film.width, scene.film.height) == tuple(sensor.film().size())
+    assert scene.spp == sensor.sampler().sample_count()
+    assert (scene.camera.near_clip, scene.camera.far_clip) == pytest.approx((params["near_clip"], params["far_clip"]))
+    assert str(sensor.film().rfilter()) == f"GaussianFilter[stddev={scene.film.filter_stddev:.2f}, radius=2.00]"
+    assert (scene.film.filter, scene.film.filter_radius) == ("gaussian", 2)
+    # 50 mm on 36 x 24 mm film, measured along the diagonal; Mitsuba keeps what that makes along x
+    assert scene.camera.fov_axis == "diagonal"
+    x_fov = 2 * math.degrees(math.atan(math.tan(math.radians(scene.camera.fov / 2)) * 4 / 5))
+    assert x_fov == pytest.approx(params["x_fov"], rel=1e-5)
+    path = mitsuba.load_string('<scene version="3.0.0"><integrator type="path"/></scene>').integrator()
+    assert f"rr_depth = {scene.integrator.rr_depth}\n" in str(path)
+    assert scene.integrator.max_depth == -1 and any("<integrator>" in note for note in scene.notes)
+
+
+def test_thin_lens_focuses_at_the_far_clip_unless_told(read, mitsuba):
+    lens = '<sensor type="thinlens"><float name="aperture_radius" value="0.1"/><float name="far_clip" value="9"/></sensor>'
+    camera = read("", sensor=lens).camera
+    theirs = mitsuba.traverse(mitsuba.load_string(f'<scene version="3.0.0">{lens}</scene>').sensors()[0])
+    assert camera.aperture_radius == 0.1
+    assert camera.focus_distance == pytest.approx(theirs["focus_distance"]) == 9
+
+
+def test_direct_is_one_bounce_without_roulette(read):
+    integrator = read('<integrator type="direct"><boolean name="hide_emitters" value="true"/></integrator>').integrator
+    assert (integrator.max_depth, integrator.hide_emitters) == (2, True)
+    assert integrator.rr_depth > 2
+
+
+def test_film_crop_filter_and_settings_without_effect(read):
+    film = """<film type="hdrfilm"><integer name="width" value="40"/><integer name="height" value="30"/>
+      <integer name="crop_offset_x" value="4"/><integer name="crop_width" value="20"/>
+      <string name="pixel_format" value="rgb"/><string name="component_format" value="float16"/>
+      <rfilter type="gaussian"><float name="stddev" value="0.7"/></rfilter></film>"""
+    scene = read("", sensor=f'<sensor type="perspective">{film}</sensor>')
+    assert scene.film.crop == (4, 0, 20, 30)
+    assert (scene.film.filter_stddev, scene.film.filter_radius) == (0.7, pytest.approx(2.8))
+    assert any("component_format has no effect" in note for note in scene.notes)
+
+
+@pytest.mark.parametrize("kind", ["independent", "stratified", "multijitter", "orthogonal", "ldsampler"])
+def test_any_sampler_sets_spp_and_is_noted(read, kind):
+    inside = '<integer name="sample_count" value="9"/><integer name="seed" value="4000000000"/>'
+    scene = read("", sensor=f'<sensor type="perspective"><sampler type="{kind}">{inside}</sampler></sensor>')
+    assert (scene.spp, scene.sampler) == (9, kind)
+    assert any(kind in note for note in scene.notes)
+
+
+FILM = '<film type="hdrfilm">{}</film>'
+
+
+@pytest.mark.parametrize(
+    ("inside", "words"),
+    [
+        ('<float name="fov" value="180"/>', "below 180"),
+        ('<float name="fov" value="0"/>', "above 0"),
+        ('<float name="fov" value="30"/><string name="focal_length" value="50mm"/>', "excludes fov"),
+        ('<string name="focal_length" value="5cm"/>', 'like "50mm"'),
+        ('<string name="fov_axis" value="z"/><float name="fov" value="30"/>', "use x or y"),
+        ('<float name="near_clip" value="0"/>', "above 0"),
+        ('<float name="near_clip" value="5"/><float name="far_clip" value="2"/>', "smaller than far_clip"),
+        ('<float name="aperture_radius" value="1"/>', "is not a parameter of"),
+        ('<transform name="to_world"><scale value="2"/></transform>', "turned and moved only"),
+        (FILM.format('<integer name="width" value="0"/>'), "must be from 1"),
+        (FILM.format('<integer name="width" value="40000"/><integer name="height" value="40000"/>'), "pixels"),
+        (FILM.format('<integer name="width" value="99999999999999999999999"/>'), "not an integer"),
+        (FILM.format('<string name="width" value="10"/>'), "cannot be a <string>; give it as <integer>"),
+        (FILM.format('<float name="width" value="10"/>'), "cannot be a <float>"),
+        (FILM.format('<integer name="widht" value="10"/>'), 'did you mean "width"'),
+        (FILM.format('<integer name="crop_offset_x" value="10"/>'), "beyond the film"),
+        (FILM.format('<string name="pixel_format" value="rgba"/>'), "use rgb"),
+        (FILM.format('<rfilter type="mitchell"/>'), "use one of box, tent, gaussian"),
+        (FILM.format('<rfilter type="gaussian"><float name="radius" value="2"/></rfilter>'), "it has: stddev"),
+        ('<film type="specfilm"/>', "use one of hdrfilm"),
+        ('<sampler type="independent"><integer name="sample_count" value="0"/></sampler>', "must be from 1"),
+        ('<sampler type="random"/>', "use one of independent"),
+        ("<film/>", 'lacks the attribute "type"'),
+    ],
+)
+def test_sensors_that_are_not_modelled_are_refused(refused, inside, words):
+    assert words in refused("", line=1, sensor=f'<sensor type="perspective">{inside}</sensor>')
+
+
+@pytest.mark.parametrize(
+    ("body", "words"),
+    [
+        ('<integrator type="volpath"/>', "use one of path, direct"),
+        ('<integrator type="path"><integer name="max_depth" value="0"/></integrator>', "renders black"),
+        ('<integrator type="path"><integer name="max_depth" value="-2"/></integrator>', "from -1"),
+        ('<integrator type="path"><integer name="rr_depth" value="0"/></integrator>', "from 1"),
+        ('<integrator type="direct"><integer name="emitter_samples" value="4"/></integrator>', "must be 1, is 4"),
+        (SENSOR, "one <sensor> is supported here"),
+        ('<film type="hdrfilm"/>', "not supported directly in <scene>"),
+        ('<float name="x" value="1"/>', "not supported directly in <scene>"),
+        ('<sensr type="perspective"/>', 'did you mean "sensor"?'),
+    ],
+)
+def test_top_level_elements_that_are_not_modelled_are_refused(refused, body, words):
+    assert words in refused(body)
+
+
+def test_a_scene_needs_a_sensor(refused):
+    assert "no <sensor>" in refused("", line=1, sensor="")
+
+
+def test_objects_that_nothing_uses_are_checked_and_noted(read, refused):
+    assert any("is used by nothing" in note for note in read('<bsdf type="diffuse" id="spare"/>').notes)
+    assert "plastic" in refused('<bsdf type="plastic" id="spare"/>')
+
+
+# --- files that are no scenes
+
+
+@pytest.mark.parametrize(
+    ("data", "words"),
+    [
+        (b"", ":1: not well-formed XML: no element found"),
+        (b"\x00\xff\xfe garbage", ":1: not well-formed"),
+        (b'<scene version="3.0.0">\n<shape>\n</scene>', ":3: not well-formed XML: mismatched tag"),
+        (b'<!DOCTYPE scene [<!ENTITY a "aaaa">]>\n<scene version="3.0.0">&a;</scene>', ":1: a document type"),
+        (b"<scene/>", 'lacks the attribute "version"'),
+        (b'<scene version="0.6.0"/>', 'version "0.6.0" is not supported'),
+        (b'<scene version="3.0.0" name="x"/>', 'no attribute "name"'),
+        (b'<shape type="sphere"/>', "the outermost element is"),
+        (b"<a>" * 100_000, "nested more than"),
+        (b'<?xml version="1.0" encoding="klingon"?><scene/>', ":1: "),
+    ],
+)
+def test_files_that_are_no_scenes_are_refused(tmp_path, data, words):
+    (tmp_path / "bad.xml").write_bytes(data)
+    with pytest.raises(InputError) as caught:
+        load(tmp_path / "bad.xml")
+    assert f"{tmp_path}/bad.xml:" in str(caught.value) and words in str(caught.value)
+
+
+def test_missing_files_and_folders_are_refused(tmp_path):
+    with pytest.raises(InputError, match=r"none\.xml: no such file"):
+        load(tmp_path / "none.xml")
+    with pytest.raises(InputError, match="not a file"):
+        load(tmp_path)
+    with pytest.raises(InputError, match="cannot be read|no such file"):
+        load(tmp_path / ("x" * 5000))
+
+
+def test_a_scene_file_of_gigabytes_is_refused_unread(tmp_path):
+    with open(tmp_path / "huge.xml", "wb") as file:
+        file.truncate(1 << 40)
+    with pytest.raises(InputError, match="larger than"):
+        load(tmp_path / "huge.xml")
