@@ -1,12 +1,13 @@
 """pathjax: a differentiable Monte Carlo path tracer in pure JAX."""
 
-from pathjax import runtime  # first: sets XLA up before a backend starts
+from pathjax import runtime as _runtime  # noqa: F401  first: sets XLA up before a backend starts
 from pathjax.errors import InputError
+from pathjax.query import closest_hit
 from pathjax.render import render
 from pathjax.scene import Scene, parameters, with_parameters
 
 __version__ = "0.1.0"
-__all__ = ["InputError", "Scene", "__version__", "parameters", "render", "runtime", "with_parameters"]
+__all__ = ["InputError", "Scene", "__version__", "closest_hit", "load_scene", "parameters", "render", "with_parameters"]
 
 
 def load_scene(file, **parameters) -> Scene:

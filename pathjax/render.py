@@ -35,18 +35,20 @@ def render(scene: Scene, spp: int = 64, seed: int = 0, strategy: str = "mis"):
     return image.reshape(*film.image_shape(scene.film), 3)
 
 
-def render_pixels(scene: Scene, pixels, first_sample, spp, seed, strategy: str = "mis", form: str | None = None):
-    """Means over the samples first_sample, ..., first_sample + spp - 1 of some pixels: (N,) int32 -> (N, 3)."""
+def render_pixels(scene: Scene, pixels, first_sample, spp, seed, strategy: str = "mis", **how):
+    """Means over the samples first_sample, ..., first_sample + spp - 1 of some pixels: (N,) int32 -> (N, 3).
+
+    how: `form` and `devices` of `runtime.native_map`.
+    """
     arguments = (jnp.asarray(x, jnp.uint32) for x in (first_sample, spp, seed))
-    return _render_pixels(replace(scene, about=None), pixels, *arguments, strategy=strategy, form=form)
+    return _render_pixels(replace(scene, about=None), pixels, *arguments, strategy=strategy, **how)
 
 
-@partial(jax.jit, static_argnames=("strategy", "form"))
-def _render_pixels(scene, pixels, first_sample, spp, seed, *, strategy, form):
+@partial(jax.jit, static_argnames=("strategy", "form", "devices"))
+def _render_pixels(scene, pixels, first_sample, spp, seed, *, strategy, form=None, devices=None):
     choice = emitters.choice(scene.emitters, strategy)
-    return native_map(
-        partial(_pixel_mean, strategy=strategy), pixels, scene, choice, first_sample, spp, seed, form=form
-    )
+    pixel_mean = partial(_pixel_mean, strategy=strategy)
+    return native_map(pixel_mean, pixels, scene, choice, first_sample, spp, seed, form=form, devices=devices)
 
 
 def _pixel_mean(pixel, scene, choice, first_sample, spp, seed, strategy):

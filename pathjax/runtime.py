@@ -68,7 +68,7 @@ def native() -> bool:
     return jax.default_backend() == "cpu" and _OPTION in os.environ.get("XLA_FLAGS", "")
 
 
-def native_map(f: Callable, xs, *shared, form: str | None = None):
+def native_map(f: Callable, xs, *shared, form: str | None = None, devices: int | None = None):
     """`f(x, *shared)` for every x of `xs`, on all local devices.
 
     Args:
@@ -77,12 +77,13 @@ def native_map(f: Callable, xs, *shared, form: str | None = None):
         shared: pytrees that every item sees whole.
         form: "loop" (one native sequential loop a device), "vmap" (chunks of vectorised lanes), or None: what suits
             the backend. Both give the same results up to rounding.
+        devices: how many local devices to use; None: all.
     Returns:
         pytree of arrays (N, ...); bitwise the same for every number of devices.
     """
     count = jax.tree.leaves(xs)[0].shape[0]
     form = form or ("loop" if native() else "vmap")
-    devices = jax.local_devices()
+    devices = jax.local_devices()[:devices]
     each = -(-count // len(devices))
     run = _loop if form == "loop" else partial(_vmap_chunks, chunk=_CHUNK_BYTES // _BYTES_PER_LANE)
     if len(devices) == 1:

@@ -28,9 +28,9 @@ OUTPUT.npz then holds, for run k, `images_k` (seeds, H, W, 3) float32, or with s
       "reference": null                     # or one such entry
     }
 
-`spp` is what the sampler really took: all but independent may round up (stratified to a square, say). The warm-up compiles
-(Dr.Jit keeps kernels on disk, so a second process warms up faster) and renders once; it is no part of `seconds`, each
-of which runs from the call to the image in NumPy. A statistic over seeds supposes `independent`.
+`spp` is what the sampler really took: all but independent may round up (stratified to a square, say). The warm-up
+compiles (Dr.Jit keeps kernels on disk, so a second process warms up faster) and renders once; it is no part of
+`seconds`, each of which runs from the call to the image in NumPy. A statistic over seeds supposes `independent`.
 
 Exit status: 0 done, 1 the render failed, 2 the request is wrong, 3 Mitsuba or a suitable LLVM is missing.
 """
@@ -128,8 +128,11 @@ def find_llvm() -> str:
 
 def import_mitsuba(variant: str, threads: int | None):
     """Mitsuba with `variant` set."""
-    if variant.startswith("llvm") and not os.environ.get("DRJIT_LIBLLVM_PATH"):
-        os.environ["DRJIT_LIBLLVM_PATH"] = find_llvm()
+    if variant.startswith("llvm"):
+        library = os.environ.get("DRJIT_LIBLLVM_PATH") or find_llvm()
+        if 0 < llvm_version(library) < OLDEST_LLVM:
+            raise PeerMissing(f"DRJIT_LIBLLVM_PATH names {library}: version {OLDEST_LLVM} or newer is needed")
+        os.environ["DRJIT_LIBLLVM_PATH"] = library
     try:
         import drjit
         import mitsuba as mi

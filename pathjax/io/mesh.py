@@ -14,6 +14,7 @@ import json
 import struct
 import warnings
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -247,16 +248,15 @@ def _read_gltf(path: Path) -> _Raw:
     import trimesh
     from trimesh.exchange.gltf import load_glb, load_gltf
 
-    with open(path, "rb") as file:
-        start = file.read(20)
-        binary = start[:4] == b"glTF"
-        header = json.loads(file.read(struct.unpack("<5I", start)[3]) if binary else start + file.read())
-        refused = [name for name in header.get("extensionsRequired", []) if not name.startswith("KHR_materials_")]
-        if refused or header.get("skins"):
-            refused = ", ".join(refused) or "skins"
-            raise InputError(f"{path}: glTF with {refused} is not supported; export plain triangles")
-        file.seek(0)
-        loaded = (load_glb if binary else load_gltf)(file, resolver=trimesh.resolvers.FilePathResolver(path))
+    data = path.read_bytes()
+    resolver = trimesh.resolvers.FilePathResolver(path)
+    if data[:4] == b"glTF":
+        magic, version, total, length, chunk = struct.unpack("<5I", data[:20])
+        text = _bare_gltf(path, json.loads(data[20 : 20 + length]))
+        start = struct.pack("<5I", magic, version, total - length + len(text), len(text), chunk)
+        loaded = load_glb(BytesIO(start + text + data[20 + length :]), resolver=resolver)
+    else:
+        loaded = load_gltf(BytesIO(_bare_gltf(path, json.loads(data))), resolver=resolver)
 
     graph = trimesh.scene.transforms.SceneGraph()
     for edge in loaded["graph"]:
@@ -273,6 +273,27 @@ def _read_gltf(path: Path) -> _Raw:
         uv = None if part.uv is None else part.uv * [1, -1] + [0, 1]  # trimesh has turned v upwards
         parts.append(_Raw(part.vertices @ matrix[:3, :3].T + matrix[:3, 3], faces, normals, uv))
     return _joined(parts)
+
+
+def _bare_gltf(path: Path, header: dict) -> bytes:
+    """The JSON of a glTF file with one blank material for all: trimesh reads uv only beside a material, and would
+    decode textures that nobody looks at. What trimesh would misread is refused."""
+    refused = [name for name in header.get("extensionsRequired", []) if not name.startswith("KHR_materials_")]
+    refused += ["skins"] if header.get("skins") else []
+    if any("bufferView" not in accessor for accessor in header.get("accessors", [])):
+        refused.append("accessors without data")  # trimesh makes as many zeros as they claim
+    for primitive in (primitive for mesh in header.get("meshes", []) for primitive in mesh["primitives"]):
+        primitive["material"] = 0
+        uv = primitive["attributes"].get("TEXCOORD_0")
+        if uv is not None and header["accessors"][uv]["componentType"] != GLTF_FLOAT:
+            refused.append("integer texture coordinates")
+        if primitive.get("mode") == GLTF_FAN:
+            refused.append("triangle fans")
+        if primitive.get("targets"):
+            refused.append("morph targets")
+    if refused:
+        raise InputError(f"{path}: glTF with {', '.join(refused)} is not supported; export plain triangles")
+    return json.dumps({**header, "materials": [{}]}).encode()
 
 
 def _from_trimesh(loaded: dict) -> _Raw | None:
@@ -315,6 +336,8 @@ def _joined(parts: list[_Raw | None]) -> _Raw | None:
     vertices = np.concatenate([part.vertices for part in parts])
     return _Raw(vertices, faces, column([part.normals for part in parts], 3), column([part.uv for part in parts], 2))
 
+
+GLTF_FLOAT, GLTF_FAN = 5126, 6
 
 READERS = {"obj": _read_obj, "ply": _read_ply, "stl": _read_stl, "glb": _read_gltf, "gltf": _read_gltf}
 

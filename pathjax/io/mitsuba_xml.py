@@ -8,6 +8,9 @@ from __future__ import annotations
 
 import math
 import re
+from collections import defaultdict
+from collections.abc import Iterator
+from itertools import count
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +24,7 @@ from pathjax.io.xml_reader import Document, Element, nearest, read
 MAX_PIXELS = 10**9
 
 
-def load(path: str | Path, **parameters: object) -> d.Description:
+def load(path: str | Path, /, **parameters: object) -> d.Description:
     """Read a scene file and the meshes and images that it names.
 
     Args:
@@ -39,7 +42,8 @@ class _Loader:
         self.document = document
         self.notes: list[str] = []
         self.names = set(document.ids)
-        self.made: dict[Element, object] = {}  # an element that is referenced twice is one object; None: in the making
+        self.counts: defaultdict[str, Iterator[int]] = defaultdict(count)
+        self.made: dict[Element, object] = {}  # an element that is referenced twice is one object
 
     def description(self, file: str) -> d.Description:
         scene: dict[str, list[Element]] = {tag: [] for tag in TOP_LEVEL}
@@ -65,7 +69,7 @@ class _Loader:
         for element in scene["emitter"]:
             background, background_name = self.make(element, BACKGROUNDS), element.id or self.unique("background")
         shapes = tuple(
-            self.make(element, dict.fromkeys(SHAPES, _shape), element.id or self.unique("shape", 0))
+            self.make(element, dict.fromkeys(SHAPES, _shape), element.id or self.numbered("shape"))
             for element in scene["shape"]
         )
         for element in scene["bsdf"] + scene["texture"]:
@@ -90,19 +94,19 @@ class _Loader:
     def shared(self, element: Element, table: dict, name: str):
         """A bsdf or texture; the same object each time. `name` is for one without an id."""
         if element not in self.made:
-            self.made[element] = None
             self.made[element] = self.make(element, table, element.id or name)
-        if self.made[element] is None:
-            raise element.error(f"{element} refers to itself")
         return self.made[element]
 
-    def unique(self, name: str, number: int | None = None) -> str:
-        """`name`, or `name0`, `name1`, ... from `number` on; the first that is free."""
-        candidate = name if number is None else f"{name}{number}"
-        if candidate in self.names:
-            return self.unique(name, 0 if number is None else number + 1)
-        self.names.add(candidate)
-        return candidate
+    def numbered(self, name: str) -> str:
+        """`name0`, `name1`, ...; the next that is free."""
+        return self.unique(next(each for k in self.counts[name] if (each := f"{name}{k}") not in self.names))
+
+    def unique(self, name: str) -> str:
+        """`name` if it is free, else with a number."""
+        if name in self.names:
+            return self.numbered(name)
+        self.names.add(name)
+        return name
 
 
 def _shape(loader: _Loader, fields: Fields, name: str) -> d.Shape:
@@ -118,10 +122,10 @@ def _shape(loader: _Loader, fields: Fields, name: str) -> d.Shape:
     inherited = fields.element.id or None
     nested = fields.objects("bsdf")
     if nested:
-        bsdf = loader.shared(nested[0], BSDFS, nested[0].id or inherited or loader.unique("bsdf", 0))
+        bsdf = loader.shared(nested[0], BSDFS, nested[0].id or inherited or loader.numbered("bsdf"))
     else:
         # Mitsuba: a light that is given no bsdf reflects nothing
-        bsdf = d.Diffuse(inherited or loader.unique("bsdf", 0), np.full(3, 0.5 if radiance is None else 0.0))
+        bsdf = d.Diffuse(inherited or loader.numbered("bsdf"), np.full(3, 0.5 if radiance is None else 0.0))
     return d.Shape(name, geometry, bsdf, radiance, emitter_name, flip_normals)
 
 
@@ -213,9 +217,9 @@ def _twosided(loader: _Loader, fields: Fields, name: str) -> d.Twosided:
     names = [name] if len(nested) == 1 else [loader.unique(f"{name}_{side}") for side in ("front", "back")]
     sides = []
     for element, side_name in zip(nested, names, strict=True):
-        sides.append(loader.shared(element, BSDFS, side_name))
-        if not isinstance(sides[-1], (d.Diffuse, d.Conductor)):
+        if element.attributes.get("type") not in ("diffuse", "conductor"):
             raise element.error(f"{element} cannot stand inside {fields.element}; use diffuse or conductor")
+        sides.append(loader.shared(element, BSDFS, side_name))
     return d.Twosided(name, sides[0], sides[-1])
 
 
@@ -264,8 +268,8 @@ def _path(loader: _Loader, fields: Fields) -> d.Integrator:
 
 
 def _direct(loader: _Loader, fields: Fields) -> d.Integrator:
-    for count in ("shading_samples", "emitter_samples", "bsdf_samples"):
-        fields.integer(count, 1, at_least=1, at_most=1)
+    for samples in ("shading_samples", "emitter_samples", "bsdf_samples"):
+        fields.integer(samples, 1, at_least=1, at_most=1)
     return d.Integrator(max_depth=2, hide_emitters=fields.boolean("hide_emitters", False))
 
 
@@ -288,7 +292,7 @@ def _perspective(loader: _Loader, fields: Fields) -> tuple[d.Camera, d.Film, int
 
     films, samplers = fields.objects("film"), fields.objects("sampler")
     film = loader.make(films[0], FILMS) if films else d.Film(768, 576, (0, 0, 768, 576))
-    spp = loader.make(samplers[0], dict.fromkeys(SAMPLERS, _sampler)) if samplers else 4
+    spp = loader.make(samplers[0], SAMPLERS) if samplers else 4
     return camera, film, spp, samplers[0].attributes["type"] if samplers else "independent"
 
 
@@ -319,8 +323,8 @@ def _hdrfilm(loader: _Loader, fields: Fields) -> d.Film:
         )
     fields.string("pixel_format", "rgb", choices=("rgb",))
     for name, choices in WITHOUT_EFFECT.items():
-        if fields.has(name):
-            (fields.string(name, choices=choices) if choices else fields.boolean(name))
+        given = fields.string(name, None, choices=choices) if choices else fields.boolean(name, None)
+        if given is not None:
             loader.notes.append(f"{fields.where(name).file}:{fields.where(name).line}: {name} has no effect")
     filters = fields.objects("rfilter")
     shape = loader.make(filters[0], FILTERS) if filters else ("gaussian", 2.0, 0.5)
@@ -343,8 +347,10 @@ def _gaussian(loader: _Loader, fields: Fields) -> tuple[str, float, float]:
 def _sampler(loader: _Loader, fields: Fields) -> int:
     spp = fields.integer("sample_count", 4, at_least=1)
     fields.integer("seed", 0, at_least=0, at_most=2**32 - 1)
-    for name in SAMPLERS[fields.type]:
-        fields.boolean(name, True) if name == "jitter" else fields.integer(name, 2, at_least=0)
+    if fields.type in ("stratified", "multijitter", "orthogonal"):
+        fields.boolean("jitter", True)
+    if fields.type == "orthogonal":
+        fields.integer("strength", 2, at_least=0)
     loader.notes.append(f"{fields.element}: pathjax draws its samples from its own sequence; sample_count is kept")
     return spp
 
@@ -360,14 +366,7 @@ SENSORS = {"perspective": _perspective, "thinlens": _perspective}
 FILMS = {"hdrfilm": _hdrfilm}
 FILTERS = {"box": _box, "tent": _tent, "gaussian": _gaussian}
 
-# what Mitsuba's samplers can be told besides sample_count and seed
-SAMPLERS = {
-    "independent": (),
-    "stratified": ("jitter",),
-    "multijitter": ("jitter",),
-    "orthogonal": ("jitter", "strength"),
-    "ldsampler": (),
-}
+SAMPLERS = dict.fromkeys(("independent", "stratified", "multijitter", "orthogonal", "ldsampler"), _sampler)
 
 # settings of the film that concern Mitsuba's own files and blocks, with their choices; none: a boolean
 WITHOUT_EFFECT = {

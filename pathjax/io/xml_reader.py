@@ -12,6 +12,8 @@ from difflib import get_close_matches
 from pathlib import Path
 from xml.parsers import expat
 
+import numpy as np
+
 from pathjax.errors import InputError
 
 # Far above any real scene (meshes live in files of their own), and low enough that a hostile file fails at once.
@@ -62,7 +64,7 @@ class Document:
         if element.children:
             raise element.error(f"{element} takes nothing inside")
         if element.id not in self.ids:
-            raise element.error(f'{element}: there is no such id{nearest(element.id, self.ids)}')
+            raise element.error(f"{element}: there is no such id{nearest(element.id, self.ids)}")
         return self.ids[element.id]
 
     def find(self, filename: str, element: Element) -> Path:
@@ -120,7 +122,7 @@ class _Reader:
 
     def expand(self, root: Element, chain: tuple[Path, ...]) -> Element:
         if root.tag != "scene":
-            raise root.error(f"the outermost element is {root}; a scene file starts with <scene version=\"3.0.0\">")
+            raise root.error(f'the outermost element is {root}; a scene file starts with <scene version="3.0.0">')
         require_attributes(root, required=("version",))
         if not re.fullmatch(r"[23]\.\d+\.\d+", root.attributes["version"]):
             version = root.attributes["version"]
@@ -250,4 +252,4 @@ def _find(filename: str, folders: list[Path] | tuple[Path, ...], element: Elemen
 def _as_text(value: object) -> str:
     if isinstance(value, bool):
         return str(value).lower()
-    return ", ".join(map(str, value)) if isinstance(value, (list, tuple)) else str(value)
+    return ", ".join(map(str, value)) if np.ndim(value) == 1 else str(value)

@@ -100,7 +100,7 @@ def binary_tree(unit, choose, leaf_size):
         leaf_of: (P,) int64, the leaf that holds each primitive.
     """
     p = unit.shape[2]
-    rows = np.zeros((p, 8), np.float32)                            # 32 bytes: NumPy gathers them several times faster than 24
+    rows = np.zeros((p, 8), np.float32)                            # of 32 bytes, which NumPy gathers faster than 24
     rows[:, :3], rows[:, 3:6] = unit[0].T, unit[1].T + THICKNESS
     rows = rows.view(np.int32)
     centre = unit[0] + unit[1]
@@ -148,7 +148,10 @@ def split(order, rows, centre, count, side, choose, leaf_size):
     """Split M neighbouring nodes: `order` (3, n) becomes, in place, the order of their 2 M children.
 
     Args:
-        rows: (P, 8) int32, the bits of lo, hi and nothing; centre: (3, P) float32; count: (M,); side: (P,) bool, scratch.
+        rows:   (P, 8) int32, the bits of lo (3), of hi (3) and padding.
+        centre: (3, P) float32.
+        count:  (M,) primitives of each node.
+        side:   (P,) bool, scratch.
     Returns: (M,) how many go to the left child.
     """
     first = np.cumsum(count) - count

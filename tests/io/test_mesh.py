@@ -62,8 +62,8 @@ def mitsuba_mesh(path, kind, to_world, inside=""):
     mi = pytest.importorskip("mitsuba")
     mi.set_variant("scalar_rgb")
     mi.set_log_level(mi.LogLevel.Error)
-    matrix = " ".join(map(str, to_world.ravel()))
-    inside += f'<string name="filename" value="{path}"/><transform name="to_world"><matrix value="{matrix}"/></transform>'
+    matrix = f'<matrix value="{" ".join(map(str, to_world.ravel()))}"/>'
+    inside += f'<string name="filename" value="{path}"/><transform name="to_world">{matrix}</transform>'
     scene = mi.load_string(f'<scene version="3.0.0"><shape type="{kind}">{inside}</shape></scene>')
     params = mi.traverse(scene.shapes()[0])
     faces = np.array(params["faces"]).reshape(-1, 3)
@@ -114,12 +114,12 @@ def test_real_meshes_agree_with_mitsuba(name):
     assert_agrees(path, path.suffix[1:], TURN, face_normals=False)
 
 
-@pytest.mark.parametrize(("kind", "text", "default"), [("obj", OBJ["uv seam"], True), ("ply", PLY["normals and uv"], False)])
-def test_v_points_down_unless_the_file_is_said_to_have_it_so(write, kind, text, default):
+@pytest.mark.parametrize(("kind", "text"), [("obj", OBJ["uv seam"]), ("ply", PLY["normals and uv"])])
+def test_v_is_flipped_by_default_for_obj_alone(write, kind, text):
     path = write(kind, text)
-    as_is, flipped, by_default = (load(path, kind, IDENTITY, flip_tex_coords=flip)[0].uv for flip in (False, True, None))
+    as_is, flipped, default = (load(path, kind, IDENTITY, flip_tex_coords=flip)[0].uv for flip in (False, True, None))
     np.testing.assert_allclose(flipped, as_is * [1, -1] + [0, 1])
-    np.testing.assert_array_equal(by_default, flipped if default else as_is)
+    np.testing.assert_array_equal(default, flipped if kind == "obj" else as_is)
 
 
 def test_winding_agrees_with_the_normals_of_the_file_also_under_a_mirror(write):
@@ -174,15 +174,17 @@ def test_vertices_without_normal_get_a_smooth_one_and_a_note(write):
         ("ply", PLY_HEADER.format(3) + PLY_FACES.format(1) + "0 0 0\n1 0 0\n0 1 0\n3 0 1 -1\n", "there are 3"),
         ("ply", PLY_HEADER.format(3) + PLY_FACES.format(1) + "0 0 0\n1 0 nan\n0 1 0\n3 0 1 2\n", "vertex 1"),
         ("ply", PLY_HEADER.format(3) + "end_header\n0 0 0\n1 0 0\n0 1 0\n", "empty"),
-        ("ply", PLY_HEADER.format(3) + PLY_FACES.format(2) + "0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n", "ends after 1 of 2 face rows"),
+        ("ply", PLY_HEADER.format(3) + PLY_FACES.format(2) + "0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n", "after 1 of 2 face"),
         ("ply", "not a ply", "cannot be read as PLY"),
         ("stl", b"solid nothing\nendsolid", "empty"),
         ("stl", b"\0" * 84, "empty"),
         ("glb", b"glTF", "cannot be read as GLB"),
         ("gltf", "{}", "empty"),
         ("gltf", "[]", "cannot be read as GLTF"),
-        ("gltf", '{"extensionsRequired": ["KHR_draco_mesh_compression"]}', "KHR_draco_mesh_compression is not supported"),
+        ("gltf", '{"extensionsRequired": ["KHR_draco_mesh_compression"]}', "KHR_draco_mesh_compression is not"),
+        ("gltf", '{"meshes": [{"primitives": [{"attributes": {}, "mode": 6}]}]}', "triangle fans is not"),
         ("gltf", '{"skins": [{}]}', "skins is not supported"),
+        ("gltf", '{"accessors": [{"componentType": 5126, "count": 100000000000, "type": "VEC3"}]}', "without data"),
     ],
 )
 def test_what_is_no_mesh_is_refused(refused, kind, text, words):
@@ -224,8 +226,7 @@ def gltf(node: dict, image_v: float = 0.25) -> tuple[dict, bytes]:
         "buffers": [{"byteLength": len(data)}],
         "bufferViews": views,
         "accessors": accessors,
-        "materials": [{}],
-        "meshes": [{"primitives": [{"attributes": attributes, "indices": 3, "material": 0}]}],
+        "meshes": [{"primitives": [{"attributes": attributes, "indices": 3}]}],
         "nodes": [{"mesh": 0, **node}, {"children": [0], "scale": [2, 2, 2]}],
         "scenes": [{"nodes": [1]}],
         "scene": 0,

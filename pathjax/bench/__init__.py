@@ -1,0 +1,1 @@
+"""Speed against error, beside a peer in the same run."""

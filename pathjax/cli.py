@@ -1,0 +1,244 @@
+"""The command line: parses, calls, prints. Results on stdout; progress and messages on stderr.
+
+Exit status: 0 done, 1 the work failed, 2 the command or a file is wrong.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import threading
+import time
+from pathlib import Path
+
+from pathjax.errors import InputError
+
+DONE, FAILED, WRONG = 0, 1, 2
+
+
+def main(arguments: list[str] | None = None) -> int:
+    options = _parser().parse_args(arguments)
+    try:
+        return options.run(options)
+    except InputError as error:
+        print(f"pathjax: {error}", file=sys.stderr)
+        return WRONG
+    except KeyboardInterrupt:
+        print("pathjax: interrupted; nothing was written", file=sys.stderr)
+        return FAILED
+    except BrokenPipeError:
+        sys.stderr.close()
+        return FAILED
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="pathjax", description="A differentiable Monte Carlo path tracer in pure JAX.")
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+
+    render = commands.add_parser("render", help="render a scene to an image")
+    _add_scene(render)
+    render.add_argument("-o", "--output", required=True, metavar="OUT.{exr,png}")
+    render.add_argument("--spp", type=_positive, metavar="N", help="samples per pixel; default: the file's")
+    render.add_argument("--seed", type=_seed, default=0, metavar="K")
+    render.add_argument("--strategy", choices=("mis", "light", "bsdf"), default="mis", help="how light is sampled")
+    render.add_argument("--json", action="store_true", help="print one JSON object on stdout")
+    render.set_defaults(run=_render)
+
+    info = commands.add_parser("info", help="what a scene holds and what is compiled for it")
+    _add_scene(info)
+    info.add_argument("--json", action="store_true", help="print one JSON object on stdout")
+    info.set_defaults(run=_info)
+
+    bench = commands.add_parser("bench", help="speed against error")
+    bench.add_argument("scenes", nargs="+", metavar="SCENE.xml")
+    bench.add_argument("-D", dest="defines", action="append", default=[], type=_pair, metavar="name=value")
+    bench.add_argument("--against", choices=("mitsuba",), help="measure this peer in the same run")
+    bench.add_argument("--spp", type=_spp_list, default=[16, 64, 256], metavar="16,64,256")
+    bench.add_argument("--reference-spp", type=_positive, default=16384, metavar="N", help="of the converged reference")
+    bench.add_argument("--repeat", type=_positive, default=5, metavar="N", help="timed runs of each; medians are shown")
+    bench.add_argument("-o", "--output", metavar="DIR", help="also write bench.json and bench.md there")
+    bench.add_argument("--json", action="store_true", help="print one JSON object on stdout")
+    bench.set_defaults(run=_bench)
+    return parser
+
+
+def _add_scene(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("scene", metavar="SCENE.xml")
+    parser.add_argument(
+        "-D", dest="defines", action="append", default=[], type=_pair, metavar="name=value", help="a $name of the file"
+    )
+    parser.add_argument(
+        "--set", dest="settings", action="append", default=[], type=_pair, metavar="NAME=VALUE", help="a parameter"
+    )
+
+
+def _pair(text: str) -> tuple[str, str]:
+    name, equals, value = text.partition("=")
+    if not name or not equals:
+        raise argparse.ArgumentTypeError(f"{text!r} is not of the form name=value")
+    return name, value
+
+
+def _positive(text: str) -> int:
+    if not text.isdecimal() or not 0 < int(text) < 2**31:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a positive integer below 2^31")
+    return int(text)
+
+
+def _seed(text: str) -> int:
+    if not text.isdecimal() or int(text) >= 2**31:
+        raise argparse.ArgumentTypeError(f"{text!r} is not an integer in [0, 2^31)")
+    return int(text)
+
+
+def _spp_list(text: str) -> list[int]:
+    return [_positive(part) for part in text.split(",")]
+
+
+def _numbers(name: str, text: str):
+    try:
+        values = [float(part) for part in text.split(",")]
+    except ValueError:
+        raise InputError(f"--set {name}={text}: a value is a number, or three separated by commas") from None
+    return values[0] if len(values) == 1 else values
+
+
+def _load(options):
+    import pathjax
+
+    scene = pathjax.load_scene(options.scene, **dict(options.defines))
+    return pathjax.with_parameters(scene, {name: _numbers(name, text) for name, text in options.settings})
+
+
+# ---- render -------------------------------------------------------------------------------------------------------
+
+
+def _render(options) -> int:
+    output = Path(options.output)
+    if output.suffix.lower() not in (".exr", ".png"):
+        raise InputError(f"{output}: images are written as .exr or .png")
+    if not output.parent.is_dir():
+        raise InputError(f"{output}: there is no folder {output.parent}; make it first")
+    if output.is_dir():
+        raise InputError(f"{output}: is a folder; name a file")
+    started = time.perf_counter()
+    scene = _load(options)
+
+    from pathjax.progressive import ProgressiveRender
+
+    spp = options.spp or scene.about.description.spp
+    progressive = ProgressiveRender(scene, spp, options.seed, options.strategy)
+    loaded = time.perf_counter()
+    interrupted, first_call = _run_passes(progressive)
+    finished = time.perf_counter()
+    fewest, most = progressive.samples()
+    if most == 0:
+        raise KeyboardInterrupt
+    image = progressive.image()
+    _write(output, image, scene, options, most)
+    pixels_lost = int((image != image).any(-1).sum())
+    if pixels_lost:
+        print(f"pathjax: {pixels_lost} pixels met a sample that is not finite, and hold nan", file=sys.stderr)
+    if interrupted:
+        print(f"pathjax: interrupted; {output} holds {_range(fewest, most)} of {spp} spp", file=sys.stderr)
+    if options.json:
+        report = {
+            "output": str(output),
+            "width": image.shape[1],
+            "height": image.shape[0],
+            "spp": most,
+            "seed": options.seed,
+            "load_seconds": loaded - started,
+            "compile_seconds": first_call,
+            "run_seconds": finished - loaded - first_call,
+            "error": progressive.error() if fewest > 1 else None,
+            "not_finite_pixels": pixels_lost,
+            "interrupted": interrupted,
+        }
+        print(json.dumps(report))
+    return FAILED if interrupted else DONE
+
+
+def _run_passes(progressive) -> tuple[bool, float]:
+    """Render with a progress bar; returns whether Ctrl-C ended it, and the seconds of the first call (compilation)."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+    _, height, width = progressive.spp, *progressive.image().shape[:2]
+    columns = TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[status]}"), TimeRemainingColumn()
+    calls = iter(progressive)
+    started = time.perf_counter()
+    first_call = 0.0
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("compiling", total=width * height * progressive.spp, status="")
+        try:
+            bar.advance(task, _interruptible(lambda: next(calls)))
+            first_call = time.perf_counter() - started
+            for paths in calls:
+                fewest, most = progressive.samples()
+                status = f"{_range(fewest, most)}/{progressive.spp} spp"
+                if fewest == most and most > 1:
+                    status += f"  error {progressive.error():.2%}"
+                bar.update(task, advance=paths, description="rendering", status=status)
+        except KeyboardInterrupt:
+            return True, first_call
+    return False, first_call
+
+
+def _interruptible(call):
+    """The call's result, waited for in a way that Ctrl-C ends at once (compilation itself cannot be interrupted)."""
+    outcome = []
+
+    def work():
+        try:
+            outcome.append((True, call()))
+        except BaseException as error:
+            outcome.append((False, error))
+
+    thread = threading.Thread(target=work, daemon=True)
+    thread.start()
+    while thread.is_alive():
+        thread.join(0.1)
+    succeeded, result = outcome[0]
+    if not succeeded:
+        raise result
+    return result
+
+
+def _range(fewest: int, most: int) -> str:
+    return str(most) if fewest == most else f"{fewest}-{most}"
+
+
+def _write(output: Path, image, scene, options, spp: int) -> None:
+    from pathjax import __version__
+    from pathjax.io import image as files
+
+    if output.suffix.lower() == ".png":
+        files.write_png(output, image)
+        return
+    header = {
+        "pathjax.version": __version__,
+        "pathjax.scene": str(options.scene),
+        "pathjax.parameters": " ".join(f"{name}={value}" for name, value in options.defines + options.settings),
+        "pathjax.spp": spp,
+        "pathjax.seed": options.seed,
+    }
+    files.write_exr(output, {name: image[..., i] for i, name in enumerate("RGB")}, header)
+
+
+# ---- info and bench -----------------------------------------------------------------------------------------------
+
+
+def _info(options) -> int:
+    from pathjax import report
+
+    facts = report.facts(_load(options))
+    print(json.dumps(facts) if options.json else report.text(facts))
+    return DONE
+
+
+def _bench(options) -> int:
+    from pathjax.bench import bench
+
+    return bench.run(options)

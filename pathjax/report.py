@@ -1,0 +1,99 @@
+"""What `pathjax info` tells: what a scene holds, what is compiled for it, its parameters, its hierarchies."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pathjax import bsdfs, film
+from pathjax.scene import UNBOUNDED, Scene, parameters
+from pathjax.shapes.planar import Planar
+
+_SAMPLER = "Owen-scrambled Sobol' pairs for the first bounces, hashing after"
+
+
+def facts(scene: Scene) -> dict:
+    """Everything as JSON-ready values."""
+    about = scene.about
+    description = about.description
+    max_depth = int(scene.max_depth)
+    height, width = film.image_shape(scene.film)
+    return {
+        "file": description.file,
+        "image": {"width": width, "height": height, "filter": scene.film.filter, "spp": description.spp},
+        "camera": "thinlens" if scene.camera.lens is not None else "perspective",
+        "integrator": {
+            "max_depth": None if max_depth == UNBOUNDED else max_depth,
+            "rr_depth": int(scene.rr_depth),
+            "hide_emitters": scene.hide_emitters,
+        },
+        "sampler": {"file": description.sampler, "used": _SAMPLER},
+        "shapes": len(description.shapes),
+        "primitives": {_kind(table): int((np.asarray(table.rows) >= 0).sum()) for table in scene.geometry.tables},
+        "compiled": {
+            "shapes": [_kind(table) + (" (tree)" if table.tree else " (flat)") for table in scene.geometry.tables],
+            "bsdfs": [type(table).__name__.removesuffix("Table").lower() for table in scene.materials.tables],
+            "light sampling": bsdfs.any_smooth(scene.materials) and scene.emitters.area is not None,
+            "emitters": [name for name in ("area", "constant") if getattr(scene.emitters, name) is not None],
+            "dtype": str(scene.camera.origin.dtype),
+        },
+        "trees": {
+            kind: {
+                "nodes": len(tree.child),
+                "leaves": len(tree.leaf_first),
+                "depth": tree.depth,
+                "primitives per leaf": float(tree.leaf_count.mean()),
+                "sah cost": float(tree.sah_cost),
+            }
+            for kind, tree in about.trees.items()
+        },
+        "parameters": {
+            name: {"value": np.asarray(value).tolist(), "shape": list(value.shape), "bounds": _bounds(about, name)}
+            for name, value in parameters(scene).items()
+        },
+        "notes": list(description.notes),
+    }
+
+
+def _bounds(about, name):
+    low, high = about.parameters[name].bounds
+    return [low, None if high == np.inf else high]
+
+
+def _kind(table) -> str:
+    if isinstance(table, Planar):
+        return "disks" if table.disk else "rectangles"
+    return type(table).__name__.lower()
+
+
+def text(facts: dict) -> str:
+    """The same for people."""
+    image, integrator, compiled = facts["image"], facts["integrator"], facts["compiled"]
+    depth = "unbounded" if integrator["max_depth"] is None else integrator["max_depth"]
+    lines = [
+        facts["file"],
+        f"image       {image['width']} x {image['height']}, {image['filter']} filter, {image['spp']} spp by default",
+        f"camera      {facts['camera']}",
+        f"integrator  path, max_depth {depth}, roulette from depth {integrator['rr_depth']}"
+        + (", emitters hidden" if integrator["hide_emitters"] else ""),
+        f"sampler     {facts['sampler']['used']} (the file asks for {facts['sampler']['file']})",
+        f"shapes      {facts['shapes']}: " + _listed(f"{n} {kind}" for kind, n in facts["primitives"].items()),
+        "compiled    " + _listed([*compiled["shapes"], *compiled["bsdfs"]]) + f"; {compiled['dtype']}",
+        "light       " + _listed(compiled["emitters"]) + (", sampled" if compiled["light sampling"] else ", not sampled"),
+    ]
+    for kind, tree in facts["trees"].items():
+        lines.append(
+            f"tree        {kind}s: {tree['nodes']} nodes, {tree['leaves']} leaves of {tree['primitives per leaf']:.1f}, "
+            f"depth {tree['depth']}, SAH cost {tree['sah cost']:.1f}"
+        )
+    lines.append("parameters" if facts["parameters"] else "parameters  none")
+    for name, parameter in facts["parameters"].items():
+        low, high = parameter["bounds"]
+        value = parameter["value"]
+        shown = ", ".join(f"{x:g}" for x in value) if isinstance(value, list) else f"{value:g}"
+        lines.append(f"  {name:32} {shown:28} in [{low:g}, {'inf' if high is None else format(high, 'g')}]")
+    lines += [f"note        {note}" for note in facts["notes"]]
+    return "\n".join(lines)
+
+
+def _listed(items) -> str:
+    return ", ".join(items) or "none"
