@@ -58,6 +58,9 @@ def radiance(scene, choice: Choice | None, ray: Ray, numbers, strategy: str):
     shapes, materials = scene.geometry, scene.materials
     sample_lights = strategy != "bsdf" and choice is not None and bsdfs.any_smooth(materials)
 
+    def end(path: Path) -> Path:
+        return path._replace(alive=jnp.bool_(False))
+
     def extend(path: Path) -> Path:
         ray = path.ray
         hit = geometry.closest_hit(shapes, ray)
@@ -81,7 +84,9 @@ def radiance(scene, choice: Choice | None, ray: Ray, numbers, strategy: str):
         else:
             share = jnp.where((strategy == "light") & sample_lights & jnp.isfinite(path.pdf) & (pdf_light > 0), 0, 1)
         if scene.hide_emitters:
+            # What emits lets camera rays through, as in Mitsuba; the background is black to them.
             share = jnp.where(path.depth == 0, 0, share)
+            hidden = found & (path.depth == 0) & geometry.emits(shapes, hit)
         path = path._replace(L=path.L + path.throughput * Le * share, depth=path.depth + 1)
 
         def scatter(path: Path) -> Path:
@@ -133,9 +138,13 @@ def radiance(scene, choice: Choice | None, ray: Ray, numbers, strategy: str):
             return Path(spawn_ray(surface, d, hit.primitive), L, throughput, pdf, eta, path.depth, alive)
 
         if not shapes.tables:
-            return path._replace(alive=jnp.bool_(False))
+            return end(path)
         goes_on = found & (path.depth < scene.max_depth)
-        return lax.cond(goes_on, scatter, lambda path: path._replace(alive=jnp.bool_(False)), path)
+        if scene.hide_emitters:
+            beyond = spawn_ray(surface, ray.d, hit.primitive)._replace(t_max=ray.t_max - hit.t)
+            through = path._replace(ray=beyond, depth=jnp.int32(0))
+            return lax.cond(hidden, lambda path: through, lambda path: lax.cond(goes_on, scatter, end, path), path)
+        return lax.cond(goes_on, scatter, end, path)
 
     one = jnp.ones_like(ray.t_max)
     zero3 = jnp.zeros_like(ray.o)

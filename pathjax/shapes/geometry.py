@@ -113,6 +113,11 @@ def surface(geometry: Geometry, ray: Ray, hit: Hit) -> Surface:
     return switch_by_range(primitive, first, [of(*pair) for pair in zip(geometry.tables, first, strict=True)])
 
 
+def emits(geometry: Geometry, hit: Hit):
+    """() bool: whether what was hit is a light."""
+    return (hit.primitive >= 0) & (at(geometry.light, jnp.maximum(hit.primitive, 0)) >= 0)
+
+
 def switch_by_range(number, first: list[int], branches):
     """Call the branch whose range, starting at first[i], holds the number. One branch is called without a test."""
     if len(branches) == 1:
