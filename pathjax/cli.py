@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import sys
 import threading
 import time
@@ -33,7 +34,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="pathjax", description="A differentiable Monte Carlo path tracer in pure JAX.")
+    parser = argparse.ArgumentParser(prog="pathjax", description="A differentiable Monte Carlo path tracer.")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
 
     render = commands.add_parser("render", help="render a scene to an image")
@@ -165,7 +166,7 @@ def _run_passes(progressive) -> tuple[bool, float]:
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-    _, height, width = progressive.spp, *progressive.image().shape[:2]
+    height, width = progressive.image().shape[:2]
     columns = TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[status]}"), TimeRemainingColumn()
     calls = iter(progressive)
     started = time.perf_counter()
@@ -198,8 +199,13 @@ def _interruptible(call):
 
     thread = threading.Thread(target=work, daemon=True)
     thread.start()
-    while thread.is_alive():
-        thread.join(0.1)
+    try:
+        while thread.is_alive():
+            thread.join(0.1)
+    except KeyboardInterrupt:
+        # The compiler cannot be stopped, and aborts the process if the interpreter ends under it.
+        print("pathjax: interrupted; nothing was written", file=sys.stderr, flush=True)
+        os._exit(FAILED)
     succeeded, result = outcome[0]
     if not succeeded:
         raise result

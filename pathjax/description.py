@@ -73,7 +73,7 @@ BSDF = Diffuse | Dielectric | Conductor | Twosided
 class Sphere:
     center: np.ndarray  # (3,) float64, world
     radius: float
-    to_world: np.ndarray  # rigid motion and uniform scale of the unit sphere at the origin; only its rotation is needed (uv)
+    to_world: np.ndarray  # carries the unit sphere at the origin; only its rotation matters further (uv)
 
 
 @dataclass(frozen=True)

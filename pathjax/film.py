@@ -17,7 +17,7 @@ from pathjax.core.math import at
 from pathjax.core.warp import tent
 
 # Steps of the tabulated inverse of the Gaussian's running integral; its density is sampled exactly, step by step.
-_STEPS = 64
+_STEPS = 1024
 
 
 @jax.tree_util.register_dataclass
@@ -43,7 +43,7 @@ class Film:
 def build(film: description.Film, dtype) -> Film:
     gaussian = None
     if film.filter == "gaussian":
-        x = np.linspace(-film.filter_radius, film.filter_radius, 16 * _STEPS * 8 + 1)
+        x = np.linspace(-film.filter_radius, film.filter_radius, 16 * _STEPS + 1)
         f = _gaussian(x, film.filter_stddev, film.filter_radius, np)
         running = np.concatenate([[0], np.cumsum((f[1:] + f[:-1]) / 2 * np.diff(x))])
         knots = np.interp(np.linspace(0, running[-1], _STEPS + 1), running, x)
@@ -86,7 +86,8 @@ def _gaussian(x, stddev, radius, xp=jnp):
 
 def _sample_gaussian(table: Gaussian, u):
     step = jnp.minimum((u * _STEPS).astype(jnp.int32), _STEPS - 1)
-    low, high = at(table.knots, step), at(table.knots, step + 1)
+    low = jnp.stack([at(table.knots, step[0]), at(table.knots, step[1])])
+    high = jnp.stack([at(table.knots, step[0] + 1), at(table.knots, step[1] + 1)])
     x = low + (u * _STEPS - step) * (high - low)
     density = 1 / (_STEPS * (high - low))
     return x, _gaussian(x, table.stddev, table.radius) * table.scale / density

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import partial
 
 import jax
 import jax.numpy as jnp
 
-from pathjax.core.math import normalize
+from pathjax.core.math import normalize, rescale
 from pathjax.core.types import Hit, Ray
 from pathjax.runtime import native_map
 from pathjax.scene import Scene
@@ -32,7 +31,7 @@ def closest_hit(scene: Scene, origins, directions) -> Hit:
 def _closest_hit(shapes, origins, directions, form=None, devices=None):
     def one(ray, shapes):
         o, d = ray
-        ray = Ray(o, normalize(d), jnp.full_like(o[0], jnp.inf), jnp.int32(-1))
+        ray = Ray(o, normalize(rescale(d)), jnp.full_like(o[0], jnp.inf), jnp.int32(-1))
         return geometry.closest_hit(shapes, ray)
 
     return native_map(one, (origins, directions), shapes, form=form, devices=devices)

@@ -76,14 +76,14 @@ def text(facts: dict) -> str:
         f"integrator  path, max_depth {depth}, roulette from depth {integrator['rr_depth']}"
         + (", emitters hidden" if integrator["hide_emitters"] else ""),
         f"sampler     {facts['sampler']['used']} (the file asks for {facts['sampler']['file']})",
-        f"shapes      {facts['shapes']}: " + _listed(f"{n} {kind}" for kind, n in facts["primitives"].items()),
-        "compiled    " + _listed([*compiled["shapes"], *compiled["bsdfs"]]) + f"; {compiled['dtype']}",
-        "light       " + _listed(compiled["emitters"]) + (", sampled" if compiled["light sampling"] else ", not sampled"),
+        f"shapes      {facts['shapes']}: {_listed(f'{n} {kind}' for kind, n in facts['primitives'].items())}",
+        f"compiled    {_listed([*compiled['shapes'], *compiled['bsdfs']])}; {compiled['dtype']}",
+        "lights      " + _listed(compiled["emitters"]) + ("" if compiled["light sampling"] else ", not sampled"),
     ]
     for kind, tree in facts["trees"].items():
         lines.append(
-            f"tree        {kind}s: {tree['nodes']} nodes, {tree['leaves']} leaves of {tree['primitives per leaf']:.1f}, "
-            f"depth {tree['depth']}, SAH cost {tree['sah cost']:.1f}"
+            f"tree        {kind}s: {tree['nodes']} nodes, {tree['leaves']} leaves "
+            f"of {tree['primitives per leaf']:.1f}, depth {tree['depth']}, SAH cost {tree['sah cost']:.1f}"
         )
     lines.append("parameters" if facts["parameters"] else "parameters  none")
     for name, parameter in facts["parameters"].items():

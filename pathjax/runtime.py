@@ -39,7 +39,7 @@ def _set_up() -> None:
     devices_chosen = _DEVICE_FLAG in flags or jax.config.jax_num_cpu_devices >= 0
     try:
         if not devices_chosen:
-            jax.config.update("jax_num_cpu_devices", len(os.sched_getaffinity(0)) if _has_affinity() else os.cpu_count())
+            jax.config.update("jax_num_cpu_devices", _cores())
         elif wanted:
             # The update refuses a started backend: the one public way to ask whether it has started.
             chosen = jax.config.jax_num_cpu_devices
@@ -56,8 +56,9 @@ def _set_up() -> None:
             )
 
 
-def _has_affinity() -> bool:
-    return hasattr(os, "sched_getaffinity")  # Linux only
+def _cores() -> int:
+    """Those that this process may use, where the system tells."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 _set_up()

@@ -195,7 +195,8 @@ def _conductor(bsdfs, dtype, parameters, path) -> ConductorTable:
 def _dielectric(bsdfs, dtype, parameters, path) -> DielectricTable:
     for row, bsdf in enumerate(bsdfs):
         for name in ("int_ior", "ext_ior"):
-            parameters[f"{bsdf.name}.{name}"] = Parameter((*path, name), (row,), (), (np.finfo(np.float32).tiny, np.inf))
+            positive = (float(np.finfo(np.float32).tiny), np.inf)
+            parameters[f"{bsdf.name}.{name}"] = Parameter((*path, name), (row,), (), positive)
     int_ior, ext_ior = (np.array([getattr(bsdf, name) for bsdf in bsdfs]) for name in ("int_ior", "ext_ior"))
     return DielectricTable(jnp.asarray(int_ior, dtype), jnp.asarray(ext_ior, dtype))
 
@@ -306,7 +307,7 @@ def _area_lights(radiance, lights, names, dtype) -> AreaLights:
     if any(a is not None for a in areas):
         sizes = [0 if a is None else len(a) for a in areas]
         cdf_first = jnp.asarray(np.cumsum([0, *sizes[:-1]]), jnp.int32)
-        cdf = jnp.asarray(np.cumsum(np.concatenate([a for a in areas if a is not None])), dtype)
+        cdf = jnp.asarray(np.concatenate([np.cumsum(a) / np.sum(a) for a in areas if a is not None]), dtype)
     return AreaLights(
         jnp.asarray(np.stack(radiance), dtype),
         jnp.asarray(emitter, jnp.int32),
@@ -325,7 +326,8 @@ def _spheres(parts, name, dtype, rule):
     linear = np.stack([ball.to_world[:3, :3] for part in parts for ball, _ in part])
     rotation = linear / np.linalg.norm(linear, axis=1, keepdims=True)
     sign = np.array([-1.0 if flip else 1.0 for part in parts for _, flip in part])
-    leaves, rows, tree, built = geometry_module.leaves_of(sphere.leaf_numbers(balls), *sphere.bounds(balls), dtype, rule)
+    numbers, bounds = sphere.leaf_numbers(balls), sphere.bounds(balls)
+    leaves, rows, tree, built = geometry_module.leaves_of(numbers, *bounds, dtype, rule)
     to_local = np.swapaxes(rotation, 1, 2)
     arrays = (jnp.asarray(x, dtype) for x in (balls, to_local, sign))
     return Spheres(leaves, rows, tree, *arrays), built
@@ -398,7 +400,7 @@ def _checked(name, value, parameter: Parameter, dtype):
         raise InputError(f"{name} takes {wanted}, not {value!r}") from None
     if not isinstance(value, jax.core.Tracer):
         low, high = parameter.bounds
-        if not bool(jnp.all((value >= low) & (value <= high))):
+        if not bool(jnp.all((value >= low) & (value <= high) & jnp.isfinite(value))):
             raise InputError(f"{name} = {np.asarray(value).tolist()} lies outside its bounds [{low:g}, {high:g}]")
     return value
 

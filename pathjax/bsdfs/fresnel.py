@@ -1,10 +1,10 @@
-"""Fresnel reflectance of unpolarised light. Cosines are of the incident direction; `eta` is transmitted over incident IOR."""
+"""Fresnel reflectance of unpolarised light. Cosines are incident; `eta` is the transmitted over the incident IOR."""
 
 from __future__ import annotations
 
 import jax.numpy as jnp
 
-from pathjax.core.math import safe_sqrt
+from pathjax.core.math import larger, safe_sqrt, smaller
 
 
 def dielectric(cos_i, eta):
@@ -17,15 +17,15 @@ def dielectric(cos_i, eta):
         R (), in [0, 1]; cos_t () >= 0, 0 under total internal reflection, where R = 1.
     Derivatives are finite everywhere: at and beyond the critical angle they are those of the constant 1.
     """
-    sin2_t = (1 - cos_i) * (1 + cos_i) / (eta * eta)
-    cos2_t = 1 - sin2_t
+    # With the contrast taken out, nothing cancels: equal media reflect 0 at any angle, with derivative 0.
+    contrast = (eta - 1) * (eta + 1)
+    cos2_t = (cos_i * cos_i + contrast) / (eta * eta)
+    refracts = cos2_t > 0
     cos_t = safe_sqrt(cos2_t)
-    # Both numerators vanish at grazing incidence on equal media; the denominators only at cos_i = cos_t = 0.
-    s_sum, p_sum = cos_i + eta * cos_t, eta * cos_i + cos_t
-    inside = (cos2_t > 0) & (s_sum > 0) & (p_sum > 0)
-    r_s = (cos_i - eta * cos_t) / jnp.where(inside, s_sum, 1)
-    r_p = (eta * cos_i - cos_t) / jnp.where(inside, p_sum, 1)
-    return jnp.where(inside, (r_s * r_s + r_p * r_p) / 2, 1), cos_t
+    s, p = cos_i + eta * cos_t, eta * cos_i + cos_t
+    r_s = contrast / jnp.where(refracts, s * s, 1)
+    r_p = contrast * ((eta * eta + 1) * cos_i * cos_i - 1) / jnp.where(refracts, eta * eta * p * p, 1)
+    return jnp.where(refracts, smaller((r_s * r_s + r_p * r_p) / 2, jnp.ones_like(cos_t)), 1), cos_t
 
 
 def conductor(cos_i, eta, k):
@@ -44,7 +44,7 @@ def conductor(cos_i, eta, k):
     r_s = _ratio(t1 - t2, t1 + t2)
     t3, t4 = cos2 * a2_b2 + sin2 * sin2, t2 * sin2
     r_p = r_s * _ratio(t3 - t4, t3 + t4)
-    return (r_s + r_p) / 2
+    return larger((r_s + r_p) / 2, jnp.zeros_like(r_s))
 
 
 def _ratio(a, b):

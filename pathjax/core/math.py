@@ -29,8 +29,13 @@ def larger(a, b):
 
 
 def at(table, *index):
-    """`table[index]` for indices known to lie inside: no wrap-around, no clamp."""
-    return table.at[index].get(mode="promise_in_bounds")
+    """`table[index]` for integers known to lie inside: one contiguous load. (Plain indexing, which counts negative
+    indices from the end, and gathers cost a dozen instructions each in the kernel.)
+    """
+    rest = table.shape[len(index) :]
+    start = [jnp.asarray(i, jnp.int32) for i in index] + [jnp.int32(0)] * len(rest)
+    block = lax.dynamic_slice(table, start, (1,) * len(index) + rest, allow_negative_indices=False)
+    return block.reshape(rest)
 
 
 def safe_sqrt(x):
@@ -50,6 +55,18 @@ def normalize(v):
     squared = dot(v, v)
     positive = squared > 0
     return jnp.where(positive, v * lax.rsqrt(jnp.where(positive, squared, 1)), 0)
+
+
+def rescale(v):
+    """v over its largest component: neither squares nor products of the result overflow or underflow."""
+    largest = jnp.max(jnp.abs(v))
+    return v / lax.stop_gradient(jnp.where(largest > 0, largest, 1))
+
+
+def safe_atan2(y, x):
+    """atan2 with value and derivatives 0 at the origin."""
+    origin = (x == 0) & (y == 0)
+    return jnp.where(origin, 0, jnp.arctan2(y, jnp.where(origin, 1, x)))
 
 
 def luminance(rgb):

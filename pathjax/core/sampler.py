@@ -9,7 +9,6 @@ Every pixel and every seed is an independent randomisation; within one, the numb
 from __future__ import annotations
 
 import jax.numpy as jnp
-from jax import lax
 
 _LANES = 8
 
@@ -81,15 +80,11 @@ def pixel_stream(seed, pixel):
     return combine(pixel, hash_u32(_u32(seed)))
 
 
-def hashed(stream, sample, dimension, count: int):
-    """(count,) float32 independent numbers for dimensions dimension, ..., dimension + count - 1.
+def path_key(stream, sample):
+    """() uint32: what `hashed` hashes for one sample. Apart from `sobol_pairs`, which hashes otherwise."""
+    return combine(stream ^ jnp.uint32(0x5BF03635), _u32(sample))
 
-    The dimensions of `sobol_pairs` and these are apart: they use different hashes.
-    """
-    key = combine(stream ^ jnp.uint32(0x5BF03635), _u32(sample))
+
+def hashed(key, dimension, count: int):
+    """(count,) float32 independent numbers for dimensions dimension, ..., dimension + count - 1 of a path."""
     return to_unit(hash_u32(key + (_u32(dimension) + jnp.arange(count, dtype=jnp.uint32)) * jnp.uint32(0x9E3779B9)))
-
-
-def barrier(x):
-    """Keep XLA from computing x again for each of its consumers."""
-    return lax.optimization_barrier(x)

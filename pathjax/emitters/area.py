@@ -27,7 +27,7 @@ class AreaLights:
     table: jax.Array  # (R,) int32 into `tables`
     first: jax.Array  # (R,) int32 first row in the table of its shapes
     count: jax.Array  # (R,) int32 rows: 1 but for meshes
-    area_cdf: jax.Array | None  # (T,) running area over all triangles that emit; None: no mesh does
+    area_cdf: jax.Array | None  # (T,) running share of the area, of each mesh in turn; None: no mesh emits
     cdf_first: jax.Array | None  # (R,) int32 first entry of a mesh in `area_cdf`
     tables: tuple[int, ...] = field(metadata={"static": True})  # which tables of the geometry hold lights
 
@@ -80,9 +80,16 @@ def _facing(d, distance, n, pdf, Le, primitive):
 def _triangle(lights: AreaLights, row, u):
     """Row of a triangle of the mesh, chosen by area."""
     start, count = at(lights.cdf_first, row), at(lights.count, row)
-    below = jnp.where(start > 0, at(lights.area_cdf, jnp.maximum(start - 1, 0)), 0)
-    found = jnp.searchsorted(lights.area_cdf, below + u * at(lights.area, row), side="right").astype(jnp.int32)
-    return at(lights.first, row) + jnp.clip(found - start, 0, count - 1)
+
+    def halve(_, between):
+        low, high = between
+        middle = (low + high) // 2
+        above = at(lights.area_cdf, start + middle) > u
+        return jnp.where(above, low, middle + 1), jnp.where(above, middle, high)
+
+    steps = lights.area_cdf.shape[0].bit_length()
+    found, _ = lax.fori_loop(0, steps, halve, (jnp.int32(0), count - 1))
+    return at(lights.first, row) + jnp.minimum(found, count - 1)
 
 
 def hit(lights: AreaLights, shapes: Geometry, row, ray: Ray, hit: Hit, surface: Surface):

@@ -20,4 +20,5 @@ class Constant:
 def sample(table: Constant, u) -> EmitterSample:
     """Uniform over the sphere. u: (2,)."""
     d = square_to_sphere(u)
-    return EmitterSample(d, jnp.full_like(d[0], jnp.inf), jnp.int32(-1), table.radiance, jnp.full_like(d[0], SPHERE_PDF))
+    far, pdf = jnp.full_like(d[0], jnp.inf), jnp.full_like(d[0], SPHERE_PDF)
+    return EmitterSample(d, far, jnp.int32(-1), table.radiance, pdf)

@@ -168,10 +168,10 @@ def sample_numbers(scene, stream, sample):
     """
     dtype = scene.camera.origin.dtype
     pairs = sampler.sobol_pairs(stream, sample, 2 + 2 * SOBOL_BOUNCES).astype(dtype)
-    pairs = lax.optimization_barrier(pairs)
+    pairs, key = lax.optimization_barrier((pairs, sampler.path_key(stream, sample)))
 
     def numbers(depth):
-        hashed = sampler.hashed(stream, sample, depth * 8, 8).astype(dtype)
+        hashed = sampler.hashed(key, depth * 8, 8).astype(dtype)
 
         def early():
             return at(pairs, 2 + 2 * depth), at(pairs, 3 + 2 * depth)

@@ -11,8 +11,10 @@ index 0 as 1, and leaves out without a word the normals and uv of a file in whic
 from __future__ import annotations
 
 import json
+import signal
 import struct
 import warnings
+from contextlib import contextmanager
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
@@ -31,6 +33,19 @@ class _Raw:
     faces: np.ndarray  # (F, 3)
     normals: np.ndarray | None = None  # (V, 3); a row of zeros: this vertex has none
     uv: np.ndarray | None = None  # (V, 2), v as the file has it
+
+
+@contextmanager
+def _interrupts_wait():
+    """Hold Ctrl-C back: trimesh catches every exception around its optional imports, and so would lose it."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def load(
@@ -218,7 +233,8 @@ def _obj_corner(word: str, tables: dict[str, list[list[float]]]) -> tuple[int, .
 
 
 def _read_ply(path: Path) -> _Raw:
-    from trimesh.exchange.ply import load_ply
+    with _interrupts_wait():
+        from trimesh.exchange.ply import load_ply
 
     with open(path, "rb") as file:
         # fix_texture would reorder vertices and leave their normals behind
@@ -235,7 +251,8 @@ def _read_ply(path: Path) -> _Raw:
 
 
 def _read_stl(path: Path) -> _Raw:
-    from trimesh.exchange.stl import load_stl
+    with _interrupts_wait():
+        from trimesh.exchange.stl import load_stl
 
     with open(path, "rb") as file:
         loaded = load_stl(file)
@@ -245,8 +262,9 @@ def _read_stl(path: Path) -> _Raw:
 
 def _read_gltf(path: Path) -> _Raw:
     """All triangles of the default scene, its nodes' transforms applied; materials, cameras, lights are not read."""
-    import trimesh
-    from trimesh.exchange.gltf import load_glb, load_gltf
+    with _interrupts_wait():
+        import trimesh
+        from trimesh.exchange.gltf import load_glb, load_gltf
 
     data = path.read_bytes()
     resolver = trimesh.resolvers.FilePathResolver(path)

@@ -1,4 +1,4 @@
-"""Traversal of the 8-wide hierarchy of `bvh_build`, one ray, front to back."""
+"""Traversal of the 8-wide hierarchy of `bvh_build`, one ray, in octant order."""
 
 from __future__ import annotations
 
@@ -12,27 +12,18 @@ from jax import lax
 from pathjax.core.math import at, larger, smaller
 
 WIDTH = 8
-NO_HIT = np.int32(0x7FFFFFFF)  # as a primitive: none; as the bits of a distance: beyond infinity
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Tree:
-    bounds: jax.Array  # (N, 2, 3, 8) lower and upper planes of the children; empty slots are turned inside out
+    bounds: jax.Array  # (N, 2, 3, 8) lower and upper planes of the children; NaN in empty slots
     child: jax.Array  # (N, 8) int32: > 0 an inner node, < 0 the leaf ~child
     depth: int = field(metadata={"static": True})  # levels of inner nodes: the size of the stack
 
 
-def order_bits(t):
-    """int32 that orders as the positive float t does. (Integer minima vectorise, float minima do not.)"""
-    if t.dtype == jnp.float64:
-        # The upper half of a double orders like the double, up to 2^-20: enough to sort nodes by.
-        return (lax.bitcast_convert_type(t, jnp.int64) >> 32).astype(jnp.int32)
-    return lax.bitcast_convert_type(t, jnp.int32)
-
-
 def traverse(tree: Tree, leaf, o, d, t, primitive):
-    """Visit the leaves that the ray o + s d, 0 <= s <= t, may hit, nearest first.
+    """Visit the leaves that the ray o + s d, 0 <= s <= t, may hit, near ones first.
 
     Args:
         leaf: (number of the leaf, t, primitive) -> (t, primitive) after testing it; a negative t ends the search.
@@ -42,59 +33,62 @@ def traverse(tree: Tree, leaf, o, d, t, primitive):
     Returns:
         t, primitive.
 
-    The stack holds, for each level, a node and a sort key for each of its children: the bits of the distance at which
-    the ray enters the child, the slot in the lowest three. Its smallest entry is the next child to visit, and an entry
-    beyond t ends the level. The slabs are widened by the rounding errors of the test (Ize 2013, "Robust BVH ray
-    traversal"), so no ray slips between the boxes of two triangles that share an edge.
+    A node's children still to visit are the bits of a mask: bit k is the child in slot k ^ octant, which the builder
+    has chosen so that ascending bits go away from a ray of that octant. The stack holds a node and a mask for each
+    level. Nothing else is kept, since every buffer that the loop carries costs instructions in each of its trips;
+    for the same reason the constants of the ray travel in one array.
     """
     eps = np.finfo(d.dtype).eps
     lane = jnp.arange(WIDTH, dtype=jnp.int32)
-    slot_bits = np.int32(WIDTH - 1)
-
     # A component of zero becomes one that moves the ray less than rounding does over any distance in range.
     tiny = np.asarray(1e-18, d.dtype)
     inv = 1 / jnp.where(jnp.abs(d) < tiny, jnp.copysign(tiny, d), d)
-    start = o * inv
-    slack = jnp.abs(start) * (2 * eps)
     negative = (d < 0).astype(jnp.int32)
-    inv, start_near, start_far, negative = lax.optimization_barrier((inv, start + slack, start - slack, negative))
+    octant = negative[0] + 2 * negative[1] + 4 * negative[2]
+    weights = jnp.left_shift(jnp.int32(1), lane ^ octant)
+    # Slabs are widened by what o, o / d and the product round (Ize 2013): a few ulps of the coordinates.
+    start, slack = o * inv, jnp.abs(o * inv) * (4 * eps)
+    ray = jnp.concatenate([inv, start + slack, start - slack])
+    ray, octant, weights = lax.optimization_barrier((ray, octant, weights))
 
-    def keys_of_children(node, t):
-        near = [at(tree.bounds, node, negative[a], a) * inv[a] - start_near[a] for a in range(3)]
-        far = [at(tree.bounds, node, 1 - negative[a], a) * inv[a] - start_far[a] for a in range(3)]
-        enter = larger(near[0], larger(near[1], larger(near[2], jnp.zeros_like(t))))
-        leave = smaller(far[0], smaller(far[1], smaller(far[2], t)))
-        hit = enter <= leave * (1 + 4 * eps)
-        return jnp.where(hit, (order_bits(enter) & ~slot_bits) | lane, NO_HIT)
+    def hit_children(node, t):
+        box = at(tree.bounds, node)
+        low = [box[0, axis] * ray[axis] for axis in range(3)]
+        high = [box[1, axis] * ray[axis] for axis in range(3)]
+        near = [smaller(low[axis], high[axis]) - ray[3 + axis] for axis in range(3)]
+        far = [larger(low[axis], high[axis]) - ray[6 + axis] for axis in range(3)]
+        # The NaN of an empty slot gets through as the last argument.
+        enter = larger(larger(larger(jnp.zeros_like(t), near[2]), near[1]), near[0])
+        leave = smaller(smaller(far[0], far[1]), smaller(far[2], t))
+        return jnp.sum(jnp.where(enter <= leave * (1 + 5 * eps), weights, 0), dtype=jnp.int32)
 
     def visit_next(state):
-        level, nodes, keys, t, primitive = state
-        row = at(keys, level)
-        key = jnp.min(row)
+        level, node, mask, stack, t, primitive = state
+        slot = (31 - lax.clz(mask & -mask)) ^ octant
+        child = at(tree.child, node, slot)
+        rest = mask & (mask - 1)
 
-        def visit(nodes, keys):
-            child = at(tree.child, at(nodes, level), key & slot_bits)
-            keys = lax.dynamic_update_index_in_dim(keys, jnp.where(row == key, NO_HIT, row), level, 0)
+        def test_leaf():
+            return *leaf(~child, t, primitive), jnp.int32(0)
 
-            def test_leaf(nodes, keys):
-                return level, nodes, keys, *leaf(~child, t, primitive)
+        def open_node():
+            return t, primitive, hit_children(child, t)
 
-            def open_node(nodes, keys):
-                nodes = lax.dynamic_update_index_in_dim(nodes, child, level + 1, 0)
-                keys = lax.dynamic_update_index_in_dim(keys, keys_of_children(child, t), level + 1, 0)
-                return level + 1, nodes, keys, t, primitive
+        t, primitive, below = lax.cond(child < 0, test_leaf, open_node)
+        descend = below != 0
+        stack = lax.dynamic_update_slice(stack, jnp.stack([node, rest])[None], (level, jnp.int32(0)))
+        level = level + (descend & (rest != 0))
+        node, mask = jnp.where(descend, child, node), jnp.where(descend, below, rest)
 
-            return lax.cond(child < 0, test_leaf, open_node, nodes, keys)
-
-        def leave_level(nodes, keys):
-            return level - 1, nodes, keys, t, primitive
-
-        return lax.cond(key <= order_bits(t), visit, leave_level, nodes, keys)
+        done = mask == 0
+        node_above, mask_above = at(stack, jnp.maximum(level - 1, 0))
+        node, mask = jnp.where(done, node_above, node), jnp.where(done & (level > 0), mask_above, mask)
+        return level - done, node, mask, stack, t, primitive
 
     def more(state):
-        level, _, _, t, _ = state
-        return (level >= 0) & (t >= 0)
+        _, _, mask, _, t, _ = state
+        return (mask != 0) & (t >= 0)
 
-    nodes = jnp.zeros(tree.depth, jnp.int32)
-    keys = jnp.full((tree.depth, WIDTH), NO_HIT).at[0].set(keys_of_children(jnp.int32(0), t))
-    return lax.while_loop(more, visit_next, (jnp.int32(0), nodes, keys, t, primitive))[3:]
+    root = jnp.int32(0)
+    stack = jnp.zeros((tree.depth, 2), jnp.int32)
+    return lax.while_loop(more, visit_next, (root, root, hit_children(root, t), stack, t, primitive))[4:]

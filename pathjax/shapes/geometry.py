@@ -12,16 +12,17 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from pathjax.core.math import at
+from pathjax.core.math import at, smaller
 from pathjax.core.types import Hit, Ray, Surface
 from pathjax.shapes import bvh, bvh_build, planar, sphere, triangle
-from pathjax.shapes.bvh import NO_HIT
 from pathjax.shapes.planar import Planar
 from pathjax.shapes.sphere import Spheres
 from pathjax.shapes.triangle import Triangles
 
+# As a primitive: none. As the bits of a float32 distance: beyond infinity.
+NO_HIT = np.int32(0x7FFFFFFF)
 # Up to here every ray tests all primitives of a kind, in registers of 8; above, a tree pays.
-FLAT_LIMIT = 48
+FLAT_LIMIT = 32
 LEAF_WIDTH = 8
 
 _MODULES = {Triangles: triangle, Planar: planar, Spheres: sphere}
@@ -54,9 +55,7 @@ def leaves_of(numbers, lo, hi, dtype, rule="sah"):
         lane = np.arange(LEAF_WIDTH)
         place = built.leaf_first[:, None] + lane
         rows = np.where(lane < built.leaf_count[:, None], built.order[np.minimum(place, count - 1)], -1)
-        inside_out = np.array([np.inf, -np.inf])[:, None, None]
-        bounds = np.where(np.isnan(built.bounds), inside_out, built.bounds)
-        tree = bvh.Tree(jnp.asarray(bounds, dtype), jnp.asarray(built.child, jnp.int32), built.depth)
+        tree = bvh.Tree(jnp.asarray(built.bounds, dtype), jnp.asarray(built.child, jnp.int32), built.depth)
     padded = np.concatenate([numbers, np.full((1, numbers.shape[1]), np.nan)])
     leaves = np.moveaxis(padded[rows], 1, 2)  # row -1 is the padding
     return jnp.asarray(leaves, dtype), jnp.asarray(rows, jnp.int32), tree, built
@@ -65,24 +64,28 @@ def leaves_of(numbers, lo, hi, dtype, rule="sah"):
 def firsts(geometry: Geometry) -> list[int]:
     """Number of the first primitive of each table."""
     counts = [_MODULES[type(table)].count(table) for table in geometry.tables]
-    return [0, *np.cumsum(counts)[:-1].tolist()]
+    return np.cumsum([0, *counts])[:-1].tolist()
 
 
 def closest_hit(geometry: Geometry, ray: Ray) -> Hit:
     """First primitive that the ray meets at 0 < t <= ray.t_max; of coincident ones the lowest."""
     none = jnp.int32(NO_HIT)
+    beyond = _bits(jnp.full_like(ray.t_max, jnp.inf))
     ray = jax.tree.map(lax.stop_gradient, ray)
 
     def leaf_test(distances, primitives, t, primitive):
-        hit = (distances > 0) & (distances <= t) & (primitives >= 0)
-        # Positive floats order as integers, and integer minima vectorise.
-        bits = jnp.where(hit, _bits(distances), _bits(jnp.full_like(distances, jnp.inf)))
-        nearest = jnp.min(bits)
-        candidate = jnp.min(jnp.where(hit & (bits == nearest), primitives, none))
-        found = lax.bitcast_convert_type(nearest, distances.dtype)
-        # Misses come as inf, and a ray without an end takes inf for a distance.
-        better = (found < jnp.inf) & ((found < t) | (candidate < primitive))
-        return jnp.where(better, found, t), jnp.where(better, candidate, primitive)
+        # Positive floats order as integers, and integer minima vectorise. A miss is the bits of infinity or more.
+        bits = jnp.where((distances > 0) & (distances <= t) & (primitives >= 0), _bits(distances), beyond)
+        bits = lax.optimization_barrier(bits)
+        nearest = lax.optimization_barrier(_least(bits))
+
+        def update():
+            found = lax.bitcast_convert_type(nearest, distances.dtype)
+            candidate = _least(jnp.where(bits == nearest, primitives, none))
+            better = (found < t) | (candidate < primitive)
+            return jnp.where(better, found, t), jnp.where(better, candidate, primitive)
+
+        return lax.cond(nearest < beyond, update, lambda: (t, primitive))
 
     t, primitive = _visit(geometry, ray, leaf_test, ray.t_max, none)
     found = primitive != none
@@ -135,7 +138,7 @@ def _visit(geometry: Geometry, ray: Ray, leaf_test, t, primitive):
         def leaf(number, t, primitive, table=table, first=first, module=module, prepared=prepared):
             rows = at(table.rows, number)
             primitives = jnp.where(rows >= 0, rows + first, -1)
-            distances = module.intersect(table, at(table.leaves, number), prepared, primitives == ray.exclude)
+            distances = module.intersect(table, number, prepared, primitives == ray.exclude)
             return leaf_test(distances, primitives, t, primitive)
 
         if table.tree is None:
@@ -143,6 +146,15 @@ def _visit(geometry: Geometry, ray: Ray, leaf_test, t, primitive):
         else:
             t, primitive = bvh.traverse(table.tree, leaf, ray.o, ray.d, t, primitive)
     return t, primitive
+
+
+def _least(x):
+    """Minimum of (W,) integers, W a multiple of 8. (XLA reduces one by one; registers are first folded into one.)"""
+    registers = x.reshape(-1, LEAF_WIDTH)
+    least = registers[0]
+    for register in registers[1:]:
+        least = smaller(register, least)
+    return jnp.min(lax.optimization_barrier(least))
 
 
 def _bits(x):

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pathjax.core.math import at, dot, safe_divide
+from pathjax.core.math import at, dot, safe_atan2, safe_divide, safe_sqrt
 from pathjax.core.types import Surface
 from pathjax.core.warp import square_to_disk
 from pathjax.shapes.bvh import Tree
@@ -30,7 +30,7 @@ class Planar:
 
 
 def leaf_numbers(frames):
-    """(P, 4, 3) float64 -> (P, 16): c, normal, the dual vectors of a and b, and the rounding error of each coordinate."""
+    """(P, 4, 3) float64 -> (P, 16): c, normal, dual vectors of a and b, bounds on the rounding of each coordinate."""
     c, a, b, n = np.moveaxis(np.asarray(frames, np.float64), 1, 0)
     normal = np.cross(a, b)
     squared = (normal**2).sum(-1, keepdims=True)
@@ -54,13 +54,14 @@ def prepare(o, d):
     return o, d
 
 
-def intersect(table, leaf, prepared, on_it):
-    """Distances to W of them at once: (16, W) -> (W,), NaN or inf where missed, possibly negative where behind.
+def intersect(table: Planar, leaf, prepared, on_it):
+    """Distances to the W of a leaf: (W,), NaN or inf where missed, possibly negative where behind.
 
     on_it: (W,) bool, the ray starts on this primitive, which is flat and not hit again.
     The border is inclusive by the rounding error of the coordinate, so faces that share an edge leave no gap.
     """
     o, d = prepared
+    leaf = at(table.leaves, leaf)
     c, n, dual_a, dual_b, errors = leaf[0:3], leaf[3:6], leaf[6:9], leaf[9:12], leaf[12:16]
     from_c = [o[axis] - c[axis] for axis in range(3)]
     t = -dot(n, from_c) / dot(n, d)
@@ -80,7 +81,11 @@ def count(table: Planar) -> int:
 
 
 def surface(table: Planar, row, o, d, t) -> Surface:
-    """Differentiable in the ray; the point lies on the plane to the last bits."""
+    """Differentiable in the ray; the point lies on the plane to the last bits.
+
+    No margin: the primitive is excluded by number, and its few neighbours err only within rounding of the shared edge.
+    So a sheet of glass may be as thin as the coordinates can tell.
+    """
     c, a, b, n = at(table.frames, row)
     from_c = o - c
     distance = -safe_divide(dot(n, from_c), dot(n, d))
@@ -91,25 +96,23 @@ def surface(table: Planar, row, o, d, t) -> Surface:
     x, y = (bb * qa - ab * qb) * scale, (aa * qb - ab * qa) * scale
     p = c + x * a + y * b
     if table.disk:
-        r = jnp.sqrt(jnp.maximum(x * x + y * y, np.finfo(d.dtype).tiny))
-        angle = jnp.arctan2(y, x) / (2 * math.pi)
+        r = safe_sqrt(x * x + y * y)
+        angle = safe_atan2(y, x) / (2 * math.pi)
         uv = jnp.stack([r, jnp.where(angle < 0, angle + 1, angle)])
     else:
         uv = jnp.stack([(x + 1) / 2, (y + 1) / 2])
-    return Surface(p, n, _margin(c, a, b, n), n, uv)
+    return Surface(p, n, jnp.zeros_like(x), n, uv)
 
 
 def sample(table: Planar, row, u):
     """Uniform point: u (2,) -> point (3,), unit normal (3,), rounding error along it ()."""
     c, a, b, n = at(table.frames, row)
     xy = square_to_disk(u) if table.disk else 2 * u - 1
-    return c + xy[0] * a + xy[1] * b, n, _margin(c, a, b, n)
+    margin = dot(jnp.abs(n), jnp.abs(c) + jnp.abs(a) + jnp.abs(b)) * (4 * np.finfo(c.dtype).eps)
+    return c + xy[0] * a + xy[1] * b, n, margin
 
 
 def area(frames, disk):
     """(P, 4, 3) -> (P,)."""
     return np.linalg.norm(np.cross(frames[:, 1], frames[:, 2]), axis=-1) * (math.pi if disk else 4)
 
-
-def _margin(c, a, b, n):
-    return dot(jnp.abs(n), jnp.abs(c) + jnp.abs(a) + jnp.abs(b)) * (4 * np.finfo(c.dtype).eps)

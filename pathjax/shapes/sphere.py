@@ -9,7 +9,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pathjax.core.math import at, dot, frame_from_normal, larger, normalize, safe_divide, safe_sqrt, to_world
+from pathjax.core.math import (
+    at,
+    dot,
+    frame_from_normal,
+    larger,
+    normalize,
+    safe_atan2,
+    safe_divide,
+    safe_sqrt,
+    to_world,
+)
 from pathjax.core.types import Surface
 from pathjax.core.warp import SPHERE_PDF, cone_pdf, square_to_cone, square_to_sphere
 from pathjax.shapes.bvh import Tree
@@ -39,8 +49,8 @@ def prepare(o, d):
     return o, d
 
 
-def intersect(table, leaf, prepared, on_it):
-    """Distances to W spheres at once: (4, W) -> (W,), NaN where missed, negative where behind.
+def intersect(table: Spheres, leaf, prepared, on_it):
+    """Distances to the W spheres of a leaf: (W,), NaN where missed, negative where behind.
 
     Args:
         on_it: (W,) bool, the ray starts on this sphere: its root at the origin is exactly 0 and does not count.
@@ -49,6 +59,7 @@ def intersect(table, leaf, prepared, on_it):
     "Precision improvements for ray/sphere intersection").
     """
     o, d = prepared
+    leaf = at(table.leaves, leaf)
     radius = leaf[3]
     f = [o[axis] - leaf[axis] for axis in range(3)]
     b = -dot(f, d)
@@ -77,8 +88,8 @@ def surface(table: Spheres, row, o, d, t) -> Surface:
     # t says which of the two roots was found.
     outward = normalize(closest + jnp.copysign(half_chord, t - b) * d)
     local = at(table.to_local, row) @ outward
-    phi = jnp.arctan2(local[1], local[0]) / (2 * math.pi)
-    theta = jnp.arctan2(safe_sqrt(local[0] * local[0] + local[1] * local[1]), local[2]) / math.pi
+    phi = safe_atan2(local[1], local[0]) / (2 * math.pi)
+    theta = safe_atan2(safe_sqrt(local[0] * local[0] + local[1] * local[1]), local[2]) / math.pi
     uv = jnp.stack([jnp.where(phi < 0, phi + 1, phi), theta])
     n = outward * at(table.sign, row)
     return Surface(center + radius * outward, n, jnp.zeros_like(radius), n, uv)

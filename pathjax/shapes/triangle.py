@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 
-from pathjax.core.math import at, cross, dot, normalize, safe_divide
+from pathjax.core.math import at, cross, dot, normalize, rescale, safe_divide
 from pathjax.core.types import Surface
 from pathjax.core.warp import square_to_triangle
 from pathjax.shapes.bvh import Tree
@@ -17,7 +18,7 @@ from pathjax.shapes.bvh import Tree
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Triangles:
-    leaves: jax.Array  # (L, 9, W) vertex 0 xyz, vertex 1 xyz, vertex 2 xyz; NaN in empty lanes
+    leaves: jax.Array  # (L, 9, W) x of the three vertices, y, z; NaN in empty lanes
     rows: jax.Array  # (L, W) int32 row of each lane
     tree: Tree | None  # None: L = 1, every ray tests all
     vertices: jax.Array  # (P, 3, 3) by row: vertex, axis
@@ -26,8 +27,8 @@ class Triangles:
 
 
 def leaf_numbers(vertices):
-    """(P, 3, 3) -> (P, 9), what a leaf keeps of each triangle."""
-    return np.asarray(vertices).reshape(-1, 9)
+    """(P, 3, 3) -> (P, 9), what a leaf keeps of each triangle: x of the vertices, y, z."""
+    return np.swapaxes(np.asarray(vertices), 1, 2).reshape(-1, 9)
 
 
 def bounds(vertices):
@@ -36,27 +37,37 @@ def bounds(vertices):
 
 
 def prepare(o, d):
-    """Constants of a ray: the shear that turns it into the z axis (Woop, Benthin, Wald 2013, JCGT 2(1))."""
-    z = jnp.argmax(jnp.abs(d)).astype(jnp.int32)
+    """Constants of a ray: the shear that turns it into the z axis (Woop, Benthin, Wald 2013, JCGT 2(1)).
+
+    Returns:
+        (3,) int32 axes x, y, z, and (6,) origin and shear in that order.
+    """
+    size = jnp.abs(d)
+    z = jnp.where(size[0] > size[1], jnp.where(size[0] > size[2], 0, 2), jnp.where(size[1] > size[2], 1, 2))
+    z = z.astype(jnp.int32)
     x = jnp.where(z == 2, 0, z + 1)
     y = jnp.where(x == 2, 0, x + 1)
     scale = 1 / at(d, z)
-    return x, y, z, at(o, x), at(o, y), at(o, z), at(d, x) * scale, at(d, y) * scale, scale
+    shear = [at(d, x) * scale, at(d, y) * scale, scale]
+    return jnp.stack([x, y, z]), jnp.stack([at(o, x), at(o, y), at(o, z), *shear])
 
 
-def intersect(table, leaf, prepared, on_it):
-    """Distances to W triangles at once: (9, W) -> (W,), NaN or inf where missed, possibly negative where behind.
+def intersect(table: Triangles, leaf, prepared, on_it):
+    """Distances to the W triangles of a leaf: (W,), NaN or inf where missed, possibly negative where behind.
 
     on_it: (W,) bool, the ray starts on this triangle, which is flat and not hit again.
-
     Watertight: edges are inclusive by the rounding error of their edge function. (Contraction to fused multiply-adds
     leaves the plain functions of two triangles that share an edge with different signs.)
     """
-    kx, ky, kz, ox, oy, oz, shear_x, shear_y, scale = prepared
-    z = [at(leaf, 3 * v + kz) - oz for v in range(3)]
-    x = [at(leaf, 3 * v + kx) - ox - shear_x * z[v] for v in range(3)]
-    y = [at(leaf, 3 * v + ky) - oy - shear_y * z[v] for v in range(3)]
-    tolerance = 2 * np.finfo(leaf.dtype).eps
+    axes, ray = prepared
+    _, _, width = table.leaves.shape
+    coordinates = table.leaves.reshape(-1, 3, 3, width)
+    z = at(coordinates, leaf, axes[2]) - ray[2]
+    x = at(coordinates, leaf, axes[0]) - ray[0] - ray[3] * z
+    y = at(coordinates, leaf, axes[1]) - ray[1] - ray[4] * z
+    # Several results share these; without the barrier each computes them again.
+    x, y, z = lax.optimization_barrier((x, y, z))
+    tolerance = 2 * np.finfo(x.dtype).eps
 
     def edge(i, j):
         a, b = x[i] * y[j], y[i] * x[j]
@@ -65,8 +76,11 @@ def intersect(table, leaf, prepared, on_it):
     (u, u_error), (v, v_error), (w, w_error) = edge(2, 1), edge(0, 2), edge(1, 0)
     front = (u >= -u_error) & (v >= -v_error) & (w >= -w_error)
     back = (u <= u_error) & (v <= v_error) & (w <= w_error)
-    t = (u * z[0] + v * z[1] + w * z[2]) * scale / (u + v + w)
-    return jnp.where((front | back) & ~on_it, t, jnp.inf)
+    det = u + v + w
+    t = (u * z[0] + v * z[1] + w * z[2]) * ray[5] / det
+    # Seen edge-on, or tiny and far from the ray, all three errors rule and every edge is inclusive.
+    sound = jnp.abs(det) > u_error + v_error + w_error
+    return jnp.where((front | back) & sound & ~on_it, t, jnp.inf)
 
 
 def count(table: Triangles) -> int:
@@ -84,7 +98,7 @@ def surface(table: Triangles, row, o, d, t) -> Surface:
     b1 = jnp.clip(dot(s, h) * scale, 0, 1)
     b2 = jnp.clip(dot(d, q) * scale, 0, 1 - b1)
     b0 = 1 - b1 - b2
-    n = normalize(cross(edge1, edge2))
+    n = _normal(edge1, edge2)
 
     def interpolate(values):
         return b0 * values[0] + b1 * values[1] + b2 * values[2]
@@ -100,9 +114,15 @@ def sample(table: Triangles, row, u):
     """Uniform point of the triangle: u (2,) -> point (3,), unit normal (3,), rounding error along it ()."""
     vertices = at(table.vertices, row)
     b = square_to_triangle(u)
-    n = normalize(cross(vertices[1] - vertices[0], vertices[2] - vertices[0]))
-    p = vertices[0] + b[0] * (vertices[1] - vertices[0]) + b[1] * (vertices[2] - vertices[0])
+    edge1, edge2 = vertices[1] - vertices[0], vertices[2] - vertices[0]
+    n = _normal(edge1, edge2)
+    p = vertices[0] + b[0] * edge1 + b[1] * edge2
     return p, n, dot(jnp.abs(n), _point_error(vertices))
+
+
+def _normal(edge1, edge2):
+    # Edges of length 1 first: the square of a product of tiny ones underflows.
+    return normalize(cross(rescale(edge1), rescale(edge2)))
 
 
 def _point_error(vertices):

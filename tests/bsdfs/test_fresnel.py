@@ -1,0 +1,201 @@
+"""Fresnel reflectances against closed forms, their derivatives against complex steps, finite everywhere."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from pathjax.bsdfs import fresnel
+
+ETAS = [1.0003, 1.33, 1.5046, 2.419, 1 / 1.33, 1 / 2.419]
+# float32 roundings of a few operations on numbers of order 1.
+ROUNDING = 2e-6
+
+
+@pytest.fixture
+def x64():
+    context = jax.enable_x64 if hasattr(jax, "enable_x64") else jax.experimental.enable_x64
+    with context(True):
+        yield
+
+
+def dielectric(cos_i, eta):
+    r, cos_t = jax.jit(jax.vmap(fresnel.dielectric))(*np.broadcast_arrays(np.float32(cos_i), np.float32(eta)))
+    return np.asarray(r, np.float64), np.asarray(cos_t, np.float64)
+
+
+def exact_dielectric(cos_i, eta):
+    """Textbook form, complex so that it may be differentiated by a complex step; not under total reflection."""
+    cos_t = np.sqrt((cos_i**2 + eta**2 - 1) / eta**2)
+    r_s = (cos_i - eta * cos_t) / (cos_i + eta * cos_t)
+    r_p = (eta * cos_i - cos_t) / (eta * cos_i + cos_t)
+    return (r_s**2 + r_p**2) / 2
+
+
+def exact_conductor(cos_i, eta, k):
+    """Complex amplitudes; independent of the real form in the code."""
+    n = eta + 1j * k
+    cos_t = np.sqrt(1 - (1 - cos_i**2) / n**2)
+    r_s = (cos_i - n * cos_t) / (cos_i + n * cos_t)
+    r_p = (n * cos_i - cos_t) / (n * cos_i + cos_t)
+    return (abs(r_s) ** 2 + abs(r_p) ** 2) / 2
+
+
+def critical_cos(eta):
+    """Cosine of incidence at which refraction ends, for eta < 1."""
+    return np.sqrt(1 - eta**2)
+
+
+@pytest.mark.parametrize("eta", ETAS)
+def test_normal_incidence(eta):
+    r, cos_t = dielectric([1.0], eta)
+    np.testing.assert_allclose(r, ((eta - 1) / (eta + 1)) ** 2, atol=1e-7)
+    np.testing.assert_allclose(cos_t, 1, atol=1e-7)
+
+
+@pytest.mark.parametrize("eta", ETAS)
+def test_brewsters_angle_leaves_half_of_the_s_wave(eta):
+    cos_i = 1 / np.hypot(1, eta)  # tan = eta
+    r_s = (1 - eta**2) / (1 + eta**2)
+    np.testing.assert_allclose(dielectric([cos_i], eta)[0], r_s**2 / 2, atol=ROUNDING)
+
+
+@pytest.mark.parametrize("eta", ETAS)
+def test_closed_form_at_all_angles(eta):
+    cos_i = np.float32(np.linspace(critical_cos(eta) + 1e-3 if eta < 1 else 1e-3, 1, 1001)).astype(np.float64)
+    eta = float(np.float32(eta))
+    # Near the critical angle the root of a small difference keeps half of the digits.
+    np.testing.assert_allclose(dielectric(cos_i, eta)[0], exact_dielectric(cos_i, eta), atol=2e-4 if eta < 1 else 1e-5)
+
+
+@pytest.mark.parametrize("eta", [e for e in ETAS if e < 1])
+def test_total_internal_reflection_begins_at_the_critical_angle(eta):
+    c = critical_cos(eta)
+    r, cos_t = dielectric([0, 0.5 * c, c - 1e-5], eta)
+    assert (r == 1).all() and (cos_t == 0).all()
+    r, cos_t = dielectric([c + 1e-3, 1], eta)
+    assert (r < 1).all() and (cos_t > 0).all()
+
+
+@pytest.mark.parametrize("eta", [1.0003, 1.5, 2.4])
+def test_grazing_incidence_tends_to_one_smoothly(eta):
+    cos_i = np.float32([0, 1e-8, 1e-7, 1e-6, 1e-5, 1e-4])
+    r = dielectric(cos_i, eta)[0]
+    assert r[0] == 1 and (np.diff(r) <= 1e-7).all()
+    # 1 - R = 2 cos (1 + eta^2) / sqrt(eta^2 - 1) to first order.
+    slope = 2 * (1 + eta**2) / np.sqrt(eta**2 - 1)
+    np.testing.assert_allclose(1 - r, slope * cos_i.astype(float), rtol=0.02, atol=5e-7)
+
+
+@pytest.mark.parametrize("eta", [1.33, 1.5, 2.4])
+def test_reciprocity(eta):
+    cos_i = np.linspace(0.01, 1, 200)
+    r, cos_t = dielectric(cos_i, eta)
+    back, cos_back = dielectric(cos_t, 1 / eta)
+    # The way back runs near the critical angle, where a rounding of cos_t changes R by 1e-4.
+    np.testing.assert_allclose(back, r, atol=3e-4)
+    np.testing.assert_allclose(cos_back, cos_i, atol=2e-5)
+
+
+def test_equal_media_reflect_nothing_at_any_angle():
+    cos_i = np.concatenate([np.linspace(0.01, 1, 100), np.geomspace(1e-6, 1e-2, 50)])
+    r, cos_t = dielectric(cos_i, 1.0)
+    np.testing.assert_allclose(r, 0, atol=1e-12)
+    np.testing.assert_allclose(cos_t, cos_i, rtol=1e-6)
+
+
+def test_equal_media_have_derivative_zero():
+    cos_i = jnp.asarray(np.geomspace(1e-3, 1, 50), jnp.float32)
+    of_eta = jax.grad(lambda c, eta: fresnel.dielectric(c, eta)[0], argnums=1)
+    slope = jax.jit(jax.vmap(of_eta, (0, None)))(cos_i, 1.0)
+    np.testing.assert_allclose(slope, 0, atol=1e-6)
+
+
+def test_dielectric_derivatives_are_the_analytic_ones(x64):
+    step = 1e-30
+    gradient = jax.jit(jax.vmap(jax.grad(lambda c, e: fresnel.dielectric(c, e)[0], (0, 1)), (0, None)))
+    for eta in ETAS:
+        low = critical_cos(eta) + 1e-3 if eta < 1 else 1e-3
+        cos_i = np.linspace(low, 1 - 1e-3, 50)
+        slopes = gradient(cos_i, eta)
+        # A complex step has no cancellation: exact to the last bits.
+        exact = exact_dielectric(cos_i + 1j * step, eta), exact_dielectric(cos_i, eta + 1j * step)
+        np.testing.assert_allclose(slopes, [r.imag / step for r in exact], rtol=1e-8, atol=1e-12)
+
+
+def test_dielectric_derivatives_are_finite_everywhere():
+    cos_i, eta = [], []
+    for e in [*ETAS, 1.0, np.nextafter(np.float32(1), 0), np.nextafter(np.float32(1), 2), 1e-3, 1e3]:
+        around = critical_cos(e) + np.array([-1e-3, -1e-6, -1e-7, 0, 1e-7, 1e-6, 1e-3]) if e < 1 else []
+        for c in [0, 1e-30, 1e-7, 1e-3, 1, *around]:
+            cos_i.append(c)
+            eta.append(e)
+    arguments = np.float32(cos_i).clip(0, 1), np.float32(eta)
+    for differentiate in (jax.jacfwd, jax.jacrev):
+        slopes = jax.jit(jax.vmap(differentiate(fresnel.dielectric, (0, 1))))(*arguments)
+        assert all(np.isfinite(s).all() for s in jax.tree.leaves(slopes))
+    assert np.isfinite(dielectric(*arguments)[0]).all()
+
+
+def test_reflectance_lies_in_zero_to_one():
+    rng = np.random.default_rng(1)
+    r, cos_t = dielectric(rng.random(100_000), np.exp(rng.normal(size=100_000)))
+    assert r.min() >= 0 and r.max() <= 1 and cos_t.min() >= 0 and cos_t.max() <= 1
+
+
+# ---- conductors ----------------------------------------------------------------------------------------------------
+
+METALS = [(0.2, 3.9), (0.04, 10.0), (1.5, 7.6), (3.0, 0.1), (0.143, 3.98)]
+
+
+def conductor(cos_i, eta, k):
+    return np.asarray(jax.jit(jax.vmap(fresnel.conductor))(*np.broadcast_arrays(*map(np.float32, (cos_i, eta, k)))))
+
+
+@pytest.mark.parametrize("eta, k", METALS)
+def test_conductor_is_that_of_complex_amplitudes(eta, k):
+    cos_i = np.linspace(0, 1, 500)
+    np.testing.assert_allclose(conductor(cos_i, eta, k), exact_conductor(cos_i, eta, k), atol=5e-6)
+
+
+@pytest.mark.parametrize("eta", [1.0003, 1.33, 1.5, 2.4, 0.7])
+def test_conductor_without_absorption_is_a_dielectric(eta):
+    cos_i = np.linspace(0.01, 1, 200)
+    cos_i = cos_i[np.abs(cos_i - critical_cos(eta)) > 1e-2] if eta < 1 else cos_i
+    # From the difference a^2 = t0 the root keeps half of the digits.
+    np.testing.assert_allclose(conductor(cos_i, eta, 0), dielectric(cos_i, eta)[0], atol=2e-5)
+
+
+def test_conductor_grazing_and_mirror_limits():
+    for eta, k in METALS:
+        np.testing.assert_allclose(conductor([0.0], eta, k), 1, atol=1e-6)
+    np.testing.assert_allclose(conductor(np.linspace(0, 1, 20), 1.0, 1e4), 1, atol=5e-4)  # 1 - R ~ 4 / k^2
+    np.testing.assert_allclose(conductor([1.0], 0.2, 3.9), (0.8**2 + 3.9**2) / (1.2**2 + 3.9**2), atol=1e-6)
+
+
+def test_conductor_derivatives_are_the_analytic_ones(x64):
+    def reference(x):
+        return exact_conductor(*x)
+
+    gradient = jax.jit(jax.grad(lambda x: fresnel.conductor(x[0], x[1], x[2])))
+    for eta, k in METALS:
+        for cos_i in (0.05, 0.4, 0.99):
+            x = np.array([cos_i, eta, k])
+            slopes = gradient(x)
+            h = 1e-6
+            numeric = [(reference(x + h * e) - reference(x - h * e)) / (2 * h) for e in np.eye(3)]
+            # Central differences: h^2 of truncation, 1e-16 / h of rounding.
+            np.testing.assert_allclose(slopes, numeric, rtol=1e-6, atol=1e-8)
+
+
+def test_conductor_derivatives_are_finite_everywhere():
+    cases = [(c, e, k) for c in (0, 1e-20, 1e-3, 0.7, 1) for e in (0, 1e-3, 1, 2.5) for k in (0, 1e-3, 1, 100)]
+    # k = 0 at the critical angle, where the medium turns from transparent to totally reflecting.
+    cases += [(critical_cos(0.6), 0.6, 0.0), (0.8, 0.6, 0.0)]
+    c, e, k = np.float32(cases).T
+    for differentiate in (jax.jacfwd, jax.jacrev):
+        slopes = jax.jit(jax.vmap(differentiate(fresnel.conductor, (0, 1, 2))))(c, e, k)
+        bad = [case for case, *s in zip(cases, *slopes, strict=True) if not np.isfinite(s).all()]
+        assert not bad
+    r = conductor(c, e, k)
+    assert np.isfinite(r).all() and r.min() >= 0 and r.max() <= 1 + 1e-6

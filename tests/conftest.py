@@ -1,0 +1,216 @@
+"""What the tests of rendering share: scenes from text, replicated renders, and the z-test between images."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+import pathjax  # before anything starts JAX's backend  # isort: skip
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from pathjax.film import image_shape, pixel_count
+from pathjax.io import mitsuba_xml
+from pathjax.render import _render_pixels
+from pathjax.scene import build
+
+ROOT = Path(__file__).resolve().parents[1]
+
+# Chance that one correct comparison of two images fails. Seeds are fixed, so a test either fails always or never.
+FALSE_ALARM = 1e-4
+# Relative error that float32 leaves in the mean of a pixel; what differs by less is no disagreement.
+ROUNDING = 1e-5
+
+
+@pytest.fixture(scope="session")
+def root():
+    """The checkout."""
+    return ROOT
+
+
+def scene_text(
+    body,
+    *,
+    res=16,
+    depth=8,
+    rr_depth=5,
+    origin="0, 0, 4",
+    target="0, 0, 0",
+    up="0, 1, 0",
+    fov=40,
+    near=0.01,
+    far=1e4,
+    hide="false",
+    film='<rfilter type="box"/>',
+):
+    """A scene file: pinhole camera, square image, and the given shapes and emitters."""
+    return f"""<scene version="3.0.0">
+<integrator type="path"><integer name="max_depth" value="{depth}"/><integer name="rr_depth" value="{rr_depth}"/>
+  <boolean name="hide_emitters" value="{hide}"/></integrator>
+<sensor type="perspective"><float name="fov" value="{fov}"/><float name="near_clip" value="{near}"/>
+  <float name="far_clip" value="{far}"/>
+  <transform name="to_world"><lookat origin="{origin}" target="{target}" up="{up}"/></transform>
+  <sampler type="independent"/>
+  <film type="hdrfilm"><integer name="width" value="{res}"/><integer name="height" value="{res}"/>{film}</film></sensor>
+{body}
+</scene>
+"""
+
+
+@pytest.fixture(scope="session")
+def write_scene(tmp_path_factory):
+    """(body, **camera) -> path of a scene file beside the meshes of the tests."""
+    folder = tmp_path_factory.mktemp("scenes")
+    (folder / "meshes").symlink_to(ROOT / "tests" / "scenes" / "meshes")
+    numbers = iter(range(10**6))
+
+    def write(body, **camera):
+        path = folder / f"scene{next(numbers)}.xml"
+        path.write_text(scene_text(body, **camera))
+        return path
+
+    return write
+
+
+@pytest.fixture(scope="session")
+def make_scene(write_scene):
+    """(body, dtype, **camera) -> Scene."""
+
+    def make(body, dtype=jnp.float32, **camera):
+        return build(mitsuba_xml.load(write_scene(body, **camera)), dtype)
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def shipped():
+    """(name, **parameters) -> Scene of `scenes/` or `tests/scenes/`."""
+
+    def load(name, dtype=jnp.float32, **parameters):
+        folders = ROOT / "scenes", ROOT / "tests" / "scenes"
+        path = next(folder / f"{name}.xml" for folder in folders if (folder / f"{name}.xml").exists())
+        return build(mitsuba_xml.load(path, **parameters), dtype)
+
+    return load
+
+
+@pytest.fixture(scope="session")
+def x64():
+    """A context in which JAX has float64."""
+    if hasattr(jax, "enable_x64"):
+        return lambda: jax.enable_x64(True)
+    from jax.experimental import enable_x64
+
+    return enable_x64
+
+
+class Kernel(NamedTuple):
+    """A shipped scene at 16 pixels wide, compiled once for all tests that look at its kernel or its image."""
+
+    scene: pathjax.Scene
+    compiled: jax.stages.Compiled
+
+    def image(self, spp, seed=1):
+        """(H, W, 3)."""
+        pixels = jnp.arange(pixel_count(self.scene.film), dtype=jnp.int32)
+        numbers = (jnp.uint32(n) for n in (0, spp, seed))
+        means = self.compiled(replace(self.scene, about=None), pixels, *numbers)
+        return np.asarray(means).reshape(*image_shape(self.scene.film), 3)
+
+
+@pytest.fixture(scope="session")
+def kernel_of(shipped):
+    """(name, dtype) -> Kernel; in float64 to be called, and the kernel used, under `x64`."""
+
+    @functools.cache
+    def compile(name, dtype=jnp.float32):
+        scene = shipped(name, dtype, res=16)
+        pixels = jnp.arange(pixel_count(scene.film), dtype=jnp.int32)
+        numbers = (jnp.uint32(n) for n in (0, 1, 1))
+        lowered = _render_pixels.lower(replace(scene, about=None), pixels, *numbers, strategy="mis")
+        return Kernel(scene, lowered.compile())
+
+    return compile
+
+
+# ---- statistics -----------------------------------------------------------------------------------------------------
+
+
+class Estimate(NamedTuple):
+    """Mean of `count` independent images, and the estimated variance of that mean."""
+
+    mean: np.ndarray  # (H, W, 3)
+    variance: np.ndarray  # (H, W, 3)
+    count: int
+
+
+def estimate_of(images):
+    """Estimate from independent images (K, H, W, 3)."""
+    images = np.asarray(images, float)
+    return Estimate(images.mean(0), images.var(0, ddof=1) / len(images), len(images))
+
+
+@pytest.fixture(scope="session")
+def estimate_type():
+    return Estimate
+
+
+@pytest.fixture(scope="session")
+def estimate():
+    """(scene, spp, count, strategy) -> Estimate over `count` seeds.
+
+    Samples of one image share a sequence and are not independent of each other; images of different seeds are.
+    """
+
+    def render(scene, spp=16, count=16, strategy="mis", first_seed=1, scale=1):
+        seeds = range(first_seed, first_seed + count)
+        return estimate_of([np.asarray(pathjax.render(scene, spp, seed, strategy)) * scale for seed in seeds])
+
+    return render
+
+
+@pytest.fixture(scope="session")
+def agree():
+    """Assert that two Estimates, or one and an exact image, differ by chance only.
+
+    Two Welch tests share the false alarm rate: the worst of all pixels and channels (Sidak), which finds what is wrong
+    in a place, and the mean of the image in each channel, which finds a small bias everywhere. The second supposes
+    that pixels are independent of each other. Where all pixels estimate one number, `pixelwise=False` leaves the first
+    out: samples that are stratified well can give one pixel the same coarse fraction of hits for every seed.
+    """
+    from scipy import ndimage, stats
+
+    def p_value(difference, variances, counts, floor):
+        variance = sum(variances) + floor**2 + np.finfo(float).tiny
+        # Welch-Satterthwaite; an exact side has no variance and counts for nothing.
+        spread = sum(v**2 / (count - 1) for v, count in zip(variances, counts, strict=True) if count > 1)
+        freedom = np.where(spread > 0, variance**2 / np.where(spread > 0, spread, 1), np.inf)
+        freedom = np.clip(freedom, min(count - 1 for count in counts if count > 1), 1e6)
+        p = 2 * stats.t.sf(np.abs(difference) / np.sqrt(variance), freedom)
+        return -np.expm1(p.size * np.log1p(-np.minimum(p.min(), 1 - 1e-16))), np.unravel_index(p.argmin(), p.shape)
+
+    def check(a, b, *, whole=True, pixelwise=True, rounding=ROUNDING, false_alarm=FALSE_ALARM):
+        if not isinstance(b, Estimate):
+            b = Estimate(np.broadcast_to(np.asarray(b, float), a.mean.shape), np.zeros_like(a.mean), 1)
+        assert np.isfinite(a.mean).all() and np.isfinite(b.mean).all()
+        counts, rate = (a.count, b.count), false_alarm / (whole + pixelwise)
+        if pixelwise:
+            floor = rounding * (np.abs(a.mean) + np.abs(b.mean)) / 2
+            # A few seeds may all miss what a pixel rarely sees; its neighbours know that it varies.
+            variances = [np.maximum(e.variance, ndimage.uniform_filter(e.variance, (3, 3, 1))) for e in (a, b)]
+            p, place = p_value(a.mean - b.mean, variances, counts, floor)
+            worst = f"at (y, x, channel) {tuple(map(int, place))}: {a.mean[place]:.6g} against {b.mean[place]:.6g}"
+            assert p > rate, f"pixels disagree, p = {p:.1e}, worst {worst}"
+        if whole:
+            means, pixels = (a.mean.mean((0, 1)), b.mean.mean((0, 1))), a.mean[..., 0].size
+            variances = tuple(e.variance.sum((0, 1)) / pixels**2 for e in (a, b))
+            # The mean of many pixels knows its variance far better than one pixel does.
+            many = tuple(1 + (count - 1) * pixels for count in counts)
+            p, _ = p_value(means[0] - means[1], variances, many, rounding * np.abs(means).mean(0))
+            assert p > rate, f"image means disagree, p = {p:.1e}: {means[0]} against {means[1]}"
+
+    return check

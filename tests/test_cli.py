@@ -1,0 +1,404 @@
+"""The command line: exit status, messages, files. Most of it in this process, signals in one of its own."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+import pathjax as pj
+from pathjax import cli
+from pathjax.io.image import linear_to_srgb, read_exr
+
+FURNACE = "scenes/furnace.xml"
+SMALL = ("-D", "res=8")
+
+PIPES = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+
+
+def environment(root):
+    """One in which another process finds this pathjax, installed or not."""
+    return os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, [str(root), os.environ.get("PYTHONPATH")]))}
+
+
+@pytest.fixture
+def run(root, tmp_path, monkeypatch, capfd):
+    """(arguments) -> exit status, stdout, stderr, of `pathjax` in this process, in the checkout."""
+    monkeypatch.chdir(root)
+
+    def run(*arguments):
+        capfd.readouterr()
+        try:
+            status = cli.main([str(a) for a in arguments])
+        except SystemExit as error:  # argparse
+            status = error.code
+        return status, *capfd.readouterr()
+
+    return run
+
+
+@pytest.fixture
+def refused(run, tmp_path):
+    """Assert exit status 2, one message with all the given parts, and nothing written; returns the message."""
+
+    def refused(*arguments, says=()):
+        before = sorted(tmp_path.rglob("*"))
+        status, out, err = run(*arguments)
+        assert status == 2
+        assert out == ""
+        assert "Traceback" not in err
+        for part in says:
+            assert part in err
+        assert sorted(tmp_path.rglob("*")) == before
+        return err
+
+    return refused
+
+
+@pytest.fixture
+def process(root):
+    """Start `python -m pathjax` in the checkout."""
+
+    def start(*arguments):
+        command = [sys.executable, "-m", "pathjax", *map(str, arguments)]
+        return subprocess.Popen(command, cwd=root, env=environment(root), **PIPES)
+
+    return start
+
+
+# ---- render ---------------------------------------------------------------------------------------------------------
+
+
+def test_render_writes_the_image_that_render_returns(run, tmp_path):
+    status, out, _ = run("render", FURNACE, *SMALL, "-o", tmp_path / "a.exr", "--spp", 4, "--seed", 3)
+    assert (status, out) == (0, "")
+    channels, header = read_exr(tmp_path / "a.exr")
+    assert set(channels) == {"R", "G", "B"}
+    assert all(channel.dtype == np.float32 and channel.shape == (8, 8) for channel in channels.values())
+    image = np.stack([channels[c] for c in "RGB"], -1)
+    # Passes of the same samples, summed in another order.
+    np.testing.assert_allclose(image, pj.render(pj.load_scene(FURNACE, res=8), 4, 3), rtol=1e-5)
+    assert header["pathjax.seed"] == 3
+    assert header["pathjax.spp"] == 4
+    assert header["pathjax.version"] == pj.__version__
+    assert header["pathjax.scene"] == FURNACE
+    assert "res=8" in header["pathjax.parameters"]
+    assert [path.name for path in tmp_path.iterdir()] == ["a.exr"]
+
+
+def test_render_writes_png_in_srgb(run, tmp_path):
+    from PIL import Image
+
+    arguments = ("render", FURNACE, *SMALL, "-D", "max_depth=1", "--set", "glow.radiance=0.2,0.5,1", "-o")
+    assert run(*arguments, tmp_path / "a.png", "--spp", 2)[0] == 0
+    image = np.asarray(Image.open(tmp_path / "a.png"))
+    assert image.dtype == np.uint8
+    expected = np.rint(255 * linear_to_srgb(np.array([0.2, 0.5, 1])))
+    np.testing.assert_array_equal(image, np.broadcast_to(expected, (8, 8, 3)))
+
+
+def test_same_command_writes_the_same_pixels_and_another_seed_others(run, tmp_path):
+    images = []
+    for name, seed in (("a", 1), ("b", 1), ("c", 2)):
+        path = tmp_path / f"{name}.exr"
+        assert run("render", FURNACE, *SMALL, "-o", path, "--spp", 40, "--seed", seed)[0] == 0
+        images.append(read_exr(path)[0]["R"])
+    np.testing.assert_array_equal(images[0], images[1])
+    assert not np.array_equal(images[0], images[2])
+
+
+def test_json_is_one_object_on_stdout(run, tmp_path):
+    status, out, _ = run("render", FURNACE, *SMALL, "-o", tmp_path / "a.exr", "--spp", 8, "--json")
+    report = json.loads(out)
+    assert status == 0
+    assert out.count("\n") == 1
+    assert (report["width"], report["height"], report["spp"], report["seed"]) == (8, 8, 8, 0)
+    assert report["output"] == str(tmp_path / "a.exr")
+    assert report["interrupted"] is False
+    assert report["not_finite_pixels"] == 0
+    assert report["error"] >= 0
+
+
+def test_spp_defaults_to_the_files(run, tmp_path):
+    _, out, _ = run("render", FURNACE, *SMALL, "-D", "spp=5", "-o", tmp_path / "a.exr", "--json")
+    assert json.loads(out)["spp"] == 5
+
+
+def test_set_changes_parameters(run, tmp_path):
+    settings = ("--set", "wall.reflectance=0", "--set", "glow.radiance=0.5,2,3")
+    assert run("render", FURNACE, *SMALL, *settings, "-o", tmp_path / "a.exr", "--spp", 1)[0] == 0
+    channels, header = read_exr(tmp_path / "a.exr")
+    assert [channels[c][3, 4] for c in "RGB"] == [0.5, 2, 3]
+    assert "glow.radiance=0.5,2,3" in header["pathjax.parameters"]
+
+
+def test_strategy_is_heard(run, tmp_path):
+    arguments = ("render", FURNACE, *SMALL, "-D", "max_depth=4", "--strategy", "bsdf")
+    assert run(*arguments, "-o", tmp_path / "a.exr", "--spp", 1)[0] == 0
+    red = read_exr(tmp_path / "a.exr")[0]["R"]
+    np.testing.assert_allclose(red, 1.248, rtol=1e-5)  # without light sampling a furnace has no noise
+
+
+def test_an_existing_file_is_replaced_whole(run, tmp_path):
+    (tmp_path / "a.exr").write_bytes(b"old")
+    assert run("render", FURNACE, *SMALL, "-o", tmp_path / "a.exr", "--spp", 1)[0] == 0
+    assert set(read_exr(tmp_path / "a.exr")[0]) == {"R", "G", "B"}
+
+
+# ---- what is refused ------------------------------------------------------------------------------------------------
+
+
+def test_missing_scene(refused, tmp_path):
+    refused("render", "nowhere.xml", "-o", tmp_path / "a.exr", says=["nowhere.xml"])
+    refused("info", "nowhere.xml", says=["nowhere.xml"])
+
+
+def test_errors_in_a_scene_name_file_and_line(refused, write_scene, tmp_path):
+    path = write_scene('<shape type="sphere"><bsdf type="plastic"/></shape>')
+    line = 1 + path.read_text().split("plastic")[0].count("\n")
+    refused("render", path, "-o", tmp_path / "a.exr", says=[f"{path}:{line}: ", "plastic", "diffuse"])
+
+
+@pytest.mark.parametrize("text", ["", "not xml", "<scene", "<scene version='3.0.0'></scene>", "\0\1\2"])
+def test_what_is_no_scene(refused, tmp_path, text):
+    (tmp_path / "bad.xml").write_text(text)
+    refused("info", tmp_path / "bad.xml", says=["bad.xml"])
+
+
+def test_a_folder_is_no_scene(refused, tmp_path):
+    refused("info", tmp_path, says=[str(tmp_path)])
+
+
+def test_missing_output_folder(refused, tmp_path):
+    refused("render", FURNACE, "-o", tmp_path / "no" / "a.exr", says=["no folder", str(tmp_path / "no")])
+
+
+def test_output_that_is_a_folder_or_of_another_kind(refused, tmp_path):
+    (tmp_path / "b.exr").mkdir()
+    refused("render", FURNACE, "-o", tmp_path / "b.exr", says=["folder"])
+    refused("render", FURNACE, "-o", tmp_path / "a.jpg", says=[".exr or .png"])
+    refused("render", FURNACE, "-o", tmp_path / "a", says=[".exr or .png"])
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="root may write anywhere")
+def test_output_folder_without_the_right_to_write(refused, tmp_path):
+    (tmp_path / "locked").mkdir(mode=0o500)
+    refused("render", FURNACE, *SMALL, "-o", tmp_path / "locked" / "a.exr", "--spp", "1", says=["cannot be written"])
+
+
+@pytest.mark.parametrize("spp", ["0", "-1", "1.5", "many", "", str(2**31)])
+def test_spp_that_is_no_positive_integer(refused, tmp_path, spp):
+    refused("render", FURNACE, "-o", tmp_path / "a.exr", f"--spp={spp}", says=["--spp"])
+
+
+@pytest.mark.parametrize("seed", ["-1", "0.5", str(2**31)])
+def test_seed_that_is_no_31_bit_integer(refused, tmp_path, seed):
+    refused("render", FURNACE, "-o", tmp_path / "a.exr", f"--seed={seed}", says=["--seed"])
+
+
+def test_unknown_parameter_offers_names(refused, tmp_path):
+    output = ("-o", tmp_path / "a.exr")
+    refused("render", FURNACE, *output, "--set", "wal.reflectance=1", says=["wal.reflectance", "wall.reflectance"])
+    refused("render", FURNACE, *output, "--set", "zzz=1", says=["zzz", "wall.reflectance", "glow.radiance"])
+
+
+@pytest.mark.parametrize(
+    "setting, says",
+    [
+        ("wall.reflectance=1,2", "wall.reflectance"),
+        ("wall.reflectance=blue", "blue"),
+        ("wall.reflectance=1.5", "bounds"),
+        ("wall.reflectance=nan", "bounds"),
+        ("glow.radiance=-1", "bounds"),
+        ("glow.radiance=inf", "radiance"),
+        ("wall.reflectance=", "number"),
+        ("wall.reflectance", "name=value"),
+        ("=1", "name=value"),
+    ],
+)
+def test_values_that_a_parameter_does_not_take(refused, tmp_path, setting, says):
+    refused("render", FURNACE, *SMALL, "-o", tmp_path / "a.exr", "--spp", "1", "--set", setting, says=[says])
+
+
+@pytest.mark.parametrize(
+    "define, says",
+    [
+        ("resolution=8", "resolution"),
+        ("res=many", "furnace.xml:32: "),
+        ("res=0", "furnace.xml:32: "),
+        ("res=-3", "furnace.xml:32: "),
+        ("res=99999", "furnace.xml:32: "),
+        ("max_depth=0", "max_depth"),
+        ("res", "name=value"),
+    ],
+)
+def test_defines_that_a_file_does_not_take(refused, tmp_path, define, says):
+    refused("render", FURNACE, "-o", tmp_path / "a.exr", "-D", define, says=[says])
+
+
+def test_no_command_and_unknown_commands(refused):
+    refused()
+    refused("paint", FURNACE)
+    refused("render", FURNACE, says=["-o"])
+    refused("render", FURNACE, "-o", "a.exr", "--strategy", "luck", says=["luck"])
+
+
+def test_help_is_no_error(run):
+    status, out, _ = run("render", "--help")
+    assert status == 0
+    assert "--spp" in out and "--set" in out
+
+
+# ---- info -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["scenes/glass_and_mirror.xml", "tests/scenes/conductors.xml", "scenes/mesh.xml"])
+def test_info_lists_every_parameter(run, name):
+    status, out, _ = run("info", name)
+    parameters = pj.parameters(pj.load_scene(name))
+    assert status == 0
+    assert parameters
+    lines = [line.split() for line in out.splitlines()]
+    for parameter in parameters:
+        assert any(line[:1] == [parameter] for line in lines), parameter
+
+
+def test_info_as_json(run):
+    status, out, _ = run("info", "scenes/glass_and_mirror.xml", "-D", "res=20", "--set", "glass.int_ior=1.25", "--json")
+    facts = json.loads(out)
+    assert status == 0
+    assert facts["image"] == {"width": 20, "height": 20, "filter": "box", "spp": 256}
+    assert facts["camera"] == "thinlens"
+    assert facts["integrator"]["max_depth"] == 12
+    assert facts["primitives"]["spheres"] == 5
+    assert facts["parameters"]["glass.int_ior"]["value"] == 1.25
+    assert facts["parameters"]["glass.int_ior"]["shape"] == []
+    assert facts["parameters"]["sky.radiance"]["bounds"] == [0, None]
+    assert set(facts["compiled"]["bsdfs"]) == {"diffuse", "conductor", "dielectric"}
+
+
+def test_info_tells_of_the_sampler_and_the_tree(run):
+    _, out, _ = run("info", "scenes/mesh.xml")
+    assert "independent" in out
+    assert "20800 triangles" in out
+    assert "SAH cost" in out
+    assert "sampler" in out
+
+
+def test_info_of_a_scene_without_parameters_or_shapes(run, write_scene):
+    status, out, _ = run("info", write_scene(""))
+    assert status == 0
+    assert "none" in out
+
+
+# ---- in a process of its own ----------------------------------------------------------------------------------------
+
+
+def test_module_renders(process, tmp_path):
+    done = process("render", FURNACE, *SMALL, "-o", tmp_path / "a.exr", "--spp", 2, "--json")
+    out, err = done.communicate(timeout=120)
+    assert done.returncode == 0, err
+    assert json.loads(out)["spp"] == 2
+    assert set(read_exr(tmp_path / "a.exr")[0]) == {"R", "G", "B"}
+
+
+def test_module_refuses_without_a_traceback(process, tmp_path):
+    done = process("render", "nowhere.xml", "-o", tmp_path / "a.exr")
+    out, err = done.communicate(timeout=60)
+    assert (done.returncode, out) == (2, "")
+    assert "nowhere.xml" in err and "Traceback" not in err
+    assert len(err.strip().splitlines()) == 1
+    assert not list(tmp_path.iterdir())
+
+
+def first_line_with(stream, text):
+    for line in iter(stream.readline, ""):
+        if text in line:
+            return line
+    raise AssertionError(f"{text!r} did not come")
+
+
+# Says when a mesh begins to load, when the first call of the kernel begins, and when some calls are done, so that the
+# signal comes at a known time; then runs the same command line.
+TELLTALE = """
+import sys
+from pathjax import cli, progressive
+from pathjax.io import mesh
+
+def tell(what):
+    print(what, file=sys.stderr, flush=True)
+
+def load(*arguments, plain=mesh.load, **keywords):
+    tell("mesh loads")
+    return plain(*arguments, **keywords)
+
+def calls(self, plain=progressive.ProgressiveRender.__iter__):
+    tell("kernel compiles")
+    for number, paths in enumerate(plain(self)):
+        if number == 20:
+            tell("kernel ran")
+        yield paths
+
+mesh.load, progressive.ProgressiveRender.__iter__ = load, calls
+sys.exit(cli.main(sys.argv[1:]))
+"""
+
+
+@pytest.fixture
+def interrupt(root):
+    """(arguments, event of TELLTALE, seconds to wait after) -> status, stdout, stderr, seconds from the signal on."""
+
+    def interrupt(arguments, event, seconds):
+        command = [sys.executable, "-c", TELLTALE, *map(str, arguments)]
+        with subprocess.Popen(command, cwd=root, env=environment(root), **PIPES) as started:
+            try:
+                first_line_with(started.stderr, event)
+                time.sleep(seconds)
+                begin = time.perf_counter()
+                started.send_signal(signal.SIGINT)
+                out, err = started.communicate(timeout=20)
+                return started.returncode, out, err, time.perf_counter() - begin
+            finally:
+                started.kill()
+
+    return interrupt
+
+
+# Ctrl-C is to be heard within a second; half a second more for a busy machine to write and leave.
+SOON = 1.5
+sends_signals = pytest.mark.skipif(sys.platform == "win32", reason="sends SIGINT")
+
+
+@sends_signals
+def test_interrupt_keeps_what_is_done(interrupt, tmp_path):
+    output = tmp_path / "a.exr"
+    arguments = ("render", "scenes/cornell_box.xml", "-o", output, "--spp", 1_000_000, "--json")
+    status, out, err, seconds = interrupt(arguments, "kernel ran", 0.3)
+    assert status == 1
+    assert "Traceback" not in err
+    assert "interrupted" in err
+    assert seconds < SOON
+    report = json.loads(out)
+    assert report["interrupted"] is True
+    assert 0 < report["spp"] < 1_000_000
+    channels, header = read_exr(output)
+    assert header["pathjax.spp"] == report["spp"]
+    assert channels["R"].shape == (256, 256)
+    assert np.isfinite(channels["R"]).all() and (channels["R"] > 0).mean() > 0.5
+    assert [path.name for path in tmp_path.iterdir()] == ["a.exr"]
+
+
+@sends_signals
+@pytest.mark.parametrize("event, wait", [("mesh loads", 0.1), ("kernel compiles", 0.5), ("kernel compiles", 2)])
+def test_interrupt_before_the_first_pass_ends_quickly_and_writes_nothing(interrupt, tmp_path, event, wait):
+    arguments = ("render", "scenes/mesh.xml", "-o", tmp_path / "a.exr", "--spp", 1_000_000)
+    status, out, err, seconds = interrupt(arguments, event, wait)
+    assert (status, out) == (1, ""), err
+    assert "Traceback" not in err
+    assert "interrupted" in err
+    assert seconds < SOON
+    assert not list(tmp_path.iterdir())

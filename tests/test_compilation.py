@@ -1,0 +1,178 @@
+"""What is compiled, and how often: one native kernel for a render or a query, without what the scene lacks."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import pathjax as pj
+from pathjax import query, runtime
+from pathjax.render import _render_pixels
+
+ROOT = Path(__file__).resolve().parents[1]
+NAMES = sorted(path.stem for path in (*ROOT.glob("scenes/*.xml"), *ROOT.glob("tests/scenes/*.xml")))
+
+# Those whose kernels take longest to compile, among the scenes made for tests.
+LARGE = ("normals", "shapes_and_filters", "textures")
+SCENES = [pytest.param(name, marks=pytest.mark.slow if name in LARGE else ()) for name in NAMES]
+
+pytestmark = pytest.mark.skipif(not runtime.native(), reason="native loops are off")
+
+
+def lowered(scene, strategy="mis", devices=None, pixels=256):
+    numbers = (jnp.uint32(n) for n in (0, 4, 1))
+    pixels = jnp.arange(pixels, dtype=jnp.int32)
+    return _render_pixels.lower(replace(scene, about=None), pixels, *numbers, strategy=strategy, devices=devices)
+
+
+def assert_one_native_kernel(compiled):
+    """The entry computation calls one compiled loop and dispatches none itself."""
+    text = compiled.as_text()
+    entry = text[text.index("\nENTRY ") :]
+    assert entry.count("xla_cpu_small_call") == 1
+    assert " while(" not in entry
+
+
+# ---- native kernels -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_every_scene_renders_in_one_native_kernel(kernel_of, name):
+    assert_one_native_kernel(kernel_of(name).compiled)
+
+
+@pytest.mark.parametrize("strategy, devices", [("mis", 1), ("light", 1), ("bsdf", None)])
+def test_every_strategy_and_number_of_devices_is_one_native_kernel(shipped, strategy, devices):
+    assert_one_native_kernel(lowered(shipped("cornell_box", res=16), strategy, devices).compile())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("strategy", ["light", "bsdf"])
+@pytest.mark.parametrize("name", NAMES)
+def test_every_scene_and_strategy_is_one_native_kernel(shipped, name, strategy):
+    assert_one_native_kernel(lowered(shipped(name, res=16), strategy).compile())
+
+
+@pytest.mark.parametrize("name", ["cornell_box", pytest.param("mesh", marks=pytest.mark.slow)])
+def test_float64_renders_in_one_native_kernel(kernel_of, x64, name):
+    with x64():
+        assert_one_native_kernel(kernel_of(name, jnp.float64).compiled)
+
+
+@pytest.mark.parametrize("devices", [1, None])
+@pytest.mark.parametrize("name", ["glass_and_mirror", "mesh"])
+def test_closest_hit_is_one_native_kernel(shipped, name, devices):
+    rays = jnp.ones((1000, 3)), jnp.ones((1000, 3))
+    lowered = query._closest_hit.lower(shipped(name, res=16).geometry, *rays, devices=devices)
+    assert_one_native_kernel(lowered.compile())
+
+
+def test_render_in_the_users_jit_is_one_native_kernel(shipped):
+    scene = shipped("cornell_box", res=16)
+    render = jax.jit(lambda r: pj.render(pj.with_parameters(scene, {"white.reflectance": r}), 4))
+    assert_one_native_kernel(render.lower(jnp.float32(0.5)).compile())
+
+
+# ---- nothing that the scene lacks -----------------------------------------------------------------------------------
+
+# Source files that the debug information of a lowered program names.
+ALWAYS = {"render.py", "path.py", "camera.py", "film.py", "sampler.py"}
+OPTIONAL = {
+    "dielectric.py": ["glass_and_mirror", "glass_in_glass"],
+    "conductor.py": ["glass_and_mirror", "conductors"],
+    "fresnel.py": ["glass_and_mirror", "glass_in_glass", "conductors"],
+    "texture.py": ["glass_and_mirror", "textures"],
+    "sphere.py": ["glass_and_mirror", "glass_in_glass", "conductors", "textures"],
+    "triangle.py": ["textures", "mesh"],
+    "bvh.py": ["textures", "mesh"],
+    "planar.py": ["cornell_box", "glass_and_mirror", "glass_in_glass", "conductors", "textures", "mesh"],
+    "constant.py": [],  # its radiance is read by the dispatch; only strategy "light" samples it
+    "area.py": ["cornell_box", "glass_and_mirror", "glass_in_glass", "conductors", "textures", "mesh"],
+}
+
+
+@pytest.mark.parametrize(
+    "name", ["cornell_box", "glass_and_mirror", "glass_in_glass", "conductors", "textures", "mesh"]
+)
+def test_program_holds_code_of_the_kinds_present_and_of_no_others(shipped, name):
+    text = lowered(shipped(name, res=16)).as_text(debug_info=True)
+    holds = {file for file in ALWAYS | set(OPTIONAL) if f"/{file}" in text}
+    assert holds == ALWAYS | {file for file, names in OPTIONAL.items() if name in names}
+
+
+def test_background_is_sampled_by_strategy_light_alone(shipped):
+    text = lowered(shipped("glass_and_mirror", res=16), "light").as_text(debug_info=True)
+    assert "/constant.py" in text
+
+
+# ---- no recompilation -----------------------------------------------------------------------------------------------
+
+
+class Compilations:
+    """Counts what JAX's backend compiles."""
+
+    def __init__(self):
+        self.count, self.on = 0, True
+        jax.monitoring.register_event_duration_secs_listener(self.hear)
+
+    def hear(self, event, seconds, **_):
+        self.count += self.on and event == "/jax/core/compile/backend_compile_duration"
+
+
+@pytest.fixture
+def compilations():
+    counter = Compilations()
+    yield counter
+    counter.on = False
+
+
+def changes(scene):
+    camera = scene.camera
+    yield "seed", scene, {"seed": 5}
+    yield "spp", scene, {"spp": 3}
+    yield "colour", pj.with_parameters(scene, {"clay.reflectance": [0.1, 0.2, 0.3]}), {}
+    yield "IOR", pj.with_parameters(scene, {"glass.int_ior": 1.7}), {}
+    yield "light", pj.with_parameters(scene, {"lamp.radiance": 3.0}), {}
+    yield "camera position", replace(scene, camera=replace(camera, origin=camera.origin + 0.5)), {}
+    yield "max_depth", replace(scene, max_depth=jnp.int32(3)), {}
+    yield "rr_depth", replace(scene, rr_depth=jnp.int32(2)), {}
+
+
+def test_other_values_never_compile_again(shipped, compilations):
+    scene = shipped("glass_and_mirror", res=16)
+    base = np.asarray(pj.render(scene, 2))
+    list(changes(scene))  # small operations of the changes themselves compile here
+    assert compilations.count > 0  # the counter hears
+    for what, changed, how in changes(scene):
+        before = compilations.count
+        image = pj.render(changed, **({"spp": 2} | how))
+        assert compilations.count == before, what
+        assert not np.array_equal(image, base), what
+
+
+BALLS = """
+<shape type="sphere" id="{0}"><point name="center" x="{1}" y="0" z="0"/>
+  <bsdf type="diffuse" id="{2}"><rgb name="reflectance" value="{3}"/></bsdf></shape>
+<emitter type="constant" id="{4}"/>
+"""
+
+
+def test_scenes_of_one_structure_share_a_kernel_whatever_their_names(make_scene, compilations):
+    first = make_scene(BALLS.format("ball", 0, "red", "0.5, 0.1, 0.1", "sky"))
+    second = make_scene(BALLS.format("globe", 0.5, "blue", "0.1, 0.1, 0.5", "light"), fov=30, origin="1, 2, 4")
+    pj.render(first, 2)
+    before = compilations.count
+    pj.render(second, 2)
+    assert compilations.count == before
+
+
+def test_queries_do_not_compile_again(shipped, compilations):
+    scene, other = shipped("cornell_box", res=16), shipped("cornell_box", res=64)
+    rays = np.ones((10, 3), np.float32), np.ones((10, 3), np.float32)
+    pj.closest_hit(scene, *rays)
+    before = compilations.count
+    pj.closest_hit(other, *rays)
+    assert compilations.count == before

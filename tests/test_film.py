@@ -1,0 +1,111 @@
+"""Samples of a pixel lie as its filter weighs them, with weights of mean 1."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import stats
+
+from pathjax import description as desc
+from pathjax import film
+
+# Chance that a correct filter fails one test; seeds are fixed.
+FALSE_ALARM = 1e-4
+N = 400_000
+
+
+def built(**how):
+    return film.build(desc.Film(8, 6, (2, 1, 4, 3), **how), jnp.float32)
+
+
+def sampled(made, pixel, u):
+    """Offsets in pixels from the centre of the pixel on the film, and weights, float64."""
+    positions, weights = jax.jit(jax.vmap(lambda u: film.sample_position(made, jnp.int32(pixel), u)))(u)
+    center = np.array([2 + pixel % 4, 1 + pixel // 4]) + 0.5
+    return np.asarray(positions, np.float64) * [8, 6] - center, np.asarray(weights, np.float64)
+
+
+def uniform(n=N, seed=1):
+    return jnp.asarray(np.random.default_rng(seed).integers(0, 1 << 24, (n, 2)) * 2.0**-24, jnp.float32)
+
+
+FILTERS = {
+    "box": ({"filter": "box", "filter_radius": 0.5}, 0.5, lambda x: np.ones_like(x)),
+    "wide box": ({"filter": "box", "filter_radius": 1.5}, 1.5, lambda x: np.ones_like(x)),
+    "tent": ({"filter": "tent", "filter_radius": 1.0}, 1.0, lambda x: 1 - np.abs(x)),
+    "wide tent": ({"filter": "tent", "filter_radius": 2.0}, 2.0, lambda x: 1 - np.abs(x) / 2),
+    "gaussian": ({"filter": "gaussian"}, 2.0, lambda x: np.exp(-2 * x**2) - np.exp(-8)),
+    "wide gaussian": (
+        {"filter": "gaussian", "filter_stddev": 1.0, "filter_radius": 3.0},
+        3.0,
+        lambda x: np.exp(-(x**2) / 2) - np.exp(-4.5),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", FILTERS)
+def test_weighted_samples_have_the_filter_for_their_density(name):
+    how, radius, shape = FILTERS[name]
+    offsets, weights = sampled(built(**how), 5, uniform())
+    assert np.abs(offsets).max() <= radius * (1 + 1e-5)
+    # Mean weight 1, and each cell of x and y gets its share of the filter, by weight.
+    assert abs(weights.mean() - 1) < 5 * max(weights.std() / np.sqrt(N), 1e-6)
+    edges = np.linspace(-radius, radius, 13)
+    fine = (np.arange(200) + 0.5) / 200
+    share = np.array([shape(a + fine * (b - a)).mean() for a, b in zip(edges[:-1], edges[1:], strict=True)])
+    share = np.outer(share, share) / share.sum() ** 2
+    # The rim may be passed by an ulp.
+    inside = np.clip(offsets, -radius * (1 - 1e-9), radius * (1 - 1e-9))
+    total, squares = (np.histogram2d(*inside.T, [edges, edges], weights=w)[0] for w in (weights, weights**2))
+    full = share * N > 20  # the corners of a Gaussian hold next to nothing
+    error = np.sqrt(np.maximum(squares - total**2 / N, 1))
+    z = ((total - share * N) / error)[full]
+    p = 2 * stats.norm.sf(np.abs(z).max())
+    assert -np.expm1(z.size * np.log1p(-p)) > FALSE_ALARM
+    assert stats.chi2.sf((z**2).sum(), z.size) > FALSE_ALARM
+
+
+@pytest.mark.parametrize("name", FILTERS)
+def test_weights_vary_little(name):
+    """Importance sampling: only the tails of a Gaussian leave a weight other than 1."""
+    weights = sampled(built(**FILTERS[name][0]), 0, uniform(50_000))[1]
+    assert weights.min() >= 0 and weights.max() < 2.5 and weights.std() < (0.15 if "gaussian" in name else 1e-9)
+
+
+def test_box_samples_of_a_pixel_stay_in_it():
+    made = built(filter="box", filter_radius=0.5)
+    for pixel in (0, 3, 4, 11):
+        offsets, weights = sampled(made, pixel, uniform(10_000))
+        assert np.abs(offsets).max() <= 0.5 + 1e-5 and (weights == 1).all()
+
+
+@pytest.mark.parametrize("name", FILTERS)
+def test_samples_are_finite_at_the_ends_of_the_interval(name):
+    ends = [0, 0.5, 1 - 2**-24]
+    offsets, weights = sampled(
+        built(**FILTERS[name][0]), 1, jnp.array([[a, b] for a in ends for b in ends], jnp.float32)
+    )
+    assert np.isfinite(offsets).all() and np.isfinite(weights).all()
+
+
+def test_pixels_count_rows_of_the_crop_window():
+    made = built(filter="box", filter_radius=0.5)
+    assert film.pixel_count(made) == 12 and film.image_shape(made) == (3, 4)
+    middle = jax.vmap(lambda p: film.sample_position(made, p, jnp.array([0.5, 0.5]))[0])(jnp.arange(12))
+    np.testing.assert_allclose(
+        middle * jnp.array([8, 6]), [[2.5 + x, 1.5 + y] for y in range(3) for x in range(4)], rtol=1e-6
+    )
+
+
+@pytest.mark.parametrize("name", ["tent", "gaussian"])
+def test_filters_are_those_of_mitsuba(name):
+    mi = pytest.importorskip("mitsuba")
+    mi.set_variant("scalar_rgb")
+    theirs = mi.load_dict({"type": name})
+    how, radius, shape = FILTERS[name]
+    assert theirs.radius() == pytest.approx(radius)
+    x = np.linspace(-radius, radius, 41)
+    values = np.array([theirs.eval(float(v)) for v in x])
+    # Filters differ by a constant at most: both programs divide by their sum. Mitsuba's Gaussian is a polynomial fit,
+    # off by 5e-4.
+    np.testing.assert_allclose(values / values[20], shape(x) / shape(0 * x)[0], atol=1e-3)

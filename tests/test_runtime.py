@@ -1,0 +1,215 @@
+"""How XLA is set up on import, and `native_map`."""
+
+import json
+import os
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import lax
+
+from pathjax import runtime
+from pathjax.runtime import native_map
+
+OPTION = "xla_cpu_small_while_loop_byte_threshold"
+
+
+@pytest.fixture
+def python(root):
+    """(code, **environment) -> what it prints as JSON on its last line, and its stderr; in a process of its own."""
+
+    def run(code, **environment):
+        kept = {name: value for name, value in os.environ.items() if not name.startswith(("XLA_", "JAX_", "PATHJAX_"))}
+        kept["PYTHONPATH"] = os.pathsep.join(filter(None, [str(root), os.environ.get("PYTHONPATH")]))
+        command = [sys.executable, "-c", "import json\n" + code]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=120, env=kept | environment)
+        assert done.returncode == 0, done.stderr
+        return json.loads(done.stdout.splitlines()[-1]), done.stderr
+
+    return run
+
+
+# ---- set-up on import -----------------------------------------------------------------------------------------------
+
+FLAGS_AND_DEVICES = """
+import os, pathjax, jax
+print(json.dumps([os.environ.get("XLA_FLAGS", ""), jax.local_device_count(), pathjax.runtime.native()]))
+"""
+
+
+def test_import_turns_native_loops_on_with_a_device_per_core(python):
+    (flags, devices, native), err = python(FLAGS_AND_DEVICES)
+    assert OPTION in flags
+    assert native
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    assert devices == cores
+    assert "Warning" not in err
+
+
+def test_users_flags_are_kept(python):
+    (flags, _, native), _ = python(FLAGS_AND_DEVICES, XLA_FLAGS="--xla_cpu_enable_fast_math=false")
+    assert flags.startswith("--xla_cpu_enable_fast_math=false ")
+    assert native
+
+
+def test_users_own_threshold_is_kept(python):
+    mine = f"--xla_backend_extra_options={OPTION}=2048"
+    (flags, _, _), _ = python(FLAGS_AND_DEVICES, XLA_FLAGS=mine)
+    assert flags == mine
+
+
+@pytest.mark.parametrize(
+    "code, environment",
+    [
+        ("", {"XLA_FLAGS": "--xla_force_host_platform_device_count=3"}),
+        ("", {"JAX_NUM_CPU_DEVICES": "3"}),
+        ("import jax; jax.config.update('jax_num_cpu_devices', 3)", {}),
+    ],
+)
+def test_users_number_of_devices_is_kept(python, code, environment):
+    (flags, devices, native), err = python(code + FLAGS_AND_DEVICES, **environment)
+    assert devices == 3
+    assert native
+    assert "Warning" not in err
+
+
+STARTED = "import jax; jax.devices()\n"
+
+
+@pytest.mark.parametrize("number", [{}, {"JAX_NUM_CPU_DEVICES": "2"}])
+def test_import_after_the_backend_warns_once_with_the_remedy(python, number):
+    (flags, _, native), err = python(STARTED + "import pathjax" + FLAGS_AND_DEVICES, **number)
+    assert err.count("UserWarning") == 1
+    assert "before" in err and "XLA_FLAGS=--xla_backend_extra_options" in err
+    assert OPTION not in flags
+    assert not native
+
+
+def test_import_after_the_backend_is_silent_where_the_user_set_the_option(python):
+    remedy = f"--xla_backend_extra_options={OPTION}=1000000000000"
+    (_, _, native), err = python(STARTED + FLAGS_AND_DEVICES, XLA_FLAGS=remedy)
+    assert native
+    assert "Warning" not in err
+
+
+def test_import_after_jax_but_before_its_backend_is_in_time(python):
+    (_, _, native), err = python("import jax\n" + FLAGS_AND_DEVICES)
+    assert native
+    assert "Warning" not in err
+
+
+RENDER = """
+import pathjax, numpy
+scene = pathjax.load_scene("{scene}", res=4, max_depth=4)
+image = numpy.asarray(pathjax.render(scene, 2, strategy="bsdf"))
+print(json.dumps([pathjax.runtime.native(), image.tolist()]))
+"""
+
+
+@pytest.mark.parametrize("opted_out", [True, pytest.param(False, marks=pytest.mark.slow)])
+def test_renders_are_right_without_native_loops(python, root, opted_out):
+    """Opted out, or imported too late."""
+    code = RENDER.format(scene=(root / "scenes" / "furnace.xml").as_posix())
+    environment = {"PATHJAX_NATIVE_LOOPS": "0"} if opted_out else {}
+    (native, image), err = python(code if opted_out else STARTED + code, **environment)
+    assert not native
+    assert ("UserWarning" in err) == (not opted_out)
+    rho = np.array([0.2, 0.5, 0.8])
+    np.testing.assert_allclose(image, np.broadcast_to((1 - rho**4) / (1 - rho), (4, 4, 3)), rtol=1e-5)
+
+
+IMPORTS = """
+import sys, time
+import jax
+before = set(sys.modules)
+begin = time.perf_counter()
+import pathjax
+seconds = time.perf_counter() - begin
+heavy = {"trimesh", "OpenEXR", "rich", "PIL", "optimistix", "mitsuba", "matplotlib"}
+print(json.dumps([seconds, sorted(heavy & (set(sys.modules) - before))]))
+"""
+
+
+def test_import_is_light(python):
+    """Within 0.3 s of `import jax`: the best of three, as other work on the machine only ever adds."""
+    runs = [python(IMPORTS)[0] for _ in range(3)]
+    assert all(heavy == [] for _, heavy in runs)
+    assert min(seconds for seconds, _ in runs) < 0.3
+
+
+def test_import_starts_no_backend(python):
+    started, _ = python(
+        "import pathjax\nfrom jax._src import xla_bridge\nprint(json.dumps(xla_bridge.backends_are_initialized()))"
+    )
+    assert started is False
+
+
+# ---- native_map -----------------------------------------------------------------------------------------------------
+
+
+def collatz(n):
+    """Steps to 1: real control flow, of another length for every item."""
+
+    def step(state):
+        n, steps = state
+        return lax.cond(n % 2 == 0, lambda n: n // 2, lambda n: 3 * n + 1, n), steps + 1
+
+    return lax.while_loop(lambda state: state[0] > 1, step, (n, jnp.int32(0)))[1]
+
+
+def collatz_by_hand(n):
+    steps = 0
+    while n > 1:
+        n, steps = (n // 2 if n % 2 == 0 else 3 * n + 1), steps + 1
+    return steps
+
+
+MANY = len(jax.local_devices())
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 17])
+@pytest.mark.parametrize("form", ["loop", "vmap"])
+@pytest.mark.parametrize("devices", [1, None])
+def test_map_of_any_length_form_and_number_of_devices(count, form, devices):
+    mapped = jax.jit(lambda xs: native_map(collatz, xs, form=form, devices=devices))
+    xs = jnp.arange(1, count + 1, dtype=jnp.int32)
+    np.testing.assert_array_equal(mapped(xs), [collatz_by_hand(n) for n in range(1, count + 1)])
+
+
+@pytest.mark.parametrize("form", ["loop", "vmap"])
+def test_map_over_trees_with_shared_trees(form):
+    def f(item, table, number):
+        (a, b), index = item["pair"], item["index"]
+        return {"sum": a + b * number, "picked": (table["rows"][index],)}
+
+    xs = {"pair": (jnp.arange(5.0), jnp.ones(5)), "index": jnp.asarray([2, 0, 1, 1, 2])}
+    table = {"rows": jnp.arange(12.0).reshape(3, 4)}
+    out = native_map(f, xs, table, 3.0, form=form)
+    np.testing.assert_array_equal(out["sum"], np.arange(5) + 3)
+    np.testing.assert_array_equal(out["picked"][0], table["rows"][xs["index"]])
+
+
+@pytest.mark.skipif(MANY < 2, reason="needs two devices")
+def test_order_is_kept_for_every_number_of_devices():
+    xs = jnp.arange(101.0)
+    for devices in range(1, MANY + 1):
+        np.testing.assert_array_equal(native_map(lambda x: 2 * x, xs, devices=devices), 2 * xs)
+
+
+def test_chunks_of_the_vectorised_form_cover_all_items(monkeypatch):
+    """Chunks that do not divide the number of items, as an accelerator would have them."""
+    monkeypatch.setattr(runtime, "_CHUNK_BYTES", 7 * runtime._BYTES_PER_LANE)
+    xs = jnp.arange(1, 101, dtype=jnp.int32)
+    np.testing.assert_array_equal(
+        native_map(collatz, xs, form="vmap", devices=1), [collatz_by_hand(n) for n in range(1, 101)]
+    )
+
+
+def test_map_passes_tangents():
+    xs = jnp.linspace(0.1, 1, 7)
+    primal, tangent = jax.jvp(lambda s: native_map(lambda x, s: jnp.sin(s * x), xs, s), (2.0,), (1.0,))
+    np.testing.assert_allclose(primal, np.sin(2 * xs), rtol=1e-6)
+    np.testing.assert_allclose(tangent, xs * np.cos(2 * xs), rtol=1e-6)
