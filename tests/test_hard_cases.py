@@ -346,7 +346,8 @@ EXTREMES = (0.0, 1 - 2**-24)
 @pytest.mark.parametrize(
     "name, strategy",
     [
-        ("glass_and_mirror", "mis"),
+        pytest.param("glass_and_mirror", "mis", marks=pytest.mark.slow),
+        ("cornell_box", "mis"),
         pytest.param("glass_and_mirror", "light", marks=pytest.mark.slow),
         pytest.param("shapes_and_filters", "light", marks=pytest.mark.slow),
         pytest.param("conductors", "mis", marks=pytest.mark.slow),

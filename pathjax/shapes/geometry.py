@@ -75,7 +75,7 @@ def closest_hit(geometry: Geometry, ray: Ray) -> Hit:
 
     def leaf_test(distances, primitives, t, primitive):
         # Positive floats order as integers, and integer minima vectorise. A miss is the bits of infinity or more.
-        bits = jnp.where((distances > 0) & (distances <= t) & (primitives >= 0), _bits(distances), beyond)
+        bits = jnp.where((distances > 0) & (distances <= t), _bits(distances), beyond)
         bits = lax.optimization_barrier(bits)
         nearest = lax.optimization_barrier(_least(bits))
 
@@ -97,7 +97,7 @@ def occluded(geometry: Geometry, ray: Ray, target):
     """() bool: whether anything but the primitive `target` lies at 0 < t < ray.t_max."""
 
     def leaf_test(distances, primitives, t, primitive):
-        blocked = jnp.any((distances > 0) & (distances < t) & (primitives >= 0) & (primitives != target))
+        blocked = jnp.any((distances > 0) & (distances < t) & (primitives != target))
         return jnp.where(blocked, -1, t), primitive
 
     t, _ = _visit(geometry, ray, leaf_test, ray.t_max, jnp.int32(NO_HIT))
@@ -137,7 +137,7 @@ def _visit(geometry: Geometry, ray: Ray, leaf_test, t, primitive):
 
         def leaf(number, t, primitive, table=table, first=first, module=module, prepared=prepared):
             rows = at(table.rows, number)
-            primitives = jnp.where(rows >= 0, rows + first, -1)
+            primitives = rows + first  # of empty lanes: nonsense, but these are never hit
             distances = module.intersect(table, number, prepared, primitives == ray.exclude)
             return leaf_test(distances, primitives, t, primitive)
 

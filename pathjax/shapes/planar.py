@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pathjax.core.math import at, dot, safe_atan2, safe_divide, safe_sqrt
+from pathjax.core.math import at, dot, larger, safe_atan2, safe_divide, safe_sqrt
 from pathjax.core.types import Surface
 from pathjax.core.warp import square_to_disk
 from pathjax.shapes.bvh import Tree
@@ -22,7 +22,7 @@ from pathjax.shapes.bvh import Tree
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Planar:
-    leaves: jax.Array  # (L, 16, W) of `leaf_numbers`; NaN in empty lanes
+    leaves: jax.Array  # (L, 14, W) of `leaf_numbers`; NaN in empty lanes
     rows: jax.Array  # (L, W) int32 row of each lane
     tree: Tree | None  # None: L = 1, every ray tests all
     frames: jax.Array  # (P, 4, 3): c, a, b, unit normal
@@ -30,7 +30,7 @@ class Planar:
 
 
 def leaf_numbers(frames):
-    """(P, 4, 3) float64 -> (P, 16): c, normal, dual vectors of a and b, bounds on the rounding of each coordinate."""
+    """(P, 4, 3) float64 -> (P, 14): c, normal, dual vectors of a and b, bound on the coordinates' rounding."""
     c, a, b, n = np.moveaxis(np.asarray(frames, np.float64), 1, 0)
     normal = np.cross(a, b)
     squared = (normal**2).sum(-1, keepdims=True)
@@ -39,8 +39,8 @@ def leaf_numbers(frames):
     # |dual| (2 t + radius) roundings.
     radius = np.sqrt((a**2).sum(-1) + (b**2).sum(-1))
     slope_a, slope_b = np.sqrt((dual_a**2).sum(-1)), np.sqrt((dual_b**2).sum(-1))
-    errors = np.stack([slope_a * radius, slope_a, slope_b * radius, slope_b], -1)
-    return np.concatenate([c, n, dual_a, dual_b, errors], -1)
+    slope = np.maximum(slope_a, slope_b)
+    return np.concatenate([c, n, dual_a, dual_b, np.stack([slope * radius, 2 * slope], -1)], -1)
 
 
 def bounds(frames, disk):
@@ -62,17 +62,13 @@ def intersect(table: Planar, leaf, prepared, on_it):
     """
     o, d = prepared
     leaf = at(table.leaves, leaf)
-    c, n, dual_a, dual_b, errors = leaf[0:3], leaf[3:6], leaf[6:9], leaf[9:12], leaf[12:16]
+    c, n, dual_a, dual_b, error = leaf[0:3], leaf[3:6], leaf[6:9], leaf[9:12], leaf[12:14]
     from_c = [o[axis] - c[axis] for axis in range(3)]
     t = -dot(n, from_c) / dot(n, d)
     x = dot(dual_a, from_c) + t * dot(dual_a, d)
     y = dot(dual_b, from_c) + t * dot(dual_b, d)
-    eps = 4 * np.finfo(leaf.dtype).eps
-    x_error, y_error = eps * (errors[0] + 2 * t * errors[1]), eps * (errors[2] + 2 * t * errors[3])
-    if table.disk:
-        inside = x * x + y * y <= 1 + x_error + y_error
-    else:
-        inside = (jnp.abs(x) <= 1 + x_error) & (jnp.abs(y) <= 1 + y_error)
+    reach = 1 + (4 * np.finfo(leaf.dtype).eps) * (error[0] + t * error[1])
+    inside = x * x + y * y <= reach * reach if table.disk else larger(jnp.abs(x), jnp.abs(y)) <= reach
     return jnp.where(inside & ~on_it, t, jnp.inf)
 
 
@@ -90,11 +86,11 @@ def surface(table: Planar, row, o, d, t) -> Surface:
     from_c = o - c
     distance = -safe_divide(dot(n, from_c), dot(n, d))
     q = from_c + distance * d
+    p = c + (q - dot(n, q) * n)
     aa, ab, bb = dot(a, a), dot(a, b), dot(b, b)
     qa, qb = dot(q, a), dot(q, b)
     scale = 1 / (aa * bb - ab * ab)
     x, y = (bb * qa - ab * qb) * scale, (aa * qb - ab * qa) * scale
-    p = c + x * a + y * b
     if table.disk:
         r = safe_sqrt(x * x + y * y)
         angle = safe_atan2(y, x) / (2 * math.pi)
