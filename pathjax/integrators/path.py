@@ -153,9 +153,12 @@ def radiance(scene, choice: Choice | None, ray: Ray, numbers, strategy: str):
 
 
 def mis_weight(pdf, other_pdf):
-    """Power heuristic for a sample of density `pdf` > 0 that the other technique finds with `other_pdf`."""
+    """Power heuristic for a sample of density `pdf` > 0 that the other technique finds with `other_pdf`.
+
+    1 for an infinite `pdf`, what cannot be found otherwise, even where a grazing light makes the other one overflow.
+    """
     ratio = other_pdf / pdf
-    return 1 / (1 + ratio * ratio)
+    return jnp.where(jnp.isinf(pdf), 1, 1 / (1 + ratio * ratio))
 
 
 def sample_numbers(scene, stream, sample):
