@@ -2,7 +2,17 @@
 
 import sys
 
-from pathjax.cli import main
+
+def main() -> int:
+    """The command line, deaf to Ctrl-C at no time: importing JAX takes a while."""
+    try:
+        from pathjax import cli
+
+        return cli.main()
+    except KeyboardInterrupt:
+        print("pathjax: interrupted; nothing was written", file=sys.stderr)
+        return 1
+
 
 if __name__ == "__main__":
     sys.exit(main())

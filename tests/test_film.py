@@ -67,9 +67,9 @@ def test_weighted_samples_have_the_filter_for_their_density(name):
 
 @pytest.mark.parametrize("name", FILTERS)
 def test_weights_vary_little(name):
-    """Importance sampling: only the tails of a Gaussian leave a weight other than 1."""
+    """Importance sampling: only the tails of a Gaussian leave a weight other than 1, most in the last of 1024 steps."""
     weights = sampled(built(**FILTERS[name][0]), 0, uniform(50_000))[1]
-    assert weights.min() >= 0 and weights.max() < 2.5 and weights.std() < (0.15 if "gaussian" in name else 1e-9)
+    assert weights.min() >= 0 and weights.max() < 5 and weights.std() < (0.15 if "gaussian" in name else 1e-9)
 
 
 def test_box_samples_of_a_pixel_stay_in_it():

@@ -13,6 +13,7 @@ from __future__ import annotations
 import json
 import signal
 import struct
+import threading
 import warnings
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -38,14 +39,17 @@ class _Raw:
 @contextmanager
 def _interrupts_wait():
     """Hold Ctrl-C back: trimesh catches every exception around its optional imports, and so would lose it."""
-    if not hasattr(signal, "pthread_sigmask"):
+    if threading.current_thread() is not threading.main_thread():
         yield
         return
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    heard = []
+    before = signal.signal(signal.SIGINT, lambda *call: heard.append(call))
     try:
         yield
     finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        signal.signal(signal.SIGINT, before)
+    if heard and callable(before):
+        before(*heard[0])
 
 
 def load(
