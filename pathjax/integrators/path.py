@@ -174,16 +174,18 @@ def sample_numbers(scene, stream, sample):
     pairs, key = lax.optimization_barrier((pairs, sampler.path_key(stream, sample)))
 
     def numbers(depth):
-        hashed = sampler.hashed(key, depth * 8, 8).astype(dtype)
+        def hashed(place, count):
+            return sampler.hashed(key, depth * 8 + place, count).astype(dtype)
 
         def early():
             return at(pairs, 2 + 2 * depth), at(pairs, 3 + 2 * depth)
 
         def late():
-            return hashed[0:2], hashed[2:4]
+            u = hashed(0, 4)
+            return u[0:2], u[2:4]
 
         light, bsdf = lax.cond(depth < SOBOL_BOUNCES, early, late)
-        return Bounce(light, bsdf, hashed[4], hashed[5])
+        return Bounce(light, bsdf, hashed(4, 1)[0], hashed(5, 1)[0])
 
     return pairs[0], pairs[1], numbers
 
