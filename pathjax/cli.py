@@ -42,7 +42,7 @@ def _parser() -> argparse.ArgumentParser:
     render.add_argument("-o", "--output", required=True, metavar="OUT.{exr,png}")
     render.add_argument("--spp", type=_positive, metavar="N", help="samples per pixel; default: the file's")
     render.add_argument("--seed", type=_seed, default=0, metavar="K")
-    render.add_argument("--strategy", choices=("mis", "light", "bsdf"), default="mis", help="how light is sampled")
+    render.add_argument("--strategy", default="mis", metavar="{mis,light,bsdf}", help="how light is sampled")
     render.add_argument("--json", action="store_true", help="print one JSON object on stdout")
     render.set_defaults(run=_render)
 

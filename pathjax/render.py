@@ -12,6 +12,7 @@ from jax import lax
 from pathjax import emitters, film
 from pathjax.camera import sample_ray
 from pathjax.core import sampler
+from pathjax.errors import InputError
 from pathjax.integrators import path
 from pathjax.runtime import native_map
 from pathjax.scene import Scene
@@ -28,6 +29,8 @@ def render(scene: Scene, spp: int = 64, seed: int = 0, strategy: str = "mis"):
         seed: other seeds give independent images; the same seed gives the same image, bit for bit, on any number of
             CPU devices.
         strategy: "mis", or "light" or "bsdf" for experiments.
+    Raises:
+        InputError: unknown strategy, spp or seed out of range.
     A sample that is not finite leaves its pixel not finite, and the others untouched.
     """
     pixels = jnp.arange(film.pixel_count(scene.film), dtype=jnp.int32)
@@ -40,6 +43,11 @@ def render_pixels(scene: Scene, pixels, first_sample, spp, seed, strategy: str =
 
     how: `form` and `devices` of `runtime.native_map`.
     """
+    if strategy not in path.STRATEGIES:
+        raise InputError(f"strategy {strategy!r} is unknown; use one of {', '.join(path.STRATEGIES)}")
+    for name, value, least in (("spp", spp, 1), ("seed", seed, 0)):
+        if isinstance(value, int) and not least <= value < 2**31:
+            raise InputError(f"{name} = {value}; it must lie in [{least}, 2^31)")
     arguments = (jnp.asarray(x, jnp.uint32) for x in (first_sample, spp, seed))
     return _render_pixels(replace(scene, about=None), pixels, *arguments, strategy=strategy, **how)
 

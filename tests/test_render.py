@@ -298,3 +298,10 @@ def test_hidden_emitters_light_the_scene_and_let_the_camera_through(make_scene, 
     agree(estimate(hidden, spp=64), RHO * (5 * f + 1 - f), pixelwise=False)
     beside = make_scene(plate + lamp + UNIFORM, hide="true", origin="4, 0, 0.2", target="4, 0, 5", fov=10)
     assert not np.asarray(pj.render(beside, 2)).any()  # the sky is hidden too
+
+
+@pytest.mark.parametrize("wrong", [{"spp": 0}, {"spp": -1}, {"seed": -1}, {"strategy": "mix"}])
+def test_arguments_out_of_range_are_refused(root, wrong):
+    scene = pj.load_scene(root / "scenes" / "cornell_box.xml", res=4)
+    with pytest.raises(pj.InputError, match=next(iter(wrong))):
+        pj.render(scene, **wrong)

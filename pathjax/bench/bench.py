@@ -37,6 +37,8 @@ def run(options) -> int:
     folder = None if options.output is None else Path(options.output)
     if folder is not None and not folder.parent.is_dir():
         raise InputError(f"{folder}: there is no folder {folder.parent}; make it first")
+    if folder is not None and folder.exists() and not folder.is_dir():
+        raise InputError(f"{folder}: is a file; name a folder")
     report = {"machine": machine(), "scenes": []}
     for file in options.scenes:
         report["scenes"].append(
@@ -123,8 +125,8 @@ def measure(file, defines, spps, repeat, reference_spp, against, say) -> dict:
 
     rows = [_row(spp, spp, seconds[spp], errors[spp], paths) for spp in spps]
     for row in rows:
-        best = max((p["efficiency"] for p in peers if p["asked_spp"] == row["spp"]), default=None)
-        row["efficiency_over_best_peer"] = None if best is None else row["efficiency"] / best
+        best = max((p["efficiency"] for p in peers if p["asked_spp"] == row["spp"] and p["efficiency"]), default=None)
+        row["efficiency_over_best_peer"] = best and row["efficiency"] and row["efficiency"] / best
     return {
         "file": str(file),
         "width": width,
@@ -145,7 +147,7 @@ def _row(asked, spp, seconds, errors, paths) -> dict:
         "run_seconds": run,
         "mpaths_per_second": paths * spp / run / 1e6,
         "rel_mse": error,
-        "efficiency": 1 / (error * run),
+        "efficiency": 1 / (error * run) if error > 0 else None,  # a scene without noise has none
     }
 
 
@@ -157,7 +159,7 @@ def _mitsuba(file, defines, spps, repeat, reference, paths) -> list[dict]:
     ]
     try:
         report, arrays = mitsuba_peer.call({"scene": str(file), "parameters": defines, "runs": runs})
-    except mitsuba_peer.PeerMissing as error:
+    except (mitsuba_peer.PeerMissing, mitsuba_peer.RequestError, mitsuba_peer.PeerFailed) as error:
         raise InputError(f"--against mitsuba: {error}") from None
     rows = []
     for k, (asked, done) in enumerate(zip(runs, report["runs"], strict=True)):
@@ -238,7 +240,8 @@ def markdown(report: dict) -> str:
 
 
 def _line(name: str, row: dict, ratio: str) -> str:
+    efficiency = "" if row["efficiency"] is None else f"{row['efficiency']:.1f}"
     return (
         f"| {name} | {row['spp']} | {row['run_seconds']:.3f} | {row['mpaths_per_second']:.2f} | {row['rel_mse']:.2e} "
-        f"| {row['efficiency']:.1f} | {ratio} |"
+        f"| {efficiency} | {ratio} |"
     )

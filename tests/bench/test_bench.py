@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pathjax.bench.bench import rel_mse
+from pathjax.bench.bench import _line, _row, rel_mse
 from pathjax.cli import main
 
 CORNELL = str(Path(__file__).resolve().parents[2] / "scenes" / "cornell_box.xml")
@@ -35,3 +35,9 @@ def test_bench_reports_speed_against_error(tmp_path, capsys):
 def test_bench_refuses_a_folder_without_parent(tmp_path, capsys):
     assert main([*QUICK, "-o", str(tmp_path / "none" / "report")]) == 2
     assert "there is no folder" in capsys.readouterr().err
+
+
+def test_a_scene_without_noise_has_no_efficiency():
+    row = _row(4, 4, [1.0], [0.0], 64)
+    assert row["efficiency"] is None
+    assert "| 0.00e+00 |  |" in _line("pathjax", row, "")
