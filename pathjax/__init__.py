@@ -2,12 +2,25 @@
 
 from pathjax import runtime as _runtime  # noqa: F401  first: sets XLA up before a backend starts
 from pathjax.errors import InputError
+from pathjax.gradient import Jacobian, jacobian
+from pathjax.named import parameters, with_parameters
 from pathjax.query import closest_hit
 from pathjax.render import render
-from pathjax.scene import Scene, parameters, with_parameters
+from pathjax.scene import Scene
 
 __version__ = "0.1.0"
-__all__ = ["InputError", "Scene", "__version__", "closest_hit", "load_scene", "parameters", "render", "with_parameters"]
+__all__ = [
+    "InputError",
+    "Jacobian",
+    "Scene",
+    "__version__",
+    "closest_hit",
+    "jacobian",
+    "load_scene",
+    "parameters",
+    "render",
+    "with_parameters",
+]
 
 
 def load_scene(file, **parameters) -> Scene:

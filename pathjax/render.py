@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 
 import jax
 import jax.numpy as jnp
-from jax import lax
+from jax.custom_derivatives import SymbolicZero
 
-from pathjax import emitters, film
-from pathjax.camera import sample_ray
-from pathjax.core import sampler
+from pathjax import emitters, film, gradient, named
 from pathjax.errors import InputError
-from pathjax.integrators import path
+from pathjax.integrators import path, pixel
+from pathjax.named import About
 from pathjax.runtime import native_map
 from pathjax.scene import Scene
 
@@ -21,8 +20,10 @@ from pathjax.scene import Scene
 def render(scene: Scene, spp: int = 64, seed: int = 0, strategy: str = "mis"):
     """Image of a scene: (H, W, 3), linear RGB, unbiased up to the scene's max_depth.
 
-    Pure; may be called inside `jax.jit`. The same scene structure, image size and strategy compile once: other
-    parameters, cameras, spp and seeds reuse the kernel.
+    Pure; may be called inside `jax.jit`, under `jax.vmap` over scenes that differ in parameters or cameras, and be
+    differentiated in what `parameters` lists, forwards or backwards: the derivative is that of `jacobian`, which says
+    how, and for the IOR of smooth glass how far, it may be trusted. The same scene structure, image size and strategy
+    compile once: other parameters, cameras, spp and seeds reuse the kernel.
 
     Args:
         spp: samples per pixel, at least 1.
@@ -30,7 +31,7 @@ def render(scene: Scene, spp: int = 64, seed: int = 0, strategy: str = "mis"):
             CPU devices.
         strategy: "mis", or "light" or "bsdf" for experiments.
     Raises:
-        InputError: unknown strategy, spp or seed out of range.
+        InputError: unknown strategy, spp or seed out of range; differentiation in anything but named parameters.
     A sample that is not finite leaves its pixel not finite, and the others untouched.
     """
     pixels = jnp.arange(film.pixel_count(scene.film), dtype=jnp.int32)
@@ -43,37 +44,63 @@ def render_pixels(scene: Scene, pixels, first_sample, spp, seed, strategy: str =
 
     how: `form` and `devices` of `runtime.native_map`.
     """
-    if strategy not in path.STRATEGIES:
-        raise InputError(f"strategy {strategy!r} is unknown; use one of {', '.join(path.STRATEGIES)}")
-    for name, value, least in (("spp", spp, 1), ("seed", seed, 0)):
-        if isinstance(value, int) and not least <= value < 2**31:
-            raise InputError(f"{name} = {value}; it must lie in [{least}, 2^31)")
-    arguments = (jnp.asarray(x, jnp.uint32) for x in (first_sample, spp, seed))
-    return _render_pixels(replace(scene, about=None), pixels, *arguments, strategy=strategy, **how)
+    path.check_sampling(strategy, spp, seed)
+    numbers = (jnp.asarray(x, jnp.uint32) for x in (first_sample, spp, seed))
+    static = _Static(scene.about, strategy, tuple(how.items()))
+    return _means(static, replace(scene, about=None), pixels, *numbers)
+
+
+@dataclass(frozen=True)
+class _Static:
+    about: About | None
+    strategy: str
+    how: tuple[tuple[str, object], ...]
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _means(static: _Static, scene, pixels, first_sample, spp, seed):
+    return _render_pixels(scene, pixels, first_sample, spp, seed, strategy=static.strategy, **dict(static.how))
+
+
+@partial(_means.defjvp, symbolic_zeros=True)
+def _means_jvp(static: _Static, primals, tangents):
+    """Tangent J @ d(parameters): linear, so that it also transposes."""
+    scene, *arguments = primals
+    scene_tangent, *_ = tangents
+    wanted = _differentiated(static.about, scene_tangent)
+    image, derivatives, _, _ = gradient.pixel_jacobians(
+        scene, wanted, *arguments, strategy=static.strategy, method="difference", step=None, **dict(static.how)
+    )
+    tangent = jnp.zeros_like(image)
+    for name, parameter in wanted.items():
+        change = named.get(scene_tangent, parameter.path)[parameter.index]
+        tangent = tangent + (derivatives[name] @ change if parameter.shape else derivatives[name] * change)
+    return image, tangent
+
+
+def _differentiated(about: About | None, scene_tangent):
+    """Parameters by name whose tangents may be other than zero."""
+    leaves, _ = jax.tree_util.tree_flatten_with_path(scene_tangent, is_leaf=lambda x: isinstance(x, SymbolicZero))
+    wanted = {}
+    for keys, leaf in leaves:
+        if isinstance(leaf, SymbolicZero):
+            continue
+        place = tuple(key.name if isinstance(key, jax.tree_util.GetAttrKey) else key.idx for key in keys)
+        names = [] if about is None else [name for name, p in about.parameters.items() if p.path == place]
+        if not names:
+            where = ".".join(map(str, place))
+            reason = "the scene was stripped of its names" if about is None else "pathjax does not differentiate in it"
+            raise InputError(
+                f"a derivative in scene.{where} was asked for, and {reason}; set named parameters by with_parameters "
+                "and differentiate in their values (`pathjax info` lists them)"
+            )
+        chosen = [name for name in names if name in about.traced] or names
+        wanted.update((name, about.parameters[name]) for name in chosen)
+    return wanted
 
 
 @partial(jax.jit, static_argnames=("strategy", "form", "devices"))
 def _render_pixels(scene, pixels, first_sample, spp, seed, *, strategy, form=None, devices=None):
     choice = emitters.choice(scene.emitters, strategy)
-    pixel_mean = partial(_pixel_mean, strategy=strategy)
+    pixel_mean = partial(pixel.mean, strategy=strategy)
     return native_map(pixel_mean, pixels, scene, choice, first_sample, spp, seed, form=form, devices=devices)
-
-
-def _pixel_mean(pixel, scene, choice, first_sample, spp, seed, strategy):
-    """(3,) mean of a pixel's samples."""
-    stream = sampler.pixel_stream(seed, pixel)
-
-    def add_sample(i, state):
-        total, lost = state
-        u_film, u_lens, numbers = path.sample_numbers(scene, stream, first_sample + i.astype(jnp.uint32))
-        position, weight = film.sample_position(scene.film, pixel, u_film)
-        ray = sample_ray(scene.camera, position, u_lens)
-        L = weight * path.radiance(scene, choice, ray, numbers, strategy)
-        # Compensated (Kahan): a million samples keep their digits.
-        term = L - lost
-        new = total + term
-        return new, (new - total) - term
-
-    zero = jnp.zeros((3,), scene.camera.origin.dtype)
-    total, _ = lax.fori_loop(0, spp.astype(jnp.int32), add_sample, (zero, zero))
-    return total / spp.astype(total.dtype)

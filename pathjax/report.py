@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from pathjax import bsdfs, film
-from pathjax.scene import UNBOUNDED, Scene, parameters
+from pathjax.named import parameters
+from pathjax.scene import UNBOUNDED, Scene
 from pathjax.shapes.planar import Planar
 
 _SAMPLER = "Owen-scrambled Sobol' pairs for the first bounces, hashing after"

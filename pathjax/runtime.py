@@ -20,6 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.custom_batching import custom_vmap
 from jax.sharding import Mesh, PartitionSpec
 
 _OPTION = "xla_cpu_small_while_loop_byte_threshold"
@@ -81,7 +82,38 @@ def native_map(f: Callable, xs, *shared, form: str | None = None, devices: int |
         devices: how many local devices to use; None: all.
     Returns:
         pytree of arrays (N, ...); bitwise the same for every number of devices.
+    Under `jax.vmap` each item loops over the batch, within the same kernel.
     """
+
+    @custom_vmap
+    def run(xs, *shared):
+        return _map(f, xs, shared, form, devices)
+
+    @run.def_vmap
+    def run_batch(size, batched, xs, *shared):
+        xs_batched, *shared_batched = batched
+
+        def entries(x, *shared):
+            def entry(b):
+                def pick(leaf, is_batched):
+                    return lax.dynamic_index_in_dim(leaf, b, keepdims=False) if is_batched else leaf
+
+                picked = jax.tree.map(pick, (x, *shared), (xs_batched, *shared_batched))
+                return f(*picked)
+
+            return lax.map(entry, jnp.arange(size))
+
+        def swap(y):
+            return jnp.swapaxes(y, 0, 1)
+
+        xs = jax.tree.map(lambda x, is_batched: swap(x) if is_batched else x, xs, xs_batched)
+        ys = jax.tree.map(swap, native_map(entries, xs, *shared, form=form, devices=devices))
+        return ys, jax.tree.map(lambda _: True, ys)
+
+    return run(xs, *shared)
+
+
+def _map(f, xs, shared, form, devices):
     count = jax.tree.leaves(xs)[0].shape[0]
     form = form or ("loop" if native() else "vmap")
     devices = jax.local_devices()[:devices]

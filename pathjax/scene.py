@@ -1,10 +1,8 @@
-"""The scene: a pytree whose structure says what occurs, so that only that is compiled; parameters by name."""
+"""The scene: a pytree whose structure says what occurs, so that only that is compiled."""
 
 from __future__ import annotations
 
-import difflib
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import jax
 import jax.numpy as jnp
@@ -19,11 +17,10 @@ from pathjax.camera import Camera
 from pathjax.emitters import Emitters
 from pathjax.emitters.area import AreaLights
 from pathjax.emitters.constant import Constant
-from pathjax.errors import InputError
 from pathjax.film import Film
+from pathjax.named import About, Parameter
 from pathjax.shapes import geometry as geometry_module
 from pathjax.shapes import planar, sphere, triangle
-from pathjax.shapes.bvh_build import Tree as BuiltTree
 from pathjax.shapes.geometry import Geometry
 from pathjax.shapes.planar import Planar
 from pathjax.shapes.sphere import Spheres
@@ -31,25 +28,6 @@ from pathjax.shapes.triangle import Triangles
 
 # Depth that stands for "no limit": more bounces than any path survives roulette.
 UNBOUNDED = 1 << 30
-
-
-@dataclass(frozen=True)
-class Parameter:
-    """Where a parameter lives: attributes and tuple places down to an array, and the entry in it."""
-
-    path: tuple[str | int, ...]
-    index: tuple[int, ...]
-    shape: tuple[int, ...]
-    bounds: tuple[float, float]
-
-
-@dataclass(frozen=True, eq=False)
-class About:
-    """What people ask of a scene and kernels do not: names, the file, reports. Compared by identity."""
-
-    description: desc.Description
-    parameters: Mapping[str, Parameter]
-    trees: Mapping[str, BuiltTree]  # kind of shape -> its hierarchy, for reports
 
 
 @jax.tree_util.register_dataclass
@@ -355,74 +333,3 @@ def _triangles(parts, name, dtype, rule):
     bounds = triangle.bounds(vertices)
     leaves, rows, tree, built = geometry_module.leaves_of(triangle.leaf_numbers(vertices), *bounds, dtype, rule)
     return Triangles(leaves, rows, tree, jnp.asarray(vertices, dtype), normals, uv), built
-
-
-# ---- parameters ---------------------------------------------------------------------------------------------------
-
-
-def parameters(scene: Scene) -> dict[str, jax.Array]:
-    """All parameters of the scene by name, `ID.field`."""
-    return {name: _get(scene, p.path)[p.index] for name, p in _about(scene).parameters.items()}
-
-
-def with_parameters(scene: Scene, values: Mapping) -> Scene:
-    """The scene with other values for some of its parameters; nothing is compiled again.
-
-    Args:
-        values: name -> value of the parameter's shape (a number stands for all channels). May be traced.
-    Raises:
-        InputError: unknown name, wrong shape, or a value outside the parameter's bounds.
-    """
-    about = _about(scene)
-    for name, value in values.items():
-        if name not in about.parameters:
-            near = difflib.get_close_matches(name, about.parameters, n=3, cutoff=0.3)
-            raise InputError(f"no parameter is named {name!r}; " + _offer(near, about.parameters))
-        parameter = about.parameters[name]
-        array = _get(scene, parameter.path)
-        value = _checked(name, value, parameter, array.dtype)
-        scene = _set(scene, parameter.path, array.at[parameter.index].set(value))
-    return scene
-
-
-def _offer(near, parameters):
-    if not parameters:
-        return "this scene has none"
-    return "did you mean " + " or ".join(near) + "?" if near else "the scene has " + ", ".join(parameters)
-
-
-def _checked(name, value, parameter: Parameter, dtype):
-    try:
-        value = jnp.asarray(value, dtype)
-        value = jnp.broadcast_to(value, parameter.shape)
-    except (TypeError, ValueError):
-        wanted = f"{parameter.shape[0]} numbers" if parameter.shape else "one number"
-        raise InputError(f"{name} takes {wanted}, not {value!r}") from None
-    if not isinstance(value, jax.core.Tracer):
-        low, high = parameter.bounds
-        if not bool(jnp.all((value >= low) & (value <= high) & jnp.isfinite(value))):
-            raise InputError(f"{name} = {np.asarray(value).tolist()} lies outside its bounds [{low:g}, {high:g}]")
-    return value
-
-
-def _about(scene: Scene) -> About:
-    if scene.about is None:
-        raise InputError("this scene was stripped of its names; take the one that load_scene returned")
-    return scene.about
-
-
-def _get(tree, path):
-    for step in path:
-        tree = tree[step] if isinstance(step, int) else getattr(tree, step)
-    return tree
-
-
-def _set(tree, path, value):
-    if not path:
-        return value
-    step, rest = path[0], path[1:]
-    if isinstance(step, int):
-        return (*tree[:step], _set(tree[step], rest, value), *tree[step + 1 :])
-    return replace(tree, **{step: _set(getattr(tree, step), rest, value)})
-
-

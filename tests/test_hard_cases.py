@@ -369,7 +369,8 @@ def test_random_numbers_at_their_ends_give_finite_light(shipped, name, strategy)
         def one(item, scene, choice):
             position, u, u_lens = item
             bounce = path.Bounce(u[0:2], u[2:4], u[4], u[5])
-            return path.radiance(scene, choice, sample_ray(scene.camera, position, u_lens), lambda _: bounce, strategy)
+            ray = sample_ray(scene.camera, position, u_lens)
+            return path.trace(scene, choice, ray, lambda _: bounce, strategy).L
 
         return native_map(one, items, scene, choice)
 

@@ -57,6 +57,11 @@ def is_two_sided_medium(materials: Materials, kind):
     return at(jnp.array(flags), jnp.maximum(kind, 0))
 
 
+def glass_bit(materials: Materials, kind, row):
+    """() int32: bit row % 31 where the kind is a dielectric, else 0."""
+    return jnp.where(is_two_sided_medium(materials, kind), jnp.left_shift(jnp.int32(1), row % 31), 0)
+
+
 def evaluate(materials: Materials, kind, row, uv, wi, wo):
     """f |cos theta_o| (3,) and pdf () of a smooth bsdf; 0 for the others."""
     smooth = [(i, table) for i, table in enumerate(materials.tables) if MODULES[type(table)].SMOOTH]

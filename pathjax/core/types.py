@@ -44,7 +44,7 @@ class BSDFSample(NamedTuple):
     weight: jax.Array  # (3,) f |cos theta_o| / pdf
     pdf: jax.Array  # () 1/sr; of a Dirac lobe: its discrete probability
     delta: jax.Array  # () bool, a Dirac lobe
-    eta: jax.Array  # () relative IOR along the path: 1 where reflected
+    passive: jax.Array  # () factor of the weight that says nothing of how much light is left: roulette disregards it
 
 
 class EmitterSample(NamedTuple):

@@ -10,16 +10,18 @@ from jax import lax
 
 from pathjax import bsdfs, emitters
 from pathjax.core import sampler
-from pathjax.core.math import at, frame_from_normal, larger, smaller, spawn_ray, to_local, to_world
+from pathjax.core.math import at, dot, frame_from_normal, larger, safe_divide, smaller, spawn_ray, to_local, to_world
 from pathjax.core.types import Ray, Surface
 from pathjax.emitters import Choice
+from pathjax.errors import InputError
 from pathjax.shapes import geometry
 
 STRATEGIES = ("mis", "light", "bsdf")
 # Bounces whose numbers come from Sobol' pairs; a path's first decisions carry most of its variance.
 SOBOL_BOUNCES = 3
-# Roulette never spares a path for certain, so that every path ends even between perfect mirrors.
-MAX_SURVIVAL = 0.95
+# Roulette never spares a path for certain, so that every path ends even between perfect mirrors; and never ends one for
+# certain, so that what is black keeps its derivative.
+MIN_SURVIVAL, MAX_SURVIVAL = 0.05, 0.95
 
 
 class Path(NamedTuple):
@@ -29,9 +31,10 @@ class Path(NamedTuple):
     L: jax.Array  # (3,) radiance gathered so far
     throughput: jax.Array  # (3,) product of the weights so far
     pdf: jax.Array  # () density [1/sr] of ray.d by bsdf sampling; inf from a camera or a Dirac lobe
-    eta: jax.Array  # () product of the relative IORs so far, which roulette takes out of the throughput
+    passive: jax.Array  # () what glass did to the throughput, which roulette takes out
     depth: jax.Array  # () int32 vertices so far
     alive: jax.Array  # () bool
+    glass: jax.Array  # () int32 bit r % 31 is set once the path met row r of the dielectrics
 
 
 class Bounce(NamedTuple):
@@ -43,8 +46,17 @@ class Bounce(NamedTuple):
     roulette: jax.Array  # ()
 
 
-def radiance(scene, choice: Choice | None, ray: Ray, numbers, strategy: str):
-    """Radiance that arrives along a camera ray.
+def check_sampling(strategy, spp, seed) -> None:
+    """Refuse, with an InputError, what no path tracer can do; numbers that are traced pass."""
+    if strategy not in STRATEGIES:
+        raise InputError(f"strategy {strategy!r} is unknown; use one of {', '.join(STRATEGIES)}")
+    for name, value, least in (("spp", spp, 1), ("seed", seed, 0)):
+        if isinstance(value, int) and not least <= value < 2**31:
+            raise InputError(f"{name} = {value}; it must lie in [{least}, 2^31)")
+
+
+def trace(scene, choice: Choice | None, ray: Ray, numbers, strategy: str, derivative: bool = False) -> Path:
+    """Follow a path from a camera ray to its end.
 
     Args:
         scene: Scene.
@@ -52,10 +64,14 @@ def radiance(scene, choice: Choice | None, ray: Ray, numbers, strategy: str):
         ray: Ray.
         numbers: depth -> Bounce.
         strategy: "mis", or for experiments "light" (next-event estimation alone) or "bsdf" (without it).
+        derivative: follow also what carries nothing, since its derivative may; the value is the same.
     Returns:
-        (3,), unbiased up to max_depth.
+        Path; `L` is the radiance that arrives, unbiased up to max_depth.
+    Gradient: what is drawn is detached from albedos and radiances, so weights carry the derivative, unbiased. Where the
+    IOR of glass moves the path, the derivative is that of the moving points (attached), and edges are missing from it.
     """
     shapes, materials = scene.geometry, scene.materials
+    least, most = (jnp.full_like(ray.t_max, x) for x in (MIN_SURVIVAL, MAX_SURVIVAL))
     sample_lights = strategy != "bsdf" and choice is not None and bsdfs.any_smooth(materials)
 
     def end(path: Path) -> Path:
@@ -68,7 +84,8 @@ def radiance(scene, choice: Choice | None, ray: Ray, numbers, strategy: str):
 
         def at_surface():
             surface = geometry.surface(shapes, ray, hit)
-            Le, pdf_light = emitters.hit(scene.emitters, shapes, choice, ray, hit, surface)
+            arrival = hit._replace(t=dot(surface.p - ray.o, ray.d)) if derivative else hit
+            Le, pdf_light = emitters.hit(scene.emitters, shapes, choice, ray, arrival, surface)
             return surface, Le, pdf_light
 
         def at_infinity():
@@ -111,7 +128,7 @@ def radiance(scene, choice: Choice | None, ray: Ray, numbers, strategy: str):
                     contribution = f * drawn.Le * (share / jnp.where(possible, drawn.pdf, 1))
                     shadow_ray = spawn_ray(surface, drawn.d, hit.primitive)._replace(t_max=drawn.distance)
                     visible = lax.cond(
-                        possible & jnp.any(contribution > 0),
+                        possible & (derivative | jnp.any(contribution > 0)),
                         lambda: ~geometry.occluded(shapes, shadow_ray, drawn.primitive),
                         lambda: jnp.bool_(False),
                     )
@@ -124,18 +141,19 @@ def radiance(scene, choice: Choice | None, ray: Ray, numbers, strategy: str):
             drawn = bsdfs.sample(materials, kind, row, surface.uv, wi, u.bsdf)
             d = to_world(frame, drawn.wo.at[2].multiply(side))
             throughput = path.throughput * drawn.weight
-            eta = path.eta * drawn.eta
+            passive = lax.stop_gradient(path.passive * drawn.passive)
 
             # ---- roulette -----------------------------------------------------------------------------------------
-            # Refraction scales radiance, not importance: without eta^2, paths inside glass would end too soon.
-            largest = larger(larger(throughput[0], throughput[1]), throughput[2])
-            survival = smaller(largest * eta * eta, jnp.full_like(largest, MAX_SURVIVAL))
+            # Refraction scales radiance, not importance: by the plain throughput, paths in glass would end too soon.
+            largest = lax.stop_gradient(larger(larger(throughput[0], throughput[1]), throughput[2]))
+            survival = larger(smaller(safe_divide(largest, passive), most), least)
             survival = jnp.where(path.depth >= scene.rr_depth, survival, 1)
             # A direction of density 0 (a random number of exactly 0 can give one) carries nothing.
-            alive = (kind >= 0) & (drawn.pdf > 0) & (largest > 0) & (u.roulette < survival)
-            throughput = throughput / jnp.where(survival > 0, survival, 1)
+            alive = (kind >= 0) & (drawn.pdf > 0) & (derivative | (largest > 0)) & (u.roulette < survival)
             pdf = jnp.where(drawn.delta, jnp.inf, drawn.pdf)
-            return Path(spawn_ray(surface, d, hit.primitive), L, throughput, pdf, eta, path.depth, alive)
+            glass = path.glass | bsdfs.glass_bit(materials, kind, row)
+            ray_on = spawn_ray(surface, d, hit.primitive)
+            return Path(ray_on, L, throughput / survival, pdf, passive, path.depth, alive, glass)
 
         if not shapes.tables:
             return end(path)
@@ -148,8 +166,8 @@ def radiance(scene, choice: Choice | None, ray: Ray, numbers, strategy: str):
 
     one = jnp.ones_like(ray.t_max)
     zero3 = jnp.zeros_like(ray.o)
-    start = Path(ray, zero3, zero3 + 1, one * jnp.inf, one, jnp.int32(0), scene.max_depth > 0)
-    return lax.while_loop(lambda path: path.alive, extend, start).L
+    start = Path(ray, zero3, zero3 + 1, one * jnp.inf, one, jnp.int32(0), scene.max_depth > 0, jnp.int32(0))
+    return lax.while_loop(lambda path: path.alive, extend, start)
 
 
 def mis_weight(pdf, other_pdf):

@@ -100,6 +100,7 @@ def occluded(geometry: Geometry, ray: Ray, target):
         blocked = jnp.any((distances > 0) & (distances < t) & (primitives != target))
         return jnp.where(blocked, -1, t), primitive
 
+    ray = jax.tree.map(lax.stop_gradient, ray)
     t, _ = _visit(geometry, ray, leaf_test, ray.t_max, jnp.int32(NO_HIT))
     return t < 0
 

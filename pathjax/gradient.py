@@ -1,0 +1,360 @@
+"""Image and Jacobian: how every pixel changes with the parameters of materials and lights.
+
+Colours (reflectances, radiances, a metal's eta and k) change what paths carry, not where they go: the derivative is
+that of the weights (detached sampling), unbiased. Light does not change its channel on the way, so one tangent stands
+for the three channels of a colour.
+
+The IOR of smooth glass moves the path itself, and what is seen through glass has edges, which no derivative of a moving
+point knows. So it is a central difference of two paths that share all random numbers and the probabilities of their
+choices. Its bias falls with the square of the step and is estimated beside it. No general derivative exists here for
+moving geometry or cameras.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from pathjax import bsdfs, emitters, film, named
+from pathjax.bsdfs import DielectricTable
+from pathjax.camera import sample_ray
+from pathjax.core import sampler
+from pathjax.core.math import at, dot, frame_from_normal, safe_divide, spawn_ray, to_local, to_world
+from pathjax.errors import InputError
+from pathjax.integrators import path, pixel
+from pathjax.named import Parameter
+from pathjax.runtime import native_map
+from pathjax.scene import Scene
+from pathjax.shapes import geometry
+
+METHODS = ("difference", "attached")
+IOR_FIELDS = ("int_ior", "ext_ior")
+# One path in so many is also traced at twice the step, to estimate the bias.
+RICHARDSON_EVERY = 16
+# Images move by this part of a pixel under one step, in the median: less adds noise, more adds bias.
+STEP_PIXELS = 0.35
+# Bounds of the step, relative to the IOR: float32 resolves the lower; beyond the upper a difference is no derivative.
+MIN_STEP, MAX_STEP = 2e-4, 0.03
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Jacobian:
+    """Derivatives of an image by the names of parameters: `J[name]` is (H, W, 3, *shape of the parameter).
+
+    bias: of those that are differences, an estimate of derivative minus truth (H, W, 3) from a second step; noisy in a
+        single pixel, meant for averages.
+    step: of those, the change of the relative IOR to either side.
+    """
+
+    derivatives: dict[str, jax.Array]
+    bias: dict[str, jax.Array]
+    step: dict[str, jax.Array]
+
+    def __getitem__(self, name):
+        return self.derivatives[name]
+
+    def __iter__(self):
+        return iter(self.derivatives)
+
+    def __len__(self):
+        return len(self.derivatives)
+
+    def keys(self):
+        return self.derivatives.keys()
+
+    def items(self):
+        return self.derivatives.items()
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What the kernel differentiates; static."""
+
+    colors: tuple[tuple[tuple, tuple], ...]  # path and index of each entry that gets a tangent
+    glass: tuple[int, ...]  # rows of the dielectrics that get a difference
+    attached: bool  # rows of glass are among `colors`, and move the path
+
+
+def jacobian(scene: Scene, names, spp: int = 64, seed: int = 0, *, strategy="mis", method="difference", step=None):
+    """Image and its derivative with respect to named parameters, from the same paths, in one kernel.
+
+    Pure; may be called inside `jax.jit`, and under `jax.vmap` over scenes that differ in parameters or cameras.
+
+    Args:
+        names: of parameters, as `parameters` lists them.
+        spp, seed, strategy: of `render`; the image is that of `render`, to rounding.
+        method: how the IOR of smooth glass is differentiated: "difference" (central, common random numbers), or
+            "attached", which follows points that move and is right only where no edge is seen through glass. An
+            attached image chooses its branches otherwise than `render`, without bias.
+        step: of differences, in relative IOR; None: what moves the image by about a third of a pixel.
+    Returns:
+        image (H, W, 3), and a Jacobian.
+    Raises:
+        InputError: unknown name, method or strategy; spp, seed or step out of range.
+    """
+    if isinstance(names, str):
+        raise InputError(f"names is a list of names; write [{names!r}]")
+    if method not in METHODS:
+        raise InputError(f"method {method!r} is unknown; use one of {', '.join(METHODS)}")
+    if step is not None and not isinstance(step, jax.core.Tracer) and not 0 < step < 1:
+        raise InputError(f"step = {step}; it must lie between 0 and 1, in units of relative IOR")
+    path.check_sampling(strategy, spp, seed)
+    wanted = {name: named.find(scene, name) for name in names}
+    pixels = jnp.arange(film.pixel_count(scene.film), dtype=jnp.int32)
+    image, derivatives, bias, used = pixel_jacobians(
+        scene, wanted, pixels, 0, spp, seed, strategy=strategy, method=method, step=step
+    )
+    shape = (*film.image_shape(scene.film), 3)
+
+    def as_image(x):
+        return x.reshape(*shape, *x.shape[2:])
+
+    return as_image(image), Jacobian(*jax.tree.map(as_image, (derivatives, bias)), used)
+
+
+def pixel_jacobians(
+    scene: Scene, wanted: dict[str, Parameter], pixels, first_sample, spp, seed, *, strategy, method, step, **how
+):
+    """Means (N, 3), and by name: derivatives (N, 3, *shape), biases (N, 3), steps ().
+
+    how: `form` and `devices` of `runtime.native_map`.
+    """
+    attached = method == "attached"
+    colors = [name for name, p in wanted.items() if attached or not is_glass(p)]
+    rows = sorted({p.index[0] for p in wanted.values() if is_glass(p)})
+    glass = () if attached else tuple(rows)
+    static = Wanted(tuple((wanted[name].path, wanted[name].index) for name in colors), glass, attached and bool(rows))
+    scene = replace(scene, about=None)
+    if static.attached:
+        scene = _choosing_by(scene, rows)
+    steps = _steps(scene, glass, step)
+    numbers = (jnp.asarray(x, jnp.uint32) for x in (first_sample, spp, seed))
+    image, by_color, by_ior, bias = _jacobians(scene, pixels, *numbers, steps, wanted=static, strategy=strategy, **how)
+
+    derivatives, biases, used = {}, {}, {}
+    for name, parameter in wanted.items():
+        if name in colors:
+            d = by_color[:, colors.index(name)]
+            # Light keeps its channel, so the derivative in a colour is diagonal.
+            derivatives[name] = d[..., None] * jnp.eye(3, dtype=d.dtype) if parameter.shape else d
+        else:
+            place = glass.index(parameter.index[0])
+            scale = _ratio_by(scene, parameter)
+            derivatives[name], biases[name] = by_ior[:, place] * scale, bias[:, place] * scale
+            used[name] = steps[place]
+    return image, derivatives, biases, used
+
+
+def is_glass(parameter: Parameter) -> bool:
+    return parameter.path[-1] in IOR_FIELDS
+
+
+def _dielectrics(scene: Scene) -> tuple[int, DielectricTable]:
+    """Place of the table of dielectrics, and the table."""
+    return next((i, t) for i, t in enumerate(scene.materials.tables) if isinstance(t, DielectricTable))
+
+
+def _with_dielectrics(scene: Scene, table: DielectricTable) -> Scene:
+    return named.put(scene, ("materials", "tables", _dielectrics(scene)[0]), table)
+
+
+def _choosing_by(scene: Scene, rows) -> Scene:
+    """The scene whose dielectrics of some rows choose their branches by the IOR that they have now."""
+    _, table = _dielectrics(scene)
+    rows = jnp.asarray(rows, jnp.int32)
+    ratio = lax.stop_gradient(table.int_ior / table.ext_ior)
+    return _with_dielectrics(scene, replace(table, choose_by=jnp.zeros_like(ratio).at[rows].set(ratio[rows])))
+
+
+def _ratio_by(scene: Scene, parameter: Parameter):
+    """Derivative of the relative IOR int_ior / ext_ior in one of the two."""
+    _, table = _dielectrics(scene)
+    row = parameter.index[0]
+    inside, outside = table.int_ior[row], table.ext_ior[row]
+    return 1 / outside if parameter.path[-1] == "int_ior" else -inside / (outside * outside)
+
+
+@partial(jax.jit, static_argnames=("wanted", "strategy", "form", "devices"))
+def _jacobians(scene, pixels, first_sample, spp, seed, steps, *, wanted, strategy, form=None, devices=None):
+    choice = emitters.choice(scene.emitters, strategy)
+    one_pixel = partial(_pixel_jacobian, wanted=wanted, strategy=strategy)
+    shared = scene, choice, _tangents(scene, wanted.colors), first_sample, spp, seed, steps
+    return native_map(one_pixel, pixels, *shared, form=form, devices=devices)
+
+
+def _tables(colors):
+    """Paths of the tables that hold the entries, each once."""
+    return list(dict.fromkeys(table_path for table_path, _ in colors))
+
+
+def _tangents(scene, colors):
+    """A unit change of all channels of each entry: for every table (entries, *shape of the table)."""
+    tangents = []
+    for table_path in _tables(colors):
+        table = named.get(scene, table_path)
+        tangent = jnp.zeros((len(colors), *table.shape), table.dtype)
+        for place, (its_path, index) in enumerate(colors):
+            if its_path == table_path:
+                tangent = tangent.at[(place, *index)].set(1)
+        tangents.append(tangent)
+    return tangents
+
+
+def _pixel_jacobian(pixel_number, scene, choice, tangents, first_sample, spp, seed, steps, wanted, strategy):
+    """Means of a pixel: radiance (3,), tangents (T, 3), differences (G, 3) and their biases (G, 3)."""
+    stream = sampler.pixel_stream(seed, pixel_number)
+    tables = [named.get(scene, table_path) for table_path in _tables(wanted.colors)]
+    dtype = scene.camera.origin.dtype
+    n_glass = len(wanted.glass)
+
+    def sample(scene, number):
+        return pixel.sample(scene, choice, pixel_number, stream, number, strategy, derivative=True)
+
+    def with_tangents(number):
+        def of(tables):
+            varied = scene
+            for table_path, table in zip(_tables(wanted.colors), tables, strict=True):
+                varied = named.put(varied, table_path, table)
+            return sample(varied, number)
+
+        def push(tangents):
+            return jax.jvp(of, (tables,), (tangents,), has_aux=True)
+
+        return jax.vmap(push, out_axes=(None, 0, None))(tangents)
+
+    def differences(number, met):
+        """Of one path (G, 3): difference quotients, and what a second step says of their bias."""
+        twice = (pixel_number.astype(jnp.uint32) + number) % RICHARDSON_EVERY == 0
+        rows = jnp.asarray(wanted.glass, jnp.int32)
+        _, table = _dielectrics(scene)
+
+        def of_row(place, out):
+            row, h = at(rows, place), at(steps, place)
+            touched = (jnp.right_shift(met, row % 31) & 1) == 1
+            ratio, outside = at(table.int_ior, row) / at(table.ext_ior, row), at(table.ext_ior, row)
+            choose_by = jnp.zeros_like(table.int_ior).at[row].set(ratio)
+
+            def shifted(k, sums):
+                # k = 0, 1, 2, 3: + h, - h, + 2 h, - 2 h
+                sign = (1 - 2 * (k % 2)).astype(dtype)
+                shift = sign * h * (1 + k // 2).astype(dtype)
+                moved = table.int_ior.at[row].set((ratio + shift) * outside)
+                L, _ = sample(_with_dielectrics(scene, DielectricTable(moved, table.ext_ior, choose_by)), number)
+                return sums.at[k // 2].add(sign * L)
+
+            # A path that never met this glass is the same at every IOR.
+            count = jnp.where(touched, jnp.where(twice, 4, 2), 0)
+            near, far = lax.fori_loop(0, count, shifted, jnp.zeros((2, 3), dtype))
+            quotient = near / (2 * h)
+            bias = jnp.where(twice, (far / (4 * h) - quotient) * (RICHARDSON_EVERY / 3), 0)
+            return out[0].at[place].set(quotient), out[1].at[place].set(bias)
+
+        zero = jnp.zeros((n_glass, 3), dtype)
+        return lax.fori_loop(0, n_glass, of_row, (zero, zero))
+
+    def add(i, state):
+        total, d_colors, d_glass, bias = state
+        number = first_sample + i.astype(jnp.uint32)
+        if wanted.colors:
+            L, dL, met = with_tangents(number)
+            d_colors = d_colors + dL
+        else:
+            L, met = sample(scene, number)
+        if wanted.glass:
+            quotient, its_bias = differences(number, met)
+            d_glass, bias = d_glass + quotient, bias + its_bias
+        return pixel.add_compensated(total, L), d_colors, d_glass, bias
+
+    zero = jnp.zeros((3,), dtype)
+    zeros = jnp.zeros((len(wanted.colors), 3), dtype), jnp.zeros((n_glass, 3), dtype), jnp.zeros((n_glass, 3), dtype)
+    (total, _), *sums = lax.fori_loop(0, spp.astype(jnp.int32), add, ((zero, zero), *zeros))
+    return tuple(x / spp.astype(dtype) for x in (total, *sums))
+
+
+# ---- step of the differences ---------------------------------------------------------------------------------------
+
+# Rays that are followed to see how far the image moves, and vertices of each.
+_PILOTS, _PILOT_DEPTH = 1024, 12
+
+
+def _steps(scene, rows, step):
+    """(G,) steps of the relative IOR."""
+    _, table = _dielectrics(scene) if rows else (None, None)
+    dtype = scene.camera.origin.dtype
+    if step is not None:
+        return jnp.full((len(rows),), step, dtype)
+    if not rows:
+        return jnp.zeros((0,), dtype)
+    rows = jnp.asarray(rows, jnp.int32)
+    ratio = (table.int_ior / table.ext_ior)[rows]
+    motion = _motions(scene, rows)
+    wished = STEP_PIXELS / jnp.where(motion > 0, motion, 1)
+    # Glass that no pilot saw (small, or met after a diffuse bounce) gets a step in the middle of the range.
+    wished = jnp.where(motion > 0, wished, 0.1 * MAX_STEP * ratio)
+    return jnp.clip(wished, MIN_STEP * ratio, MAX_STEP * ratio)
+
+
+@jax.jit
+def _motions(scene, rows):
+    """(G,) median number of pixels by which what is seen through glass moves per unit of relative IOR; 0: not seen."""
+    count = film.pixel_count(scene.film)
+    pilots = jnp.asarray(np.unique(np.linspace(0, count - 1, min(_PILOTS, count)).astype(np.int32)))
+    return jax.vmap(lambda row: _median(native_map(_motion, pilots, scene, row)))(rows)
+
+
+def _median(x):
+    seen = jnp.isfinite(x)
+    return jnp.where(jnp.any(seen), jnp.nanmedian(jnp.where(seen, x, jnp.nan)), 0)
+
+
+def _motion(pixel_number, scene, row):
+    """Pixels per unit of relative IOR of one dielectric, for the ray through the middle of a pixel; NaN: not seen."""
+    place, table = _dielectrics(scene)
+    ratio = at(table.int_ior, row) / at(table.ext_ior, row)
+    half = jnp.full((2,), 0.5, ratio.dtype)
+    middle, _ = film.sample_position(scene.film, pixel_number, half)
+    size = jnp.array([scene.film.width, scene.film.height], ratio.dtype)
+
+    def seen(x):
+        """Where the ray ends that refracts wherever it can: a point, or a direction if it hits nothing."""
+        varied = replace(table, int_ior=table.int_ior.at[row].set(x[0] * at(table.ext_ior, row)))
+        materials = named.put(scene.materials, ("tables", place), varied)
+        ray = sample_ray(scene.camera, middle + x[1:] / size, half)
+
+        def extend(state):
+            ray, _, met, depth, _ = state
+            hit = geometry.closest_hit(scene.geometry, ray)
+            found = hit.primitive >= 0
+            surface = geometry.surface(scene.geometry, ray, hit)
+            frame = frame_from_normal(surface.shading_n)
+            wi = to_local(frame, -ray.d)
+            kind, at_row = bsdfs.select(materials, hit.shape, wi[2] > 0)
+            glass = bsdfs.is_two_sided_medium(materials, kind)
+            side = jnp.where(glass | (wi[2] > 0), 1, -1).astype(wi.dtype)
+            wi = wi.at[2].multiply(side)
+            drawn = bsdfs.sample(materials, kind, at_row, surface.uv, wi, jnp.full_like(half, 1 - 2**-24))
+            d = to_world(frame, drawn.wo.at[2].multiply(side))
+            on = found & drawn.delta & (kind >= 0)
+            end = jnp.where(found, surface.p, ray.d)
+            met = met | (found & glass & (at_row == row))
+            return spawn_ray(surface, d, hit.primitive), end, met, depth + 1, on
+
+        start = ray, ray.o, jnp.bool_(False), jnp.int32(0), jnp.bool_(True)
+        _, end, met, _, unfinished = lax.while_loop(lambda s: s[-1] & (s[-2] < _PILOT_DEPTH), extend, start)
+        return end, met & ~unfinished
+
+    start = jnp.concatenate([ratio[None], jnp.zeros((2,), ratio.dtype)])
+    basis = jnp.eye(3, dtype=ratio.dtype)
+    moved, met = jax.vmap(lambda t: jax.jvp(seen, (start,), (t,), has_aux=True)[1:], out_axes=(0, None))(basis)
+    # Least squares: which shift in the image would move the end as the IOR does.
+    by_ior, by_x, by_y = moved
+    xx, xy, yy, bx, by = dot(by_x, by_x), dot(by_x, by_y), dot(by_y, by_y), dot(by_ior, by_x), dot(by_ior, by_y)
+    determinant = xx * yy - xy * xy
+    shift = jnp.stack([safe_divide(yy * bx - xy * by, determinant), safe_divide(xx * by - xy * bx, determinant)])
+    return jnp.where(met, jnp.hypot(shift[0], shift[1]), jnp.nan)

@@ -1,0 +1,150 @@
+"""Parameters by name: where each lives in the scene's tables, and scenes with other values for some of them."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from pathjax import description as desc
+from pathjax.errors import InputError
+from pathjax.shapes.bvh_build import Tree
+
+if TYPE_CHECKING:
+    from pathjax.scene import Scene
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """Where a parameter lives: attributes and tuple places down to an array, and the entry in it."""
+
+    path: tuple[str | int, ...]
+    index: tuple[int, ...]
+    shape: tuple[int, ...]
+    bounds: tuple[float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class About:
+    """What people ask of a scene and kernels do not: names, the file, reports. Compared by identity of the scene."""
+
+    description: desc.Description
+    parameters: Mapping[str, Parameter]
+    trees: Mapping[str, Tree]  # kind of shape -> its hierarchy, for reports
+    # Parameters that hold traced values: what a derivative may be wanted for. Tables hold many parameters, and a
+    # derivative costs time for each.
+    traced: frozenset[str] = frozenset()
+
+    def __eq__(self, other):
+        return isinstance(other, About) and self.parameters is other.parameters and self.traced == other.traced
+
+    def __hash__(self):
+        return hash((id(self.parameters), self.traced))
+
+
+def parameters(scene: Scene) -> dict[str, jax.Array]:
+    """All parameters of the scene by name, `ID.field`."""
+    return {name: get(scene, p.path)[p.index] for name, p in about(scene).parameters.items()}
+
+
+def with_parameters(scene: Scene, values: Mapping) -> Scene:
+    """The scene with other values for some of its parameters; nothing is compiled again.
+
+    Args:
+        values: name -> value of the parameter's shape (a number stands for all channels). May be traced.
+    Raises:
+        InputError: unknown name, wrong shape, or a value outside the parameter's bounds.
+    """
+    known = about(scene)
+    traced = set(known.traced)
+    for name, value in values.items():
+        parameter = find(scene, name)
+        array = get(scene, parameter.path)
+        value = checked(name, value, parameter, array.dtype)
+        if isinstance(array, jax.core.Tracer) and not traced & set(at_path(known, parameter.path)):
+            # Traced by someone else, who may differentiate in any of the table.
+            traced.update(at_path(known, parameter.path))
+        if isinstance(value, jax.core.Tracer):
+            traced.add(name)
+        scene = put(scene, parameter.path, array.at[parameter.index].set(value))
+    return replace(scene, about=replace(known, traced=frozenset(traced)))
+
+
+def about(scene: Scene) -> About:
+    if scene.about is None:
+        raise InputError("this scene was stripped of its names; take the one that load_scene returned")
+    return scene.about
+
+
+def find(scene: Scene, name: str) -> Parameter:
+    known = about(scene)
+    if name in known.parameters:
+        return known.parameters[name]
+    if name in _textured(known.description):
+        raise InputError(
+            f"{name} is a bitmap, whose texels are too many for one derivative each; name a constant reflectance or "
+            "the colours of a checkerboard"
+        )
+    near = difflib.get_close_matches(name, known.parameters, n=3, cutoff=0.3)
+    raise InputError(f"no parameter is named {name!r}; " + _offer(near, known.parameters))
+
+
+def _textured(description: desc.Description) -> set[str]:
+    """Names that parameters would have but for a bitmap in their place."""
+    sides = []
+    for shape in description.shapes:
+        bsdf = shape.bsdf
+        sides += [bsdf.front, bsdf.back] if isinstance(bsdf, desc.Twosided) else [bsdf]
+    return {
+        f"{bsdf.name}.reflectance"
+        for bsdf in sides
+        if isinstance(bsdf, desc.Diffuse) and isinstance(bsdf.reflectance, desc.Bitmap)
+    }
+
+
+def at_path(known: About, path) -> list[str]:
+    """Names of the parameters that one table holds."""
+    return [name for name, parameter in known.parameters.items() if parameter.path == path]
+
+
+def _offer(near, parameters):
+    if not parameters:
+        return "this scene has none"
+    return "did you mean " + " or ".join(near) + "?" if near else "the scene has " + ", ".join(parameters)
+
+
+def checked(name, value, parameter: Parameter, dtype):
+    """The value as an array of the parameter's shape; values that are known must lie within its bounds."""
+    try:
+        value = jnp.asarray(value, dtype)
+        value = jnp.broadcast_to(value, parameter.shape)
+    except (TypeError, ValueError):
+        wanted = f"{parameter.shape[0]} numbers" if parameter.shape else "one number"
+        raise InputError(f"{name} takes {wanted}, not {value!r}") from None
+    if not isinstance(value, jax.core.Tracer):
+        low, high = parameter.bounds
+        if not bool(jnp.all((value >= low) & (value <= high) & jnp.isfinite(value))):
+            raise InputError(f"{name} = {np.asarray(value).tolist()} lies outside its bounds [{low:g}, {high:g}]")
+    return value
+
+
+def get(tree, path):
+    """What `path` leads to."""
+    for step in path:
+        tree = tree[step] if isinstance(step, int) else getattr(tree, step)
+    return tree
+
+
+def put(tree, path, value):
+    """The tree with `value` where `path` leads."""
+    if not path:
+        return value
+    step, rest = path[0], path[1:]
+    if isinstance(step, int):
+        return (*tree[:step], put(tree[step], rest, value), *tree[step + 1 :])
+    return replace(tree, **{step: put(getattr(tree, step), rest, value)})
