@@ -3,6 +3,7 @@
 from pathjax import runtime as _runtime  # noqa: F401  first: sets XLA up before a backend starts
 from pathjax.errors import InputError
 from pathjax.gradient import Jacobian, jacobian
+from pathjax.inverse import Fit, fit
 from pathjax.named import parameters, with_parameters
 from pathjax.query import closest_hit
 from pathjax.render import render
@@ -10,11 +11,13 @@ from pathjax.scene import Scene
 
 __version__ = "0.1.0"
 __all__ = [
+    "Fit",
     "InputError",
     "Jacobian",
     "Scene",
     "__version__",
     "closest_hit",
+    "fit",
     "jacobian",
     "load_scene",
     "parameters",

@@ -155,6 +155,14 @@ def is_glass(parameter: Parameter) -> bool:
     return parameter.path[-1] in IOR_FIELDS
 
 
+def ior_at(scene: Scene, name: str, ratio):
+    """Value () of the parameter `name`, an IOR, at which int_ior / ext_ior of its glass is `ratio`."""
+    parameter = named.find(scene, name)
+    _, table = _dielectrics(scene)
+    row = parameter.index[0]
+    return ratio * table.ext_ior[row] if parameter.path[-1] == "int_ior" else table.int_ior[row] / ratio
+
+
 def _dielectrics(scene: Scene) -> tuple[int, DielectricTable]:
     """Place of the table of dielectrics, and the table."""
     return next((i, t) for i, t in enumerate(scene.materials.tables) if isinstance(t, DielectricTable))

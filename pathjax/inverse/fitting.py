@@ -1,0 +1,499 @@
+"""Parameters from images, with their uncertainty.
+
+A fixed seed makes a rendered image a deterministic function, which an optimistix solver can fit to a target; but the
+square of its noise moves the minimum. So a fit goes in two stages. A solver of least squares approaches, with few
+samples. Then two independent renders A and B replace the square by a product: the score
+
+    g = (J_A' W r_B + J_B' W r_A) / 2,    r = image - target,
+
+has mean 0 at the truth, whatever the noise of the renders, and its matrix (J_A' W J_B + J_B' W J_A) / 2 is not too
+large either. Newton's method finds its root; its scatter over the pixels, which are independent, gives the covariance.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+from scipy import ndimage
+
+from pathjax.errors import InputError
+from pathjax.gradient import ior_at, is_glass, jacobian
+from pathjax.inverse import problem, uncertainty
+from pathjax.inverse.problem import Problem
+from pathjax.inverse.uncertainty import Evidence
+from pathjax.named import with_parameters
+from pathjax.render import render
+from pathjax.scene import Scene
+
+# Samples per pixel of the approach. Newton's method begins with a part of the samples that `fit` is given.
+APPROACH_SPP, COARSE_PART = 16, 4
+MAX_STEPS, MAX_REJECTED, MAX_NEWTON_STEPS = 30, 6, 8
+# Newton's method ends with a step below this part of the standard errors, and takes none beyond this part of the scale.
+SMALL_STEP, LARGE_STEP = 0.3, 0.3
+# Samples per pixel of each of the two renders that tell how noisy every pixel is.
+NOISE_SPP = 8
+# Variances are floored at this part of their mean, so that no pixel weighs beyond measure.
+NOISE_FLOOR = 0.05
+# Relative indices of refraction to try before a local method begins, from almost none to diamond's; a few at a time.
+SCAN, SCAN_SPP, SCAN_CHUNK = np.geomspace(1.02, 2.6, 64), 4, 16
+SCAN_CANDIDATES = 3
+
+
+@dataclass
+class Fit:
+    """What the images say about the parameters.
+
+    Components are the parameters, or the channels of colours: `white.reflectance.r`.
+    """
+
+    values: dict[str, np.ndarray]
+    standard_errors: dict[str, np.ndarray]  # inf: the images do not determine it
+    covariance: np.ndarray  # (n, n) in the order of `components`; rows of what is not determined: inf, nan beside it
+    components: list[str]
+    undetermined: list[dict[str, float]]  # directions that the images do not determine: component -> change
+    at_bound: list[str]  # components that ended at a bound of their parameter
+    converged: bool
+    message: str  # why it ended, and what to mind
+    images: list[np.ndarray]  # of each view (H, W, 3), at the end
+    residuals: list[np.ndarray]  # of each view (H, W, 3): image - target, in standard deviations of their difference
+    history: list[dict]  # of each step: stage, spp, values, loss, seconds
+    compile_seconds: float
+    run_seconds: float
+    scenes: list[Scene]  # the views, at the fitted values
+
+    @property
+    def scene(self) -> Scene:
+        """The first view, at the fitted values."""
+        return self.scenes[0]
+
+    @property
+    def correlation(self) -> np.ndarray:
+        """(n, n); nan beside what is not determined."""
+        sigma = np.sqrt(np.diag(self.covariance))
+        with np.errstate(invalid="ignore"):
+            return self.covariance / np.outer(sigma, sigma)
+
+
+def fit(
+    scene: Scene | Sequence[Scene],
+    target,
+    names: Sequence[str],
+    *,
+    start: Mapping | None = None,
+    spp: int = 128,
+    seed: int = 0,
+    solver=None,
+    scan: bool = True,
+    progress: Callable[[dict], None] | None = None,
+) -> Fit:
+    """Find parameters with which the scene looks like the target.
+
+    Args:
+        scene: a scene, or a list of views; views share parameters by name.
+        target: linear RGB (H, W, 3), or a list of them, one for each view. Its noise must be independent from pixel to
+            pixel; how large it is, the fit finds out.
+        names: parameters to recover, of `parameters`.
+        start: values to begin with; default: the scene's.
+        spp: samples per pixel of each of the two independent renders of the last stage.
+        solver: an optimistix least-squares solver or minimiser for the approach; default: LevenbergMarquardt.
+        scan: try indices of refraction over their whole range first, since a local method finds the nearest minimum.
+        progress: called with each entry of the history.
+    Returns:
+        Fit. Ctrl-C ends it with what it has, marked as not converged.
+    Raises:
+        InputError: an unknown or repeated name, a start outside its bounds, a target of another size, with negative or
+            non-finite values, fewer pixels than unknowns.
+    Standard errors come from the scatter of the scores over pixels (White 1980). They hold the noise of target, renders
+    and Jacobians, and suppose that the scene can look like the target: `converged` is False where neighbouring
+    residuals agree too well for noise. The differences that stand for derivatives in an IOR have a bias (`jacobian`),
+    which does not move the root of the score.
+    """
+    if not isinstance(spp, int) or not 1 <= spp < 2**31:
+        raise InputError(f"spp = {spp}; it must be an integer in [1, 2^31)")
+    if not isinstance(seed, int) or not 0 <= seed < 2**31:
+        raise InputError(f"seed = {seed}; it must be an integer in [0, 2^31)")
+    solver = solver or optx.LevenbergMarquardt(rtol=1e-4, atol=1e-4)
+    if not isinstance(solver, optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser):
+        raise InputError(f"{type(solver).__name__} is no least-squares solver or minimiser of optimistix")
+    return _Run(problem.build(scene, target, names, start or {}), spp, seed, solver, progress).run(scan)
+
+
+# ---- what is compiled ----------------------------------------------------------------------------------------------
+
+
+def _residuals(x, arguments, coordinates):
+    """Weighted residuals of all views, and half their sum of squares; x: unbounded coordinates (n,)."""
+    groups, weights, spp, seed, draw = arguments
+    values = coordinates.unpack(coordinates.bounded(x))
+    parts = []
+    for views, weight in zip(groups, weights, strict=True):
+        images = views.map(partial(_image, views=views, values=values, spp=spp), views.seeds(seed, draw))
+        parts.append(((images - views.targets) * jnp.sqrt(weight)).ravel())
+    r = jnp.concatenate(parts)
+    return r, jnp.sum(r * r) / 2
+
+
+def _loss(x, arguments, coordinates):
+    _, loss = _residuals(x, arguments, coordinates)
+    return loss, loss
+
+
+def _score(z, arguments, coordinates):
+    """Root function, and the evidence that it comes from; z: steps from `base` in units of `scale`."""
+    base, scale, projector, groups, weights, spp, seed, draw = arguments
+    rest = jnp.eye(len(scale), dtype=scale.dtype) - projector
+
+    def evaluate(z):
+        evidence = _evidence(base + scale * z, groups, spp, seed, draw, coordinates)
+        flat = jnp.concatenate([weight.reshape(-1, 3) for weight in weights])
+        g = scale * jnp.sum(evidence.scores(flat), 0)
+        matrix = projector @ (scale[:, None] * evidence.matrix(flat) * scale) @ projector
+        # What is not determined stays where it is, by rows of the same size as the others.
+        size = jnp.maximum(jnp.max(jnp.abs(matrix)), jnp.finfo(z.dtype).tiny)
+        return (projector @ g / size + rest @ z, evidence), matrix / size + rest
+
+    @jax.custom_jvp
+    def score(z):
+        return evaluate(z)[0]
+
+    @score.defjvp
+    def score_jvp(primals, tangents):
+        (g, evidence), matrix = evaluate(*primals)
+        return (g, evidence), (matrix @ tangents[0], jax.tree.map(jnp.zeros_like, evidence))
+
+    return score(z)
+
+
+def _evidence(v, groups, spp, seed, draw, coordinates) -> Evidence:
+    """Two independent renders of all views, and their Jacobians; v: values (n,)."""
+    values = coordinates.unpack(v)
+    parts = []
+    for views in groups:
+
+        def image_and_columns(scene, seed, views=views):
+            image, J = jacobian(views.with_values(scene, values), views.names, spp, seed)
+            return image, coordinates.columns(J, image.shape)
+
+        seeds = jnp.stack([views.seeds(seed, 2 * draw), views.seeds(seed, 2 * draw + 1)])
+        images, columns = jax.vmap(partial(views.map, image_and_columns))(seeds)
+        parts.append(((images - views.targets).reshape(2, -1, 3), columns.reshape(2, -1, *columns.shape[-2:])))
+    residuals, jacobians = (jnp.concatenate(part, axis=1) for part in zip(*parts, strict=True))
+    return Evidence(residuals, jacobians)
+
+
+def _misfits(candidates, arguments, coordinates, profile):
+    """(K,) of candidate values (K, n); `profile`: up to the brightness of each channel."""
+    groups, weights, spp, seed, draw = arguments
+
+    def misfit(v):
+        values = coordinates.unpack(v)
+        total = 0.0
+        for views, weight in zip(groups, weights, strict=True):
+            images = views.map(partial(_image, views=views, values=values, spp=spp), views.seeds(seed, draw))
+            gain = 1.0
+            if profile:
+                square = jnp.sum(weight * images**2, (0, 1, 2))
+                gain = jnp.sum(weight * images * views.targets, (0, 1, 2)) / jnp.where(square > 0, square, 1)
+            total = total + jnp.sum(weight * (gain * images - views.targets) ** 2)
+        return total
+
+    return jax.vmap(misfit)(candidates)
+
+
+def _image(scene, seed, views, values, spp):
+    return render(views.with_values(scene, values), spp, seed)
+
+
+# ---- the run -------------------------------------------------------------------------------------------------------
+
+
+class _Stepper:
+    """An optimistix solver taken step by step, compiled once."""
+
+    def __init__(self, solver, fn, y, arguments, compiled):
+        def begin(y, arguments):
+            f, aux = jax.eval_shape(fn, y, arguments)
+            return solver.init(fn, y, arguments, {}, f, aux, frozenset())
+
+        def step(y, state, arguments):
+            y, state, aux = solver.step(fn, y, arguments, {}, state, frozenset())
+            done, result = solver.terminate(fn, y, arguments, {}, state, frozenset())
+            return y, state, aux, done, result == optx.RESULTS.successful
+
+        self.begin = compiled(eqx.filter_jit(begin), y, arguments)
+        self.step = compiled(eqx.filter_jit(step), y, self.begin(y, arguments), arguments)
+
+
+class _Run:
+    def __init__(self, problem: Problem, spp: int, seed: int, solver, progress):
+        self.problem, self.spp, self.solver, self.progress = problem, spp, solver, progress
+        self.coordinates, self.groups = problem.coordinates, problem.groups
+        self.dtype = self.groups[0].targets.dtype
+        self.seed, self.draw = jnp.uint32(seed), 0
+        self.v = problem.start.astype(float)
+        self.n = len(self.v)
+        self.history: list[dict] = []
+        self.started, self.compile_seconds = time.perf_counter(), 0.0
+        self.evidence: Evidence | None = None
+        self.weights = [jnp.ones_like(views.targets) for views in self.groups]
+        self._scan = self._approach = self._refine = self.solution = None
+        self.free, self.scale = np.ones(self.n, bool), self.coordinates.scale(self.v)
+
+    def run(self, scan: bool) -> Fit:
+        try:
+            converged, message = self._stages(scan)
+        except KeyboardInterrupt:
+            converged, message = False, "interrupted"
+        return self._result(converged, message)
+
+    def _stages(self, scan):
+        candidates = self._scanned() if scan else [self.v]
+        best = None
+        for v in candidates:
+            # A local method ends in the nearest minimum; a wrong one shows in its residuals.
+            self.v = v
+            self._weigh()
+            self._approach_with(min(APPROACH_SPP, self.spp))
+            self._weigh()
+            share, significance = self._structure()
+            if best is None or share < best[0]:
+                best = share, self.v
+            if not _structured(share, significance):
+                break
+        self.v = best[1]
+        if len(candidates) > 1:
+            self._weigh()
+        return self._refined()
+
+    # ---- approach: least squares with a fixed seed ------------------------------------------------------------------
+
+    def _approach_with(self, spp):
+        x = jnp.asarray(self.coordinates.unbounded(self.v), self.dtype)
+        # In units of the noise at this level.
+        weights = [weight * (spp / NOISE_SPP) for weight in self.weights]
+        arguments = self.groups, weights, jnp.uint32(spp), self.seed, self._next_draw()
+        if self._approach is None:
+            least_squares = isinstance(self.solver, optx.AbstractLeastSquaresSolver)
+            fn = partial(_residuals if least_squares else _loss, coordinates=self.coordinates)
+            self._approach = _Stepper(self.solver, fn, x, arguments, self._compiled)
+        state = self._approach.begin(x, arguments)
+        lowest, rejected = np.inf, 0
+        for _ in range(MAX_STEPS):
+            x, state, loss, done, _ = self._approach.step(x, state, arguments)
+            loss = float(loss)
+            self.v = np.asarray(self.coordinates.bounded(x), float)
+            self._record("approach", spp, loss)
+            # The solver tells the loss one step late, and the same one again after a step that it took back. A step
+            # that gains less than the loss is uncertain by is left to the next stage.
+            rejected = rejected + 1 if loss == lowest else 0
+            if bool(done) or rejected > MAX_REJECTED or 0 < lowest - loss < max(self.n / 2, np.sqrt(loss)):
+                break
+            lowest = min(lowest, loss)
+
+    # ---- refinement: the root of the score of two independent renders -----------------------------------------------
+
+    def _refined(self):
+        low, high = self.coordinates.bounds.T
+        converged = False
+        self._newton(max(self.spp // COARSE_PART, 1), small=1)
+        while not converged:
+            converged = self._newton(self.spp, SMALL_STEP)
+            outside = self.free & ((self.v < low) | (self.v > high))
+            self.v = np.clip(self.v, low, high)
+            if not converged or not outside.any():
+                break
+            # What wants to leave its bounds stays there, and the others are fitted again.
+            self.free &= ~outside
+            converged = False
+        # Where a bound holds a component, the curvature still says how well it is known.
+        everything = np.ones(self.n, bool)
+        self.solution = uncertainty.solve(self.evidence, self._flat_weights(), self.scale, everything)
+        share, significance = self._structure()
+        if _structured(share, significance):
+            return False, (
+                f"the residuals have structure: neighbouring pixels share {share:.0%} of their variance. This is a "
+                "local minimum, or the scene cannot look like the target; try other starts, and look at the residuals"
+            )
+        if not converged:
+            return False, f"Newton's method did not settle in {MAX_NEWTON_STEPS} steps; try more spp, or another start"
+        message = "converged: the last step is small against the standard errors, the residuals are noise"
+        if self.solution.undetermined.size:
+            message += "; but the images do not determine all that was asked"
+        return True, message
+
+    def _newton(self, spp, small) -> bool:
+        """Steps until one is below `small` standard errors; whether one was."""
+        self.scale = scale = self.coordinates.scale(self.v)
+        self.solution = uncertainty.solve(self.evidence, self._flat_weights(), scale, self.free)
+        draw, base, z = self._next_draw(), self.v, np.zeros(self.n)
+        for _ in range(MAX_NEWTON_STEPS):
+            projector = self.solution.projector
+            moved = self._newton_step(z, base, scale, projector, spp, draw)
+            step = np.clip(moved - z, -LARGE_STEP, LARGE_STEP)
+            z = z + step
+            self.v = base + scale * z
+            self.solution = uncertainty.solve(self.evidence, self._flat_weights(), scale, self.free)
+            sigma = np.sqrt(np.diag(self.solution.covariance))
+            self._record("refine", spp, float(self._mean_product()))
+            same_rank = round(np.trace(projector)) == round(np.trace(self.solution.projector))
+            if same_rank and np.all(np.abs(step) <= small * sigma + np.finfo(self.dtype).eps):
+                return True
+        return False
+
+    def _newton_step(self, z, base, scale, projector, spp, draw):
+        """(n,) where Newton's method goes from z; leaves the evidence at z."""
+        z, base, scale, projector = (jnp.asarray(a, self.dtype) for a in (z, base, scale, projector))
+        arguments = base, scale, projector, self.groups, self.weights, jnp.uint32(spp), self.seed, draw
+        if self._refine is None:
+            fn = partial(_score, coordinates=self.coordinates)
+            self._refine = _Stepper(optx.Newton(rtol=1e-6, atol=1e-6), fn, z, arguments, self._compiled)
+        moved, _, evidence, _, _ = self._refine.step(z, self._refine.begin(z, arguments), arguments)
+        self.evidence = jax.tree.map(np.asarray, evidence)
+        return np.asarray(moved, float)
+
+    def _weigh(self):
+        """Weights from the variance of a render at the current values, smoothed over neighbours."""
+        zero, scale, nowhere = np.zeros(self.n), self.coordinates.scale(self.v), np.zeros((self.n, self.n))
+        self._newton_step(zero, self.v, scale, nowhere, NOISE_SPP, self._next_draw())
+        a, b = self.evidence.residuals
+        weights = []
+        for images in self._by_view((a - b) ** 2 / 2):
+            variance = ndimage.uniform_filter(images.mean(-1, keepdims=True), (3, 3, 1))
+            floor = NOISE_FLOOR * variance.mean() + np.finfo(self.dtype).tiny
+            weights.append(np.broadcast_to(1 / (variance + floor), images.shape))
+        self.weights = [jnp.asarray(np.stack([weights[i] for i in views.numbers]), self.dtype) for views in self.groups]
+
+    # ---- scan: where a local method should begin --------------------------------------------------------------------
+
+    def _scanned(self) -> list[np.ndarray]:
+        """Values to begin with, the most promising first."""
+        names = [name for name, p in self.coordinates.parameters if is_glass(p)]
+        candidates = [self.v]
+        if names:
+            self._weigh()
+        for name in names * min(len(names), 2):
+            tried = np.stack([self._at_ratio(name, ratio) for ratio in SCAN])
+            misfits = np.concatenate([self._misfits(chunk) for chunk in np.split(tried, len(SCAN) // SCAN_CHUNK)])
+            low = [i for i in range(len(SCAN)) if misfits[i] == misfits[max(i - 1, 0) : i + 2].min()]
+            low = sorted(low, key=lambda i: misfits[i])[:SCAN_CANDIDATES]
+            candidates = [tried[i] for i in low]
+            self.v = candidates[0]
+            self._record("scan", SCAN_SPP, float(misfits[low[0]]))
+        return candidates
+
+    def _misfits(self, candidates):
+        candidates = jnp.asarray(candidates, self.dtype)
+        # All candidates see the same noise.
+        arguments = self.groups, self.weights, jnp.uint32(SCAN_SPP), self.seed, jnp.uint32(0)
+        if self._scan is None:
+            only_glass = all(is_glass(p) for _, p in self.coordinates.parameters)
+            f = partial(_misfits, coordinates=self.coordinates, profile=not only_glass)
+            self._scan = self._compiled(jax.jit(f), candidates, arguments)
+        return np.asarray(self._scan(candidates, arguments))
+
+    def _at_ratio(self, name, ratio):
+        holder = next(s for s in self.problem.scenes if name in s.about.parameters)
+        values = self.coordinates.unpack(self.v.copy())
+        return self.coordinates.pack({**values, name: ior_at(self._at_values(holder, values), name, ratio)})
+
+    # ---- the rest ---------------------------------------------------------------------------------------------------
+
+    @staticmethod
+    def _at_values(scene, values):
+        return with_parameters(scene, {name: v for name, v in values.items() if name in scene.about.parameters})
+
+    def _next_draw(self):
+        self.draw += 1
+        return jnp.uint32(self.draw)
+
+    def _compiled(self, jitted, *arguments):
+        started = time.perf_counter()
+        compiled = jitted.lower(*arguments).compile()
+        self.compile_seconds += time.perf_counter() - started
+        return compiled
+
+    def _record(self, stage, spp, loss):
+        values = dict(zip(self.coordinates.labels, self.v.tolist(), strict=True))
+        seconds = time.perf_counter() - self.started
+        entry = {"stage": stage, "spp": spp, "values": values, "loss": loss, "seconds": seconds}
+        self.history.append(entry)
+        if self.progress:
+            self.progress(entry)
+
+    def _flat_weights(self):
+        return np.concatenate([np.asarray(weight).reshape(-1, 3) for weight in self.weights])
+
+    def _by_view(self, flat):
+        """(N, 3) over all views to a list of (H, W, 3) in the caller's order."""
+        images, first = {}, 0
+        for views in self.groups:
+            shape = views.targets.shape
+            size = int(np.prod(shape[:3]))
+            stack = np.asarray(flat[first : first + size]).reshape(shape)
+            images.update(zip(views.numbers, stack, strict=True))
+            first += size
+        return [images[i] for i in range(len(images))]
+
+    def _mean_product(self):
+        """Half the weighted product of the two renders' residuals: the misfit without the renders' noise."""
+        a, b = self.evidence.residuals
+        return (self._flat_weights() * a * b).sum() / 2
+
+    def _structure(self):
+        pairs = [np.stack(pair) for pair in zip(*map(self._by_view, self.evidence.residuals), strict=True)]
+        return uncertainty.structure(pairs, self._by_view(self._flat_weights()))
+
+    def _result(self, converged, message) -> Fit:
+        labels, values = self.coordinates.labels, self.coordinates.unpack(self.v)
+        covariance, undetermined, at_bound = np.full((self.n, self.n), np.nan), [], []
+        if self.solution is not None:
+            covariance = self.solution.covariance * np.outer(self.scale, self.scale)
+            for direction in self.solution.undetermined.T:
+                largest = [i for i in np.argsort(-np.abs(direction)) if abs(direction[i]) > uncertainty.NAMED_SHARE]
+                undetermined.append({labels[i]: float(direction[i] * self.scale[i]) for i in largest})
+            unknown = (np.abs(self.solution.undetermined) > uncertainty.TOUCHED_SHARE).any(1)
+            covariance[unknown] = covariance[:, unknown] = np.nan
+            covariance[unknown, unknown] = np.inf
+            at_bound = [labels[i] for i in np.flatnonzero(~self.free)]
+        errors = np.sqrt(np.diag(covariance))
+        scenes = [self._at_values(scene, values) for scene in self.problem.scenes]
+        images, residuals = [], []
+        if self.evidence is not None:
+            (a, b), targets = map(self._by_view, self.evidence.residuals), self._by_view(self._flat_targets())
+            for x, y, target, weight in zip(a, b, targets, self._by_view(self._flat_weights()), strict=True):
+                images.append((x + y) / 2 + target)
+                # Of both: the scatter of the residuals themselves says how noisy the target is.
+                relative = (x + y) / 2 * np.sqrt(weight)
+                residuals.append(relative / max(relative.std(), np.finfo(float).tiny))
+        seconds = time.perf_counter() - self.started
+        return Fit(
+            values,
+            self.coordinates.unpack(errors),
+            covariance,
+            labels,
+            undetermined,
+            at_bound,
+            converged,
+            message,
+            images,
+            residuals,
+            self.history,
+            self.compile_seconds,
+            seconds - self.compile_seconds,
+            scenes,
+        )
+
+    def _flat_targets(self):
+        return np.concatenate([np.asarray(views.targets).reshape(-1, 3) for views in self.groups])
+
+
+def _structured(share, significance):
+    return share > uncertainty.STRUCTURE_SHARE and significance > uncertainty.STRUCTURE_SIGNIFICANCE

@@ -1,0 +1,122 @@
+"""What is to be fitted: views, targets and parameters, checked before anything is rendered, stacked for the kernel."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from pathjax import film, named
+from pathjax.errors import InputError
+from pathjax.inverse.coordinates import Coordinates
+from pathjax.scene import Scene
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Views:
+    """Views of one structure, stacked where they differ."""
+
+    scene: Scene
+    targets: jax.Array  # (V, H, W, 3)
+    names: tuple[str, ...] = field(metadata={"static": True})  # of the fitted parameters, those that these views hold
+    axes: tuple[int | None, ...] = field(metadata={"static": True})  # of each leaf of the scene: 0 where stacked
+    numbers: tuple[int, ...] = field(metadata={"static": True})  # of each view, its place in the caller's list
+
+    def map(self, f, seeds):
+        """f(scene, seed) over the views, in one kernel; seeds: (V,) uint32."""
+        leaves, tree = jax.tree.flatten(self.scene)
+
+        def one(varying, seed):
+            rest = iter(varying)
+            merged = [leaf if axis is None else next(rest) for leaf, axis in zip(leaves, self.axes, strict=True)]
+            return f(jax.tree.unflatten(tree, merged), seed)
+
+        return jax.vmap(one)([leaf for leaf, axis in zip(leaves, self.axes, strict=True) if axis == 0], seeds)
+
+    def seeds(self, seed, draw):
+        """(V,) uint32, others for every draw; their upper bit keeps them apart from any seed that a user can give."""
+        mixed = (seed * jnp.uint32(4099) + draw) * jnp.uint32(2053) + jnp.asarray(self.numbers, jnp.uint32)
+        return mixed | jnp.uint32(1 << 31)
+
+    def with_values(self, scene: Scene, values) -> Scene:
+        return named.with_parameters(scene, {name: values[name] for name in self.names})
+
+
+@dataclass(frozen=True)
+class Problem:
+    scenes: list[Scene]
+    groups: list[Views]
+    coordinates: Coordinates
+    start: np.ndarray  # (n,) values
+
+
+def build(scene, target, names, start) -> Problem:
+    """Check and stack; arguments and errors are those of `fit`."""
+    scenes = [scene] if isinstance(scene, Scene) else list(scene)
+    targets = [target] if isinstance(scene, Scene) else list(target)
+    if isinstance(names, str):
+        raise InputError(f"names is a list of names; write [{names!r}]")
+    names = list(names)
+    if not scenes or not names:
+        raise InputError(f"nothing to fit: give at least one {'parameter by name' if scenes else 'scene'}")
+    if len(scenes) != len(targets):
+        raise InputError(f"{len(scenes)} scenes and {len(targets)} targets; give one target for each scene")
+    if len(set(names)) < len(names):
+        raise InputError(f"{next(n for n in names if names.count(n) > 1)} is named twice")
+    values, found = {}, {}
+    for name in names:
+        holder = next((s for s in scenes if name in named.about(s).parameters), scenes[0])
+        found[name] = named.find(holder, name)
+        values[name] = named.parameters(holder)[name]
+    for name, value in start.items():
+        if name not in found:
+            raise InputError(f"start names {name}, which is not fitted; fitted are {', '.join(names)}")
+        dtype = scenes[0].camera.origin.dtype
+        values[name] = named.checked(f"start of {name}:", value, found[name], dtype)
+    targets = [_target(s, t, i, len(scenes)) for i, (s, t) in enumerate(zip(scenes, targets, strict=True))]
+    coordinates = Coordinates(tuple(found.items()))
+    pixels, unknowns = sum(t[..., 0].size for t in targets), len(coordinates.labels)
+    if pixels < unknowns:
+        raise InputError(f"{pixels} pixels cannot tell {unknowns} numbers; give larger targets or more views")
+    return Problem(scenes, _groups(scenes, targets, names), coordinates, coordinates.pack(values))
+
+
+def _target(scene, target, number, count) -> np.ndarray:
+    which = "the target" if count == 1 else f"target {number}"
+    target = np.asarray(target, np.float64)
+    wanted = (*film.image_shape(scene.film), 3)
+    if target.shape != wanted:
+        raise InputError(f"{which} has the shape {target.shape}; its scene renders {wanted}")
+    if not np.isfinite(target).all():
+        lost = int((~np.isfinite(target)).sum())
+        raise InputError(f"{which} holds {lost} values that are not finite; mend or crop it")
+    if (target < 0).any():
+        raise InputError(f"{which} holds {int((target < 0).sum())} negative values; it must be linear radiance")
+    return target
+
+
+def _groups(scenes, targets, names) -> list[Views]:
+    groups: dict = {}
+    for number, scene in enumerate(scenes):
+        leaves, tree = jax.tree.flatten(replace(scene, about=None))
+        held = tuple(name for name in names if name in scene.about.parameters)
+        places = tuple(scene.about.parameters[name] for name in held)
+        key = tree, tuple((leaf.shape, leaf.dtype) for leaf in leaves), held, places
+        groups.setdefault(key, []).append((number, leaves))
+    views = []
+    for (_, _, held, _), members in groups.items():
+        numbers, leaves = zip(*members, strict=True)
+        stacked, axes = [], []
+        for same in zip(*leaves, strict=True):
+            equal = all(x is same[0] or np.array_equal(x, same[0], equal_nan=True) for x in map(np.asarray, same))
+            stacked.append(same[0] if equal else jnp.stack(same))
+            axes.append(None if equal else 0)
+        first = scenes[numbers[0]]
+        scene = jax.tree.unflatten(jax.tree.structure(first), stacked)
+        dtype = first.camera.origin.dtype
+        here = jnp.asarray(np.stack([targets[i] for i in numbers]), dtype)
+        views.append(Views(scene, here, held, tuple(axes), numbers))
+    return views
