@@ -1,6 +1,7 @@
 """pathjax: a differentiable Monte Carlo path tracer in pure JAX."""
 
 from pathjax import runtime as _runtime  # noqa: F401  first: sets XLA up before a backend starts
+from pathjax.check import GradientCheck, check_gradient
 from pathjax.errors import InputError
 from pathjax.gradient import Jacobian, jacobian
 from pathjax.inverse import Fit, fit
@@ -12,10 +13,12 @@ from pathjax.scene import Scene
 __version__ = "0.1.0"
 __all__ = [
     "Fit",
+    "GradientCheck",
     "InputError",
     "Jacobian",
     "Scene",
     "__version__",
+    "check_gradient",
     "closest_hit",
     "fit",
     "jacobian",

@@ -46,6 +46,17 @@ def _parser() -> argparse.ArgumentParser:
     render.add_argument("--json", action="store_true", help="print one JSON object on stdout")
     render.set_defaults(run=_render)
 
+    fit = commands.add_parser("fit", help="recover parameters from an image of the scene")
+    _add_scene(fit)
+    fit.add_argument("target", metavar="TARGET.{exr,png}")
+    param = "a parameter to recover; may be repeated"
+    fit.add_argument("--param", dest="params", action="append", required=True, metavar="NAME[=START]", help=param)
+    fit.add_argument("--spp", type=_positive, default=128, metavar="N", help="of each of the two last renders")
+    fit.add_argument("--seed", type=_seed, default=0, metavar="K")
+    fit.add_argument("-o", "--output", default="fit", metavar="PREFIX", help="writes PREFIX.json and PREFIX.png")
+    fit.add_argument("--json", action="store_true", help="print one JSON object on stdout")
+    fit.set_defaults(run=_fit)
+
     info = commands.add_parser("info", help="what a scene holds and what is compiled for it")
     _add_scene(info)
     info.add_argument("--json", action="store_true", help="print one JSON object on stdout")
@@ -97,11 +108,11 @@ def _spp_list(text: str) -> list[int]:
     return [_positive(part) for part in text.split(",")]
 
 
-def _numbers(name: str, text: str):
+def _numbers(option: str, name: str, text: str):
     try:
         values = [float(part) for part in text.split(",")]
     except ValueError:
-        raise InputError(f"--set {name}={text}: a value is a number, or three separated by commas") from None
+        raise InputError(f"{option} {name}={text}: a value is a number, or three separated by commas") from None
     return values[0] if len(values) == 1 else values
 
 
@@ -109,7 +120,7 @@ def _load(options):
     import pathjax
 
     scene = pathjax.load_scene(options.scene, **dict(options.defines))
-    return pathjax.with_parameters(scene, {name: _numbers(name, text) for name, text in options.settings})
+    return pathjax.with_parameters(scene, {name: _numbers("--set", name, text) for name, text in options.settings})
 
 
 # ---- render -------------------------------------------------------------------------------------------------------
@@ -231,6 +242,45 @@ def _write(output: Path, image, scene, options, spp: int) -> None:
         "pathjax.seed": options.seed,
     }
     files.write_exr(output, {name: image[..., i] for i, name in enumerate("RGB")}, header)
+
+
+# ---- fit ----------------------------------------------------------------------------------------------------------
+
+
+def _fit(options) -> int:
+    from rich.console import Console
+
+    from pathjax import inverse
+    from pathjax.inverse import report
+    from pathjax.io import image as files
+    from pathjax.io.files import write_text
+
+    prefix = Path(options.output)
+    if not prefix.parent.is_dir():
+        raise InputError(f"{prefix}: there is no folder {prefix.parent}; make it first")
+    start, names = {}, []
+    for text in options.params:
+        name, equals, value = text.partition("=")
+        names.append(name)
+        if equals:
+            start[name] = _numbers("--param", name, value)
+    target = files.read_rgb(options.target)
+    scene = _load(options)
+    console = Console(stderr=True)
+    with console.status("compiling") as status:
+
+        def show(entry):
+            values = "  ".join(f"{name} {value:.4g}" for name, value in entry["values"].items())
+            status.update(f"{entry['stage']}, {entry['spp']} spp: {values}")
+
+        fit = inverse.fit(scene, target, names, start=start, spp=options.spp, seed=options.seed, progress=show)
+    facts = {"scene": str(options.scene), "target": str(options.target), "spp": options.spp, "seed": options.seed}
+    facts |= report.facts(fit)
+    write_text(prefix.with_name(prefix.name + ".json"), json.dumps(facts, indent=1) + "\n")
+    if fit.images:
+        files.write_png(prefix.with_name(prefix.name + ".png"), report.picture(fit, [target]))
+    print(json.dumps(facts) if options.json else report.text(fit))
+    return DONE if fit.converged else FAILED
 
 
 # ---- info and bench -----------------------------------------------------------------------------------------------

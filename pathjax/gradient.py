@@ -145,7 +145,7 @@ def pixel_jacobians(
             derivatives[name] = d[..., None] * jnp.eye(3, dtype=d.dtype) if parameter.shape else d
         else:
             place = glass.index(parameter.index[0])
-            scale = _ratio_by(scene, parameter)
+            scale = ratio_by(scene, parameter)
             derivatives[name], biases[name] = by_ior[:, place] * scale, bias[:, place] * scale
             used[name] = steps[place]
     return image, derivatives, biases, used
@@ -180,7 +180,7 @@ def _choosing_by(scene: Scene, rows) -> Scene:
     return _with_dielectrics(scene, replace(table, choose_by=jnp.zeros_like(ratio).at[rows].set(ratio[rows])))
 
 
-def _ratio_by(scene: Scene, parameter: Parameter):
+def ratio_by(scene: Scene, parameter: Parameter):
     """Derivative of the relative IOR int_ior / ext_ior in one of the two."""
     _, table = _dielectrics(scene)
     row = parameter.index[0]

@@ -23,6 +23,7 @@ from pathjax.bench import embree_peer, mitsuba_peer
 from pathjax.camera import sample_ray
 from pathjax.core.warp import square_to_sphere
 from pathjax.errors import InputError
+from pathjax.io.files import write_text
 from pathjax.progressive import RELATIVE_FLOOR, ProgressiveRender
 from pathjax.query import _closest_hit
 from pathjax.shapes.triangle import Triangles
@@ -54,8 +55,8 @@ def run(options) -> int:
         )
     if folder is not None:
         folder.mkdir(exist_ok=True)
-        (folder / "bench.json").write_text(json.dumps(report, indent=2))
-        (folder / "bench.md").write_text(markdown(report))
+        write_text(folder / "bench.json", json.dumps(report, indent=2))
+        write_text(folder / "bench.md", markdown(report))
     print(json.dumps(report) if options.json else markdown(report))
     return 0
 

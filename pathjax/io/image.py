@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 
 from pathjax.errors import InputError
+from pathjax.io.files import write_whole
 
 MAX_PIXELS = 10**9
 
@@ -50,7 +50,7 @@ def write_exr(path: str | Path, channels: Mapping[str, np.ndarray], header: Mapp
         with OpenEXR.File({**header, **fixed}, pixels) as file:
             file.write(beside)
 
-    _write_whole(Path(path), write)
+    write_whole(Path(path), write)
 
 
 def read_exr(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, str | int | float]]:
@@ -86,7 +86,7 @@ def write_png(path: str | Path, rgb: np.ndarray) -> None:
         raise InputError(f"{path}: an image must have the shape (H, W, 3), has {rgb.shape}")
     encoded = linear_to_srgb(np.clip(np.nan_to_num(rgb, nan=0.0, posinf=1.0, neginf=0.0), 0, 1))
     image = Image.fromarray(np.rint(encoded * 255).astype(np.uint8))
-    _write_whole(Path(path), lambda beside: image.save(beside, format="PNG"))
+    write_whole(Path(path), lambda beside: image.save(beside, format="PNG"))
 
 
 def read_rgb(path: str | Path, raw: bool = False) -> np.ndarray:
@@ -144,17 +144,3 @@ def _png_bits(path: str | Path) -> int:
 def _require_file(path: str | Path) -> None:
     if not Path(path).is_file():
         raise InputError(f"{path}: {'not a file' if Path(path).exists() else 'no such file'}")
-
-
-def _write_whole(path: Path, write: Callable[[str], None]) -> None:
-    """Let `write` fill a file beside `path`, then put it in its place: who reads `path` never sees half a file."""
-    if not path.parent.is_dir():
-        raise InputError(f"{path}: there is no folder {path.parent}")
-    beside = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        write(str(beside))
-        os.replace(beside, path)
-    except (OSError, RuntimeError) as error:
-        raise InputError(f"{path}: cannot be written: {error}") from None
-    finally:
-        beside.unlink(missing_ok=True)

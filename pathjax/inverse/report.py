@@ -1,0 +1,68 @@
+"""A fit for people and scripts: a table, JSON-ready values, and a picture of target, fit and residual."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from pathjax.inverse.fitting import Fit
+
+# Residuals of this many standard deviations are shown in full colour.
+_FULL_SCALE = 3
+_LEAST_WIDTH = 256
+_GAP = 4
+
+
+def facts(fit: Fit) -> dict:
+    """JSON-ready; what is infinite or undefined is null."""
+
+    def plain(x):
+        return [plain(y) for y in x] if np.ndim(x) else (float(x) if math.isfinite(x) else None)
+
+    return {
+        "converged": fit.converged,
+        "message": fit.message,
+        "values": {name: plain(value) for name, value in fit.values.items()},
+        "standard_errors": {name: plain(error) for name, error in fit.standard_errors.items()},
+        "components": fit.components,
+        "covariance": plain(fit.covariance),
+        "undetermined": fit.undetermined,
+        "at_bound": fit.at_bound,
+        "compile_seconds": fit.compile_seconds,
+        "run_seconds": fit.run_seconds,
+        "history": fit.history,
+    }
+
+
+def text(fit: Fit) -> str:
+    values = np.concatenate([np.ravel(v) for v in fit.values.values()])
+    errors = np.concatenate([np.ravel(e) for e in fit.standard_errors.values()])
+    width = max(map(len, fit.components))
+    lines = []
+    for label, value, error in zip(fit.components, values, errors, strict=True):
+        digits = 6 if not 0 < error < math.inf else min(max(1 - math.floor(math.log10(error)), 0), 8)
+        stated = f"+- {error:.{digits}f}" if math.isfinite(error) else "not determined" if error > 0 else "unknown"
+        note = "  (at its bound)" if label in fit.at_bound else ""
+        lines.append(f"{label:<{width}}  {value:.{digits}f}  {stated}{note}")
+    for direction in fit.undetermined:
+        together = ", ".join(f"{name} {change:+.3g}" for name, change in direction.items())
+        lines.append(f"the images look the same along: {together}")
+    lines.append(f"{fit.message} ({fit.run_seconds:.1f} s, and {fit.compile_seconds:.1f} s of compilation)")
+    return "\n".join(lines)
+
+
+def picture(fit: Fit, targets) -> np.ndarray:
+    """(H, W, 3) linear RGB: a row for each view, of target, fit, and residual: blue too dark, red too bright."""
+    rows = []
+    for target, image, residual in zip(targets, fit.images, fit.residuals, strict=True):
+        share = np.clip(residual.mean(-1, keepdims=True) * math.sqrt(3) / _FULL_SCALE, -1, 1)
+        red, blue = np.array([1, 0.05, 0.02]), np.array([0.02, 0.1, 1])
+        shown = 1 - np.abs(share) * (1 - np.where(share > 0, red, blue))
+        zoom = max(1, -(-_LEAST_WIDTH // target.shape[1]))
+        parts = [np.repeat(np.repeat(part, zoom, 0), zoom, 1) for part in (target, image, shown)]
+        gap = np.ones((parts[0].shape[0], _GAP, 3))
+        rows.append(np.concatenate([parts[0], gap, parts[1], gap, parts[2]], 1))
+    width = max(row.shape[1] for row in rows)
+    padded = [np.pad(row, ((0, _GAP), (0, width - row.shape[1]), (0, 0)), constant_values=1) for row in rows]
+    return np.concatenate(padded)[:-_GAP].astype(np.float32)
