@@ -189,8 +189,8 @@ def _evidence(v, groups, spp, seed, draw, coordinates) -> Evidence:
     return Evidence(residuals, jacobians)
 
 
-def _misfits(candidates, arguments, coordinates, profile):
-    """(K,) of candidate values (K, n); `profile`: up to the brightness of each channel."""
+def _misfits(candidates, arguments, coordinates):
+    """(K,) of candidate values (K, n)."""
     groups, weights, spp, seed, draw = arguments
 
     def misfit(v):
@@ -198,11 +198,7 @@ def _misfits(candidates, arguments, coordinates, profile):
         total = 0.0
         for views, weight in zip(groups, weights, strict=True):
             images = views.map(partial(_image, views=views, values=values, spp=spp), views.seeds(seed, draw))
-            gain = 1.0
-            if profile:
-                square = jnp.sum(weight * images**2, (0, 1, 2))
-                gain = jnp.sum(weight * images * views.targets, (0, 1, 2)) / jnp.where(square > 0, square, 1)
-            total = total + jnp.sum(weight * (gain * images - views.targets) ** 2)
+            total = total + jnp.sum(weight * (images - views.targets) ** 2)
         return total
 
     return jax.vmap(misfit)(candidates)
@@ -216,20 +212,37 @@ def _image(scene, seed, views, values, spp):
 
 
 class _Stepper:
-    """An optimistix solver taken step by step, compiled once."""
+    """An optimistix solver taken step by step."""
 
-    def __init__(self, solver, fn, y, arguments, compiled):
+    def __init__(self, solver, fn, y, arguments):
         def begin(y, arguments):
             f, aux = jax.eval_shape(fn, y, arguments)
             return solver.init(fn, y, arguments, {}, f, aux, frozenset())
 
         def step(y, state, arguments):
             y, state, aux = solver.step(fn, y, arguments, {}, state, frozenset())
-            done, result = solver.terminate(fn, y, arguments, {}, state, frozenset())
-            return y, state, aux, done, result == optx.RESULTS.successful
+            done, _ = solver.terminate(fn, y, arguments, {}, state, frozenset())
+            return y, state, aux, done
 
-        self.begin = compiled(eqx.filter_jit(begin), y, arguments)
-        self.step = compiled(eqx.filter_jit(step), y, self.begin(y, arguments), arguments)
+        self.begin = eqx.filter_jit(begin).lower(y, arguments).compile()
+        self.step = eqx.filter_jit(step).lower(y, self.begin(y, arguments), arguments).compile()
+
+
+# Of one process, so that fits of the same problem compile once: the latest, by solver, parameters, and shapes.
+_programs: dict = {}
+_MAX_PROGRAMS = 12
+
+
+def _program(key, make, *arguments):
+    """make(*arguments), or what it made for arguments of the same structure and shapes before; and its seconds."""
+    leaves, tree = jax.tree.flatten(arguments)
+    key = key, tree, tuple((leaf.shape, leaf.dtype) for leaf in leaves)
+    started = time.perf_counter()
+    if key not in _programs:
+        if len(_programs) >= _MAX_PROGRAMS:
+            del _programs[next(iter(_programs))]
+        _programs[key] = make(*arguments)
+    return _programs[key], time.perf_counter() - started
 
 
 class _Run:
@@ -282,12 +295,13 @@ class _Run:
         arguments = self.groups, weights, jnp.uint32(spp), self.seed, self._next_draw()
         if self._approach is None:
             least_squares = isinstance(self.solver, optx.AbstractLeastSquaresSolver)
-            fn = partial(_residuals if least_squares else _loss, coordinates=self.coordinates)
-            self._approach = _Stepper(self.solver, fn, x, arguments, self._compiled)
+            fn = self._bind(_residuals if least_squares else _loss)
+            key = _residuals if least_squares else _loss, repr(self.solver)
+            self._approach = self._compiled(key, partial(_Stepper, self.solver, fn), x, arguments)
         state = self._approach.begin(x, arguments)
         lowest, rejected = np.inf, 0
         for _ in range(MAX_STEPS):
-            x, state, loss, done, _ = self._approach.step(x, state, arguments)
+            x, state, loss, done = self._approach.step(x, state, arguments)
             loss = float(loss)
             self.v = np.asarray(self.coordinates.bounded(x), float)
             self._record("approach", spp, loss)
@@ -353,9 +367,9 @@ class _Run:
         z, base, scale, projector = (jnp.asarray(a, self.dtype) for a in (z, base, scale, projector))
         arguments = base, scale, projector, self.groups, self.weights, jnp.uint32(spp), self.seed, draw
         if self._refine is None:
-            fn = partial(_score, coordinates=self.coordinates)
-            self._refine = _Stepper(optx.Newton(rtol=1e-6, atol=1e-6), fn, z, arguments, self._compiled)
-        moved, _, evidence, _, _ = self._refine.step(z, self._refine.begin(z, arguments), arguments)
+            fn, newton = self._bind(_score), optx.Newton(rtol=1e-6, atol=1e-6)
+            self._refine = self._compiled(_score, partial(_Stepper, newton, fn), z, arguments)
+        moved, _, evidence, _ = self._refine.step(z, self._refine.begin(z, arguments), arguments)
         self.evidence = jax.tree.map(np.asarray, evidence)
         return np.asarray(moved, float)
 
@@ -379,6 +393,10 @@ class _Run:
         candidates = [self.v]
         if names:
             self._weigh()
+            if len(names) < len(self.coordinates.parameters):
+                # Colours first: a wrong index of refraction leaves them nearly right, and wrong ones may hide it.
+                self._approach_with(min(APPROACH_SPP, self.spp))
+                self._weigh()
         for name in names * min(len(names), 2):
             tried = np.stack([self._at_ratio(name, ratio) for ratio in SCAN])
             misfits = np.concatenate([self._misfits(chunk) for chunk in np.split(tried, len(SCAN) // SCAN_CHUNK)])
@@ -394,9 +412,8 @@ class _Run:
         # All candidates see the same noise.
         arguments = self.groups, self.weights, jnp.uint32(SCAN_SPP), self.seed, jnp.uint32(0)
         if self._scan is None:
-            only_glass = all(is_glass(p) for _, p in self.coordinates.parameters)
-            f = partial(_misfits, coordinates=self.coordinates, profile=not only_glass)
-            self._scan = self._compiled(jax.jit(f), candidates, arguments)
+            f = jax.jit(self._bind(_misfits))
+            self._scan = self._compiled(_misfits, lambda *a: f.lower(*a).compile(), candidates, arguments)
         return np.asarray(self._scan(candidates, arguments))
 
     def _at_ratio(self, name, ratio):
@@ -414,11 +431,13 @@ class _Run:
         self.draw += 1
         return jnp.uint32(self.draw)
 
-    def _compiled(self, jitted, *arguments):
-        started = time.perf_counter()
-        compiled = jitted.lower(*arguments).compile()
-        self.compile_seconds += time.perf_counter() - started
-        return compiled
+    def _bind(self, f):
+        return partial(f, coordinates=self.coordinates)
+
+    def _compiled(self, key, make, *arguments):
+        program, seconds = _program((key, self.coordinates), make, *arguments)
+        self.compile_seconds += seconds
+        return program
 
     def _record(self, stage, spp, loss):
         values = dict(zip(self.coordinates.labels, self.v.tolist(), strict=True))
