@@ -23,7 +23,7 @@ MEAN_COLOR = jnp.array([0.16, 0.12, 0.09])
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--res", type=int, default=48)
+    parser.add_argument("--res", type=int, default=96)
     parser.add_argument("--spp", type=int, default=32)
     parser.add_argument("--steps", type=int, default=40)
     parser.add_argument("-o", "--output", default="own_loss.png")

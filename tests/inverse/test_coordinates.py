@@ -1,0 +1,61 @@
+"""Named parameters as a vector, and its unbounded coordinates."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from pathjax.inverse.coordinates import Coordinates
+from pathjax.named import Parameter
+
+COLOR = Parameter(("a",), (0,), (3,), (0, 1))
+IOR = Parameter(("b",), (0,), (), (1e-38, np.inf))
+RADIANCE = Parameter(("c",), (0,), (3,), (0, np.inf))
+BOTH = Coordinates((("paint.reflectance", COLOR), ("glass.int_ior", IOR), ("lamp.radiance", RADIANCE)))
+VALUES = {"paint.reflectance": np.array([0.1, 0.5, 0.9]), "glass.int_ior": np.array(1.5), "lamp.radiance": [3.0, 20, 0.2]}
+
+
+def test_components_are_named_by_channel():
+    assert BOTH.labels == [
+        *(f"paint.reflectance.{c}" for c in "rgb"),
+        "glass.int_ior",
+        *(f"lamp.radiance.{c}" for c in "rgb"),
+    ]
+
+
+def test_unpack_inverts_pack():
+    again = BOTH.unpack(BOTH.pack(VALUES))
+    assert again.keys() == VALUES.keys()
+    for name, value in VALUES.items():
+        np.testing.assert_array_equal(again[name], value)
+        assert np.shape(again[name]) == np.shape(value)
+
+
+def test_bounded_inverts_unbounded():
+    v = BOTH.pack(VALUES)
+    np.testing.assert_allclose(BOTH.bounded(jnp.asarray(BOTH.unbounded(v), jnp.float32)), v, rtol=1e-5)
+
+
+def test_any_coordinates_give_values_within_the_bounds():
+    low, high = BOTH.bounds.T
+    for x in (-80.0, -3.0, 0.0, 3.0, 80.0):
+        v = np.asarray(BOTH.bounded(jnp.full(7, x, jnp.float32)))
+        assert np.isfinite(v).all() and (v >= low).all() and (v <= high).all()
+
+
+def test_values_at_a_bound_can_be_left():
+    """The derivative there must not vanish, or a start at a bound would stay."""
+    ends = Coordinates((("paint.reflectance", COLOR),))
+    x = jnp.asarray(ends.unbounded(np.array([0.0, 1.0, 0.5])), jnp.float32)
+    slope = np.diag(jax.jacfwd(ends.bounded)(x))
+    assert (slope > 1e-4).all() and np.isfinite(slope).all()
+
+
+@pytest.mark.parametrize("missing", ["paint.reflectance", "glass.int_ior"])
+def test_names_that_a_view_lacks_have_columns_of_zeros(missing):
+    shape = (2, 3, 3)
+    jacobian = {name: np.ones((*shape, *np.shape(v))) for name, v in VALUES.items() if name != missing}
+    columns = np.asarray(BOTH.columns(jacobian, shape))
+    assert columns.shape == (*shape, 7)
+    zero = [label.startswith(missing) for label in BOTH.labels]
+    np.testing.assert_array_equal(columns, np.broadcast_to(np.where(zero, 0, 1), columns.shape))
