@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pathjax import description
-from pathjax.core.math import normalize
+from pathjax.core.math import dot
 from pathjax.core.types import Ray
 from pathjax.core.warp import square_to_disk
 
@@ -80,13 +80,14 @@ def sample_ray(camera: Camera, position, u_lens) -> Ray:
         aperture = camera.lens.radius * square_to_disk(u_lens)
         start = jnp.stack([aperture[0], aperture[1], jnp.zeros_like(xy[0])])
         local = local * camera.lens.focus_distance - start
-    local = normalize(local)
     right, up, forward = camera.axes
 
     def to_world(v):
         return v[0] * right + v[1] * up + v[2] * forward
 
-    d = normalize(to_world(local))
-    along = 1 / local[2]
+    v = to_world(local)
+    length = jnp.sqrt(dot(v, v))
+    d = v / length
+    along = length / local[2]
     o = camera.origin + to_world(start) + d * (camera.near * along)
     return Ray(o, d, (camera.far - camera.near) * along, jnp.int32(-1))

@@ -7,6 +7,7 @@ import numpy as np
 from pathjax import bsdfs, film
 from pathjax.named import parameters
 from pathjax.scene import UNBOUNDED, Scene
+from pathjax.shapes import geometry
 from pathjax.shapes.planar import Planar
 
 _SAMPLER = "Owen-scrambled Sobol' pairs for the first bounces, hashing after"
@@ -29,7 +30,7 @@ def facts(scene: Scene) -> dict:
         },
         "sampler": {"file": description.sampler, "used": _SAMPLER},
         "shapes": len(description.shapes),
-        "primitives": {_kind(table): int((np.asarray(table.rows) >= 0).sum()) for table in scene.geometry.tables},
+        "primitives": {_kind(table): _primitives(table) for table in scene.geometry.tables},
         "compiled": {
             "shapes": [_kind(table) + (" (tree)" if table.tree else " (flat)") for table in scene.geometry.tables],
             "bsdfs": [type(table).__name__.removesuffix("Table").lower() for table in scene.materials.tables],
@@ -58,6 +59,10 @@ def facts(scene: Scene) -> dict:
 def _bounds(about, name):
     low, high = about.parameters[name].bounds
     return [low, None if high == np.inf else high]
+
+
+def _primitives(table) -> int:
+    return int((geometry.rows_of(table.leaves) >= 0).sum())
 
 
 def _kind(table) -> str:

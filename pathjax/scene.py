@@ -305,18 +305,18 @@ def _spheres(parts, name, dtype, rule):
     rotation = linear / np.linalg.norm(linear, axis=1, keepdims=True)
     sign = np.array([-1.0 if flip else 1.0 for part in parts for _, flip in part])
     numbers, bounds = sphere.leaf_numbers(balls), sphere.bounds(balls)
-    leaves, rows, tree, built = geometry_module.leaves_of(numbers, *bounds, dtype, rule)
+    leaves, tree, built = geometry_module.leaves_of(numbers, *bounds, dtype, rule)
     to_local = np.swapaxes(rotation, 1, 2)
     arrays = (jnp.asarray(x, dtype) for x in (balls, to_local, sign))
-    return Spheres(leaves, rows, tree, *arrays), built
+    return Spheres(leaves, tree, *arrays), built
 
 
 def _planars(parts, name, dtype, rule):
     frames = np.concatenate(parts)
     disk = name == "disk"
     bounds = planar.bounds(frames, disk)
-    leaves, rows, tree, built = geometry_module.leaves_of(planar.leaf_numbers(frames), *bounds, dtype, rule)
-    return Planar(leaves, rows, tree, jnp.asarray(frames, dtype), disk), built
+    leaves, tree, built = geometry_module.leaves_of(planar.leaf_numbers(frames), *bounds, dtype, rule)
+    return Planar(leaves, tree, jnp.asarray(frames, dtype), disk), built
 
 
 def _triangles(parts, name, dtype, rule):
@@ -331,5 +331,5 @@ def _triangles(parts, name, dtype, rule):
     normals = optional(1, triangle.face_normals)
     uv = optional(2, lambda v: np.broadcast_to(np.array([[0, 0], [1, 0], [0, 1]], float), (len(v), 3, 2)))
     bounds = triangle.bounds(vertices)
-    leaves, rows, tree, built = geometry_module.leaves_of(triangle.leaf_numbers(vertices), *bounds, dtype, rule)
-    return Triangles(leaves, rows, tree, jnp.asarray(vertices, dtype), normals, uv), built
+    leaves, tree, built = geometry_module.leaves_of(triangle.leaf_numbers(vertices), *bounds, dtype, rule)
+    return Triangles(leaves, tree, jnp.asarray(vertices, dtype), normals, uv), built

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 
 from pathjax.core.types import Frame, Ray, Surface
@@ -30,12 +31,17 @@ def larger(a, b):
 
 def at(table, *index):
     """`table[index]` for integers known to lie inside: one contiguous load. (Plain indexing, which counts negative
-    indices from the end, and gathers cost a dozen instructions each in the kernel.)
+    indices from the end, and gathers cost a dozen instructions each in the kernel. Unsigned ones are clamped in two.)
     """
     rest = table.shape[len(index) :]
-    start = [jnp.asarray(i, jnp.int32) for i in index] + [jnp.int32(0)] * len(rest)
+    start = [jnp.asarray(i, jnp.uint32) for i in index] + [jnp.uint32(0)] * len(rest)
     block = lax.dynamic_slice(table, start, (1,) * len(index) + rest, allow_negative_indices=False)
     return block.reshape(rest)
+
+
+def integer_like(dtype):
+    """The integers as wide as a float type."""
+    return np.int64 if dtype == np.float64 else np.int32
 
 
 def safe_sqrt(x):

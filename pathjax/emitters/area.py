@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from pathjax.core.math import at, dot, larger, normalize, safe_divide
+from pathjax.core.math import at, dot, larger, safe_divide, safe_sqrt
 from pathjax.core.types import EmitterSample, Hit, Ray, Surface
 from pathjax.shapes import geometry, planar, sphere, triangle
 from pathjax.shapes.geometry import Geometry
@@ -62,9 +62,10 @@ def sample(lights: AreaLights, shapes: Geometry, row, ref, u, u_triangle) -> Emi
             p = p + n * jnp.copysign(margin, dot(n, ref - p))
             to_p = p - ref
             squared = dot(to_p, to_p)
-            d = normalize(to_p)
+            distance = safe_sqrt(squared)
+            d = to_p * safe_divide(1, distance)
             pdf = safe_divide(squared, jnp.abs(dot(n, d)) * n_lights)
-            return _facing(d, jnp.sqrt(squared), n, pdf, Le, place + start)
+            return _facing(d, distance, n, pdf, Le, place + start)
 
         return by_direction if isinstance(table, Spheres) else by_area
 

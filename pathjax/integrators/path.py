@@ -11,7 +11,7 @@ from jax import lax
 from pathjax import bsdfs, emitters
 from pathjax.core import sampler
 from pathjax.core.math import at, dot, frame_from_normal, larger, safe_divide, smaller, spawn_ray, to_local, to_world
-from pathjax.core.types import Ray, Surface
+from pathjax.core.types import Ray
 from pathjax.emitters import Choice
 from pathjax.errors import InputError
 from pathjax.shapes import geometry
@@ -82,29 +82,35 @@ def trace(scene, choice: Choice | None, ray: Ray, numbers, strategy: str, deriva
         hit = geometry.closest_hit(shapes, ray)
         found = hit.primitive >= 0
 
-        def at_surface():
-            surface = geometry.surface(shapes, ray, hit)
-            arrival = hit._replace(t=dot(surface.p - ray.o, ray.d)) if derivative else hit
-            Le, pdf_light = emitters.hit(scene.emitters, shapes, choice, ray, arrival, surface)
-            return surface, Le, pdf_light
-
-        def at_infinity():
-            return _nowhere(ray), *emitters.background(scene.emitters, choice, ray.d)
-
         # ---- emission: bsdf sampling's share of the light that the ray ends on --------------------------------------
-        if shapes.tables:
-            surface, Le, pdf_light = lax.cond(found, at_surface, at_infinity)
-        else:
-            surface, Le, pdf_light = at_infinity()
-        if strategy == "mis":
-            share = mis_weight(path.pdf, pdf_light)
-        else:
-            share = jnp.where((strategy == "light") & sample_lights & jnp.isfinite(path.pdf) & (pdf_light > 0), 0, 1)
+        surface = geometry.surface(shapes, ray, hit) if shapes.tables else None  # of a miss: not used
+
+        def emission():
+            def at_surface():
+                arrival = hit._replace(t=dot(surface.p - ray.o, ray.d)) if derivative else hit
+                return emitters.hit(scene.emitters, shapes, choice, ray, arrival, surface)
+
+            def at_infinity():
+                return emitters.background(scene.emitters, choice, ray.d)
+
+            Le, pdf_light = lax.cond(found, at_surface, at_infinity) if shapes.tables else at_infinity()
+            if strategy == "mis":
+                share = mis_weight(path.pdf, pdf_light)
+            else:
+                share = jnp.where(
+                    (strategy == "light") & sample_lights & jnp.isfinite(path.pdf) & (pdf_light > 0), 0, 1
+                )
+            if scene.hide_emitters:
+                # What emits lets camera rays through, as in Mitsuba; the background is black to them.
+                share = jnp.where(path.depth == 0, 0, share)
+            return path.throughput * Le * share
+
+        # Most surfaces are dark.
+        bright = ~found | geometry.emits(shapes, hit) if shapes.tables else True
+        L = path.L + lax.cond(bright, emission, lambda: jnp.zeros_like(path.L))
         if scene.hide_emitters:
-            # What emits lets camera rays through, as in Mitsuba; the background is black to them.
-            share = jnp.where(path.depth == 0, 0, share)
             hidden = found & (path.depth == 0) & geometry.emits(shapes, hit)
-        path = path._replace(L=path.L + path.throughput * Le * share, depth=path.depth + 1)
+        path = path._replace(L=L, depth=path.depth + 1)
 
         def scatter(path: Path) -> Path:
             u = numbers(path.depth - 1)
@@ -206,10 +212,3 @@ def sample_numbers(scene, stream, sample):
         return Bounce(light, bsdf, hashed(4, 1)[0], hashed(5, 1)[0])
 
     return pairs[0], pairs[1], numbers
-
-
-def _nowhere(ray: Ray) -> Surface:
-    zero = jnp.zeros_like(ray.t_max)
-    return Surface(ray.o, ray.d, zero, ray.d, jnp.zeros_like(ray.o[:2]))
-
-

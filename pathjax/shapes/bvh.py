@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from pathjax.core.math import at, larger, smaller
+from pathjax.core.math import at, integer_like, larger, smaller
 
 WIDTH = 8
 
@@ -17,9 +17,20 @@ WIDTH = 8
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Tree:
-    bounds: jax.Array  # (N, 2, 3, 8) lower and upper planes of the children; NaN in empty slots
-    child: jax.Array  # (N, 8) int32: > 0 an inner node, < 0 the leaf ~child
+    # (N, 7, 8) integers as wide as the reals: bits of the children's lower planes x, y, z and upper planes, NaN in
+    # empty slots; the child: > 0 an inner node, < 0 the leaf ~child. One block, so that a visit misses the cache once.
+    nodes: jax.Array
     depth: int = field(metadata={"static": True})  # levels of inner nodes: the size of the stack
+
+
+def pack(built, dtype) -> Tree:
+    """The Tree of what `bvh_build` has built."""
+    if len(built.child) >> 31 - WIDTH:
+        raise ValueError(f"a BVH has fewer than 2^{31 - WIDTH} nodes, not {len(built.child)}")
+    planes = built.bounds.reshape(-1, 6, WIDTH).astype(dtype)
+    integer = integer_like(planes.dtype)
+    nodes = np.concatenate([planes.view(integer), built.child[:, None].astype(integer)], 1)
+    return Tree(jnp.asarray(nodes), built.depth)
 
 
 def traverse(tree: Tree, leaf, o, d, t, primitive):
@@ -34,9 +45,10 @@ def traverse(tree: Tree, leaf, o, d, t, primitive):
         t, primitive.
 
     A node's children still to visit are the bits of a mask: bit k is the child in slot k ^ octant, which the builder
-    has chosen so that ascending bits go away from a ray of that octant. The stack holds a node and a mask for each
-    level. Nothing else is kept, since every buffer that the loop carries costs instructions in each of its trips;
-    for the same reason the constants of the ray travel in one array.
+    has chosen so that ascending bits go away from a ray of that octant. An entry is a node's number above its mask; the
+    stack holds those whose masks are not empty, above a 0 that ends the search. Nothing else is kept, since every
+    buffer that the loop carries costs instructions in each of its trips; for the same reason the constants of the ray
+    travel in one array.
     """
     eps = np.finfo(d.dtype).eps
     lane = jnp.arange(WIDTH, dtype=jnp.int32)
@@ -52,9 +64,9 @@ def traverse(tree: Tree, leaf, o, d, t, primitive):
     ray, octant, weights = lax.optimization_barrier((ray, octant, weights))
 
     def hit_children(node, t):
-        box = at(tree.bounds, node)
-        low = [box[0, axis] * ray[axis] for axis in range(3)]
-        high = [box[1, axis] * ray[axis] for axis in range(3)]
+        box = lax.bitcast_convert_type(at(tree.nodes, node), d.dtype)  # the last row is not used
+        low = [box[axis] * ray[axis] for axis in range(3)]
+        high = [box[3 + axis] * ray[axis] for axis in range(3)]
         near = [smaller(low[axis], high[axis]) - ray[3 + axis] for axis in range(3)]
         far = [larger(low[axis], high[axis]) - ray[6 + axis] for axis in range(3)]
         # The NaN of an empty slot gets through as the last argument.
@@ -63,10 +75,10 @@ def traverse(tree: Tree, leaf, o, d, t, primitive):
         return jnp.sum(jnp.where(enter <= leave * (1 + 5 * eps), weights, 0), dtype=jnp.int32)
 
     def visit_next(state):
-        level, node, mask, stack, t, primitive = state
-        slot = (31 - lax.clz(mask & -mask)) ^ octant
-        child = at(tree.child, node, slot)
-        rest = mask & (mask - 1)
+        free, entry, stack, t, primitive = state
+        rest = entry & (entry - 1)
+        slot = (lax.population_count(~entry & (entry - 1)) ^ octant) & (WIDTH - 1)  # of the lowest bit
+        child = at(tree.nodes, entry >> WIDTH, 6, slot).astype(jnp.int32)
 
         def test_leaf():
             return *leaf(~child, t, primitive), jnp.int32(0)
@@ -75,20 +87,18 @@ def traverse(tree: Tree, leaf, o, d, t, primitive):
             return t, primitive, hit_children(child, t)
 
         t, primitive, below = lax.cond(child < 0, test_leaf, open_node)
-        descend = below != 0
-        stack = lax.dynamic_update_slice(stack, jnp.stack([node, rest])[None], (level, jnp.int32(0)))
-        level = level + (descend & (rest != 0))
-        node, mask = jnp.where(descend, child, node), jnp.where(descend, below, rest)
-
-        done = mask == 0
-        node_above, mask_above = at(stack, jnp.maximum(level - 1, 0))
-        node, mask = jnp.where(done, node_above, node), jnp.where(done & (level > 0), mask_above, mask)
-        return level - done, node, mask, stack, t, primitive
+        # Push the rest, unless it is empty; then go below, or pop.
+        place = free.astype(jnp.uint32)
+        stack = lax.dynamic_update_slice(stack, rest[None], (place,), allow_negative_indices=False)
+        some = rest & ((1 << WIDTH) - 1) != 0
+        free = free + some.astype(jnp.int32) - (below == 0).astype(jnp.int32)
+        entry = jnp.where(below != 0, child << WIDTH | below, at(stack, free))
+        return free, entry, stack, t, primitive
 
     def more(state):
-        _, _, mask, _, t, _ = state
-        return (mask != 0) & (t >= 0)
+        _, entry, _, t, _ = state
+        return (entry != 0) & (t >= 0)
 
-    root = jnp.int32(0)
-    stack = jnp.zeros((tree.depth, 2), jnp.int32)
-    return lax.while_loop(more, visit_next, (root, root, hit_children(root, t), stack, t, primitive))[4:]
+    stack = jnp.zeros((tree.depth + 1,), jnp.int32)
+    start = (jnp.int32(1), hit_children(jnp.int32(0), t), stack, t, primitive)
+    return lax.while_loop(more, visit_next, start)[3:]

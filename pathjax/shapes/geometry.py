@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from pathjax.core.math import at, smaller
+from pathjax.core.math import at, integer_like, smaller
 from pathjax.core.types import Hit, Ray, Surface
 from pathjax.shapes import bvh, bvh_build, planar, sphere, triangle
 from pathjax.shapes.planar import Planar
@@ -43,7 +43,8 @@ def leaves_of(numbers, lo, hi, dtype, rule="sah"):
         numbers: (P, K) what the intersection wants to know of each primitive.
         lo, hi: (P, 3) bounds.
     Returns:
-        leaves (L, K, W), rows (L, W) int32, tree (None for a few primitives), built tree for reports or None.
+        leaves (L, K + 1, W), tree (None for a few primitives), built tree for reports or None. The last numbers of a
+        leaf are the bits of its rows: one block, so that a visit misses the cache once.
     """
     count = len(numbers)
     if count <= FLAT_LIMIT:
@@ -55,10 +56,17 @@ def leaves_of(numbers, lo, hi, dtype, rule="sah"):
         lane = np.arange(LEAF_WIDTH)
         place = built.leaf_first[:, None] + lane
         rows = np.where(lane < built.leaf_count[:, None], built.order[np.minimum(place, count - 1)], -1)
-        tree = bvh.Tree(jnp.asarray(built.bounds, dtype), jnp.asarray(built.child, jnp.int32), built.depth)
+        tree = bvh.pack(built, dtype)
     padded = np.concatenate([numbers, np.full((1, numbers.shape[1]), np.nan)])
-    leaves = np.moveaxis(padded[rows], 1, 2)  # row -1 is the padding
-    return jnp.asarray(leaves, dtype), jnp.asarray(rows, jnp.int32), tree, built
+    leaves = np.moveaxis(padded[rows], 1, 2).astype(dtype)  # row -1 is the padding
+    bits = rows.astype(integer_like(leaves.dtype)).view(leaves.dtype)
+    return jnp.asarray(np.concatenate([leaves, bits[:, None]], 1)), tree, built
+
+
+def rows_of(leaf):
+    """Rows (..., W) of the primitives of a leaf (..., K + 1, W), ascending; -1 in empty lanes."""
+    bits = leaf[..., -1, :]
+    return lax.bitcast_convert_type(bits, integer_like(bits.dtype)).astype(jnp.int32)
 
 
 def firsts(geometry: Geometry) -> list[int]:
@@ -81,7 +89,10 @@ def closest_hit(geometry: Geometry, ray: Ray) -> Hit:
 
         def update():
             found = lax.bitcast_convert_type(nearest, distances.dtype)
-            candidate = _least(jnp.where(bits == nearest, primitives, none))
+            # The lowest of those that tie is the first: primitives ascend with the lanes.
+            lanes = jnp.left_shift(jnp.int32(1), jnp.arange(len(bits), dtype=jnp.int32))
+            tied = jnp.sum(jnp.where(bits == nearest, lanes, 0), dtype=jnp.int32)
+            candidate = at(primitives, lax.population_count(~tied & (tied - 1)))
             better = (found < t) | (candidate < primitive)
             return jnp.where(better, found, t), jnp.where(better, candidate, primitive)
 
@@ -137,27 +148,30 @@ def _visit(geometry: Geometry, ray: Ray, leaf_test, t, primitive):
         prepared = lax.optimization_barrier(module.prepare(ray.o, ray.d))
 
         def leaf(number, t, primitive, table=table, first=first, module=module, prepared=prepared):
-            rows = at(table.rows, number)
+            rows = rows_of(at(table.leaves, number))
             primitives = rows + first  # of empty lanes: nonsense, but these are never hit
             distances = module.intersect(table, number, prepared, primitives == ray.exclude)
             return leaf_test(distances, primitives, t, primitive)
 
         if table.tree is None:
-            t, primitive = leaf(0, t, primitive)
+            t, primitive = leaf(jnp.int32(0), t, primitive)
         else:
             t, primitive = bvh.traverse(table.tree, leaf, ray.o, ray.d, t, primitive)
     return t, primitive
 
 
 def _least(x):
-    """Minimum of (W,) integers, W a multiple of 8. (XLA reduces one by one; registers are first folded into one.)"""
+    """Minimum of (W,) integers, W a multiple of 8. (XLA reduces one by one; halves fold into each other.)"""
     registers = x.reshape(-1, LEAF_WIDTH)
     least = registers[0]
     for register in registers[1:]:
         least = smaller(register, least)
-    return jnp.min(lax.optimization_barrier(least))
+    while len(least) > 1:
+        half = len(least) // 2
+        least = smaller(least[:half], least[half:])
+    return least[0]
 
 
 def _bits(x):
     """Integers that order as the positive floats x do."""
-    return lax.bitcast_convert_type(x, jnp.int64 if x.dtype == jnp.float64 else jnp.int32)
+    return lax.bitcast_convert_type(x, integer_like(x.dtype))

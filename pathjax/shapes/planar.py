@@ -22,8 +22,7 @@ from pathjax.shapes.bvh import Tree
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Planar:
-    leaves: jax.Array  # (L, 14, W) of `leaf_numbers`; NaN in empty lanes
-    rows: jax.Array  # (L, W) int32 row of each lane
+    leaves: jax.Array  # (L, 15, W) of `leaf_numbers`, NaN in empty lanes; row of each lane
     tree: Tree | None  # None: L = 1, every ray tests all
     frames: jax.Array  # (P, 4, 3): c, a, b, unit normal
     disk: bool = field(metadata={"static": True})

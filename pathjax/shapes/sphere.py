@@ -28,8 +28,7 @@ from pathjax.shapes.bvh import Tree
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Spheres:
-    leaves: jax.Array  # (L, 4, W) center, radius; NaN in empty lanes
-    rows: jax.Array  # (L, W) int32 row of each lane
+    leaves: jax.Array  # (L, 5, W) center, radius, NaN in empty lanes; row of each lane
     tree: Tree | None  # None: L = 1, every ray tests all
     balls: jax.Array  # (P, 4) center, radius
     to_local: jax.Array  # (P, 3, 3) rotation into the frame of its uv

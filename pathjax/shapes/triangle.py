@@ -18,8 +18,7 @@ from pathjax.shapes.bvh import Tree
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Triangles:
-    leaves: jax.Array  # (L, 9, W) x of the three vertices, y, z; NaN in empty lanes
-    rows: jax.Array  # (L, W) int32 row of each lane
+    leaves: jax.Array  # (L, 10, W) x of the three vertices, y, z, NaN in empty lanes; row of each lane
     tree: Tree | None  # None: L = 1, every ray tests all
     vertices: jax.Array  # (P, 3, 3) by row: vertex, axis
     normals: jax.Array | None  # (P, 3, 3) at the vertices; None: no triangle of the scene is smooth
@@ -61,12 +60,16 @@ def intersect(table: Triangles, leaf, prepared, on_it):
     """
     axes, ray = prepared
     _, _, width = table.leaves.shape
-    coordinates = table.leaves.reshape(-1, 3, 3, width)
-    z = at(coordinates, leaf, axes[2]) - ray[2]
-    x = at(coordinates, leaf, axes[0]) - ray[0] - ray[3] * z
-    y = at(coordinates, leaf, axes[1]) - ray[1] - ray[4] * z
-    # Several results share these; without the barrier each computes them again.
-    x, y, z = lax.optimization_barrier((x, y, z))
+
+    def coordinates(axis):
+        start = [jnp.asarray(i, jnp.uint32) for i in (leaf, 3 * axis, 0)]
+        return lax.dynamic_slice(table.leaves, start, (1, 3, width), allow_negative_indices=False)[0]
+
+    z = coordinates(axes[2]) - ray[2]
+    x = coordinates(axes[0]) - ray[0] - ray[3] * z
+    y = coordinates(axes[1]) - ray[1] - ray[4] * z
+    # Several results share these; without the barrier each computes them again. (z is cheaper computed twice.)
+    x, y = lax.optimization_barrier((x, y))
     tolerance = 2 * np.finfo(x.dtype).eps
 
     def edge(i, j):

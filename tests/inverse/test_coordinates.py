@@ -12,7 +12,7 @@ COLOR = Parameter(("a",), (0,), (3,), (0, 1))
 IOR = Parameter(("b",), (0,), (), (1e-38, np.inf))
 RADIANCE = Parameter(("c",), (0,), (3,), (0, np.inf))
 BOTH = Coordinates((("paint.reflectance", COLOR), ("glass.int_ior", IOR), ("lamp.radiance", RADIANCE)))
-VALUES = {"paint.reflectance": np.array([0.1, 0.5, 0.9]), "glass.int_ior": np.array(1.5), "lamp.radiance": [3.0, 20, 0.2]}
+VALUES = {"paint.reflectance": [0.1, 0.5, 0.9], "glass.int_ior": 1.5, "lamp.radiance": [3.0, 20, 0.2]}
 
 
 def test_components_are_named_by_channel():

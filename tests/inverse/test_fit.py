@@ -16,7 +16,8 @@ ROOM = """
 <bsdf type="diffuse" id="wall"><rgb name="reflectance" value="0.2, 0.4, 0.7"/></bsdf>
 <shape type="rectangle"><transform name="to_world"><scale value="2"/><rotate x="1" angle="-90"/>
   <translate y="-1"/></transform><ref id="floor"/></shape>
-<shape type="rectangle"><transform name="to_world"><scale value="2"/><translate z="-1"/></transform><ref id="wall"/></shape>
+<shape type="rectangle"><transform name="to_world"><scale value="2"/><translate z="-1"/></transform>
+  <ref id="wall"/></shape>
 <emitter type="constant" id="sky"><rgb name="radiance" value="1, 0.9, 0.8"/></emitter>
 """
 NAMES = ["floor.reflectance", "wall.reflectance"]

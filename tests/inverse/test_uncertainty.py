@@ -1,4 +1,4 @@
-"""The statistics of a fit on problems that are linear and known: bias, covariance, what is not determined, structure."""
+"""The statistics of a fit on linear problems that are known: bias, covariance, what is not determined, structure."""
 
 import numpy as np
 import pytest
