@@ -174,6 +174,30 @@ def estimate():
 
 
 @pytest.fixture(scope="session")
+def derivatives():
+    """(scene, names, spp, count, **how of `jacobian`) -> Estimates over `count` seeds: of the image, and by name of the
+    derivative; for a colour that in the same channel, the others being 0.
+    """
+
+    def diagonal(derivative):
+        if derivative.ndim == 3:
+            return derivative
+        assert not derivative[..., ~np.eye(3, dtype=bool)].any()
+        return np.diagonal(derivative, axis1=-2, axis2=-1)
+
+    def estimates(scene, names, spp=16, count=16, first_seed=1, **how):
+        images, slopes = [], {name: [] for name in names}
+        for seed in range(first_seed, first_seed + count):
+            image, J = pathjax.jacobian(scene, names, spp, seed, **how)
+            images.append(np.asarray(image))
+            for name in names:
+                slopes[name].append(diagonal(np.asarray(J[name])))
+        return estimate_of(images), {name: estimate_of(values) for name, values in slopes.items()}
+
+    return estimates
+
+
+@pytest.fixture(scope="session")
 def agree():
     """Assert that two Estimates, or one and an exact image, differ by chance only.
 

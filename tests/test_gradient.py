@@ -1,0 +1,514 @@
+"""Derivatives of images: against closed forms, against differences of independent images, and against each other."""
+
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import pathjax as pj
+from pathjax import gradient, named
+from pathjax.io.image import write_exr
+
+NO_LIMIT = 1 << 30
+RHO = np.array([0.2, 0.5, 0.8])
+IOR = 1.5
+
+
+def without_roulette(scene, max_depth=NO_LIMIT):
+    return replace(scene, max_depth=jnp.int32(max_depth), rr_depth=jnp.int32(NO_LIMIT))
+
+
+def shape(kind, transform="", inside=""):
+    return f'<shape type="{kind}"><transform name="to_world">{transform}</transform>{inside}</shape>'
+
+
+def diffuse(name, reflectance):
+    return f'<bsdf type="diffuse" id="{name}"><rgb name="reflectance" value="{reflectance}"/></bsdf>'
+
+
+def area_light(name, radiance):
+    return f'<emitter type="area" id="{name}"><rgb name="radiance" value="{radiance}"/></emitter>'
+
+
+def sky(radiance=1):
+    return f'<emitter type="constant" id="sky"><rgb name="radiance" value="{radiance}"/></emitter>'
+
+
+# ---- colours: closed forms ------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def furnace(shipped):
+    """Inside a closed sphere of radiance 1."""
+    return shipped("furnace", shape="sphere", res=8)
+
+
+def series(rho, depth):
+    """Radiance in the furnace cut off at `depth`, and its derivative in the albedo."""
+    k = np.arange(1, depth)[:, None]
+    return 1 + np.sum(rho**k, 0), np.sum(k * rho ** (k - 1), 0)
+
+
+FURNACE_NAMES = ["wall.reflectance", "glow.radiance"]
+
+
+@pytest.mark.parametrize("depth", [1, 2, 3, 8])
+def test_closed_diffuse_sphere_per_sample(furnace, derivatives, depth):
+    """Every vertex sees radiance 1, so a single sample is the truncated series, and so is its derivative."""
+    image, slopes = derivatives(without_roulette(furnace, depth), FURNACE_NAMES, 1, 2, strategy="bsdf")
+    L, dL = series(RHO, depth)
+    for estimate, exact in ((image, L), (slopes["wall.reflectance"], dL), (slopes["glow.radiance"], L)):
+        assert (estimate.variance <= 1e-10).all()
+        # An ulp or two for each of up to 8 vertices.
+        np.testing.assert_allclose(estimate.mean, np.broadcast_to(exact, (8, 8, 3)), rtol=2e-6)
+
+
+@pytest.mark.parametrize("strategy", ["mis", "light", "bsdf"])
+def test_strategies_agree_with_the_closed_form(furnace, derivatives, agree, strategy):
+    """At depth 6, with roulette from the second vertex on and without."""
+    L, dL = series(RHO, 6)
+    for rr_depth in (1, NO_LIMIT):
+        scene = replace(furnace, max_depth=jnp.int32(6), rr_depth=jnp.int32(rr_depth))
+        image, slopes = derivatives(scene, FURNACE_NAMES, 32, 16, strategy=strategy)
+        agree(image, L)
+        agree(slopes["wall.reflectance"], dL)
+        agree(slopes["glow.radiance"], L)
+
+
+def test_black_walls_and_dark_lamps_keep_their_derivatives(furnace, derivatives, agree):
+    """An albedo of exactly 0 has dL/drho = 1; a radiance of exactly 0 leaves a black image that can change."""
+    for rr_depth in (1, NO_LIMIT):
+        scene = replace(furnace, max_depth=jnp.int32(6), rr_depth=jnp.int32(rr_depth))
+        black = pj.with_parameters(scene, {"wall.reflectance": 0.0})
+        image, slopes = derivatives(black, FURNACE_NAMES, 32)
+        agree(image, 1)
+        agree(slopes["wall.reflectance"], 1)
+        agree(slopes["glow.radiance"], 1)
+        dark = pj.with_parameters(scene, {"glow.radiance": 0.0})
+        image, slopes = derivatives(dark, FURNACE_NAMES, 32)
+        assert not image.mean.any() and not slopes["wall.reflectance"].mean.any()
+        agree(slopes["glow.radiance"], series(RHO, 6)[0])
+
+
+def test_emission_scales(shipped):
+    """The image is linear in each lamp and all of it comes from lamps: with s all radiances, s dI/ds = I."""
+    scene = shipped("nine_spheres", res=8)
+    light = pj.parameters(scene)["light.radiance"]
+    image, J = pj.jacobian(scene, ["light.radiance"], 16)
+    np.testing.assert_allclose(J["light.radiance"] @ light, image, rtol=1e-5, atol=1e-6)
+
+
+@pytest.fixture(scope="module")
+def plane(make_scene):
+    """A diffuse plate that fills the view, under radiance 1."""
+    return make_scene(shape("rectangle", inside=diffuse("plate", "0.2, 0.5, 0.8")) + sky(), res=8, fov=20, depth=2)
+
+
+def test_diffuse_plane_under_uniform_light(plane):
+    image, J = pj.jacobian(plane, ["plate.reflectance"], 4)
+    np.testing.assert_allclose(image, np.broadcast_to(RHO, (8, 8, 3)), rtol=1e-6)
+    np.testing.assert_allclose(J["plate.reflectance"], np.broadcast_to(np.eye(3), (8, 8, 3, 3)), rtol=1e-6)
+
+
+# Radiances and albedos of two facing plates, the camera looking at the first.
+E1, E2 = np.array([0.5, 1.0, 2.0]), np.array([3.0, 2.0, 1.0])
+RHO1, RHO2 = np.array([0.3, 0.6, 0.9]), np.array([0.8, 0.5, 0.2])
+PLATES = ["one.reflectance", "two.reflectance", "glow-one.radiance", "glow-two.radiance"]
+
+
+def listed(values):
+    return ", ".join(map(str, values))
+
+
+@pytest.fixture(scope="module")
+def plates(make_scene):
+    """(half width, depth) -> plates at z = 0 and z = 1, and a camera between them that sees the middle of the first."""
+
+    def make(size, depth):
+        first = diffuse("one", listed(RHO1)) + area_light("glow-one", listed(E1))
+        second = diffuse("two", listed(RHO2)) + area_light("glow-two", listed(E2))
+        return make_scene(
+            shape("rectangle", f'<scale value="{size}"/>', first)
+            + shape("rectangle", f'<scale value="{size}"/><rotate y="1" angle="180"/><translate z="1"/>', second),
+            res=8,
+            depth=depth,
+            rr_depth=4,
+            origin="0, 0, 0.9",
+            fov=0.01,
+        )
+
+    return make
+
+
+def plate_series(f, depth):
+    """B1 = E1 + rho1 f B2, B2 = E2 + rho2 f B1, cut off at `depth` vertices, and its four partial derivatives."""
+
+    def radiosity(rho1, rho2, e1, e2):
+        b1, b2 = 0, 0
+        for _ in range(depth):
+            b1, b2 = e1 + rho1 * f * b2, e2 + rho2 * f * b1
+        return b1
+
+    at = (RHO1, RHO2, E1, E2)
+    # A polynomial with real coefficients: complex steps give its derivatives to the last bits.
+    steps = np.eye(4)[:, :, None] * 1e-30j
+    return radiosity(*at), [radiosity(*(a + s for a, s in zip(at, step, strict=True))).imag / 1e-30 for step in steps]
+
+
+def test_two_infinite_plates(plates, derivatives, agree):
+    """F = 1, and (E1 + rho1 E2) / (1 - rho1 rho2): at 64 vertices the rest of the series is below 1e-8."""
+    f = 1
+    B1, partials = plate_series(f, 64)
+    np.testing.assert_allclose(B1, (E1 + RHO1 * f * E2) / (1 - RHO1 * RHO2 * f**2))
+    # Light sampling over plates so large would seldom hit where it matters.
+    image, slopes = derivatives(plates(1e3, 64), PLATES, 64, strategy="bsdf")
+    # Beyond 1e3 plate distances lie 1e-6 of the light.
+    agree(image, B1, pixelwise=False)
+    for name, partial in zip(PLATES, partials, strict=True):
+        agree(slopes[name], partial, pixelwise=False)
+
+
+@pytest.mark.parametrize("strategy", ["mis", "bsdf"])
+def test_two_finite_plates_with_their_form_factor(plates, derivatives, agree, strategy):
+    """One bounce: the point's form factor to the other plate, a rectangle seen from below its middle."""
+    # Four quarters, each 1 / (2 pi) (a / A atan(b / A) + b / B atan(a / B)), A^2 = 1 + a^2 (Howell's catalogue, B-3).
+    root = np.sqrt(2)
+    f = 4 / (2 * np.pi) * 2 * (1 / root) * np.arctan(1 / root)
+    B1, partials = plate_series(f, 2)
+    image, slopes = derivatives(plates(1.0, 2), PLATES, 64, strategy=strategy)
+    agree(image, B1, pixelwise=False)
+    for name, partial in zip(PLATES, partials, strict=True):
+        agree(slopes[name], partial, pixelwise=False)
+
+
+def metal_sheet(make_scene, angle):
+    """A sheet of metal that fills the view, seen at an angle under radiance 1."""
+    metal = (
+        '<bsdf type="conductor" id="metal"><rgb name="eta" value="0.2, 0.924, 1.102"/>'
+        '<rgb name="k" value="3.912, 2.452, 2.142"/><rgb name="specular_reflectance" value="0.9, 0.8, 0.7"/></bsdf>'
+    )
+    tilted = f'<scale value="9"/><rotate y="1" angle="{angle}"/>'
+    return make_scene(shape("rectangle", tilted, metal) + sky(2), res=8, fov=1e-3)
+
+
+def conductor_reflectance(cos_i, eta, k):
+    """Complex amplitudes, in float64."""
+    n = eta + 1j * k
+    cos_t = np.sqrt(1 - (1 - cos_i**2) / n**2)
+    r_s, r_p = (cos_i - n * cos_t) / (cos_i + n * cos_t), (n * cos_i - cos_t) / (n * cos_i + cos_t)
+    return (abs(r_s) ** 2 + abs(r_p) ** 2) / 2
+
+
+@pytest.mark.parametrize("angle", [0, 40, 75])
+def test_metals(make_scene, angle):
+    """I = 2 s F(eta, k), and all three derivatives."""
+    eta, k, s = np.array([0.2, 0.924, 1.102]), np.array([3.912, 2.452, 2.142]), np.array([0.9, 0.8, 0.7])
+    names = ["metal.eta", "metal.k", "metal.specular_reflectance"]
+    image, J = pj.jacobian(metal_sheet(make_scene, angle), names, 1)
+
+    def F(eta, k):
+        return conductor_reflectance(np.cos(np.radians(angle)), eta, k)
+
+    h = 1e-5
+    exact = (
+        2 * s * (F(eta + h, k) - F(eta - h, k)) / (2 * h),
+        2 * s * (F(eta, k + h) - F(eta, k - h)) / (2 * h),
+        2 * F(eta, k),
+    )
+    np.testing.assert_allclose(image, np.broadcast_to(2 * s * F(eta, k), (8, 8, 3)), rtol=1e-5)
+    for name, slope in zip(names, exact, strict=True):
+        # In float32 some digits cancel in 1 - F; and the view is 1e-5 wide.
+        wanted = np.broadcast_to(np.diag(slope), (8, 8, 3, 3))
+        np.testing.assert_allclose(J[name], wanted, rtol=1e-4, atol=2e-6)
+
+
+def test_checkerboard_colours(shipped):
+    """Up to depth 5 the screen is met twice at most, so a sample is quadratic in its colours, and central differences
+    with the same seed are exact."""
+    scene = without_roulette(shipped("glass_ball", res=8), 5)
+    names = ["pattern.color0", "pattern.color1", "sky.radiance"]
+    image, J = pj.jacobian(scene, names, 16)
+    h = 0.1
+    for name in names[:2]:
+        value = pj.parameters(scene)[name]
+        up, down = (pj.render(pj.with_parameters(scene, {name: value + s * h}), 16) for s in (1, -1))
+        slope = np.diagonal(J[name], axis1=-2, axis2=-1)
+        assert slope.max() > 0.1
+        np.testing.assert_allclose(slope, (up - down) / (2 * h), rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(J["sky.radiance"] @ pj.parameters(scene)["sky.radiance"], image, rtol=1e-5, atol=1e-6)
+
+
+# ---- glass: closed forms --------------------------------------------------------------------------------------------
+
+GRID = 12
+# Of the ramp over the screen, per channel, in albedo per half width.
+RAMP = np.array([0.4, 0.2, -0.3])
+PICTURES = {
+    "black": np.zeros((GRID, GRID, 3)),
+    "ramp": 0.5 + RAMP * ((np.arange(GRID) + 0.5) / GRID * 2 - 1)[None, :, None] * np.ones((GRID, 1, 1)),
+    "edge": np.where(np.arange(GRID) < GRID // 2, 0.1, 0.8)[None, :, None] * np.ones((GRID, 1, 3)),
+    "checkerboard": np.where(np.sum(np.indices((GRID, GRID)), 0) % 2, 0.1, 0.8)[..., None] * np.ones(3),
+}
+AWAY = '<scale value="1e-3"/><translate y="1e5"/>'
+
+
+@pytest.fixture(scope="module")
+def stage(make_scene, tmp_path_factory):
+    """A ball, a slab and an octahedron of one glass, and a screen with a picture, under radiance 1.
+
+    Each where its transform puts it, or out of sight: one structure, so one kernel for all tests.
+    """
+    file = tmp_path_factory.mktemp("stage") / "picture.exr"
+    write_exr(file, {c: np.zeros((GRID, GRID), np.float32) for c in "RGB"}, {})
+
+    def make(ball=AWAY, slab=AWAY, gem=AWAY, screen=AWAY, picture="black", **camera):
+        glass = (
+            '<bsdf type="dielectric" id="glass"><float name="int_ior" value="1.5"/>'
+            '<float name="ext_ior" value="1"/></bsdf>'
+        )
+        texture = (
+            '<bsdf type="diffuse" id="screen"><texture type="bitmap" name="reflectance">'
+            f'<string name="filename" value="{file}"/><boolean name="raw" value="true"/>'
+            '<string name="wrap_mode" value="clamp"/></texture></bsdf>'
+        )
+        octahedron = (
+            '<string name="filename" value="meshes/octahedron.obj"/><boolean name="face_normals" value="true"/>'
+        )
+        ref = '<ref id="glass"/>'
+        scene = make_scene(
+            glass
+            + shape("sphere", ball, ref)
+            + shape("cube", slab, ref)
+            + shape("obj", gem, octahedron + ref)
+            + shape("rectangle", screen, texture)
+            + sky(),
+            **camera,
+        )
+        place = "materials", "tables", 0, "textures", "bitmaps"
+        scene = named.put(scene, (*place, "texels"), jnp.asarray(PICTURES[picture].reshape(-1, 3), jnp.float32))
+        return named.put(scene, (*place, "nearest"), jnp.asarray([picture != "ramp"]))
+
+    return make
+
+
+GLASS = "glass.int_ior"
+SCREEN = '<scale value="6"/><translate z="-3"/>'
+
+
+def reflectance(eta):
+    """At normal incidence, and its derivative."""
+    return ((eta - 1) / (eta + 1)) ** 2, 4 * (eta - 1) / (eta + 1) ** 3
+
+
+def difference(f, step):
+    """What a central difference estimates without bias; (eta -> value), at the IOR of the tests."""
+    return (f(IOR + step) - f(IOR - step)) / (2 * step)
+
+
+BODIES = {
+    "ball": '<scale value="0.8"/>',
+    "slab": '<scale value="0.6"/><rotate y="1" angle="30"/><rotate x="1" angle="20"/>',
+    "gem": '<rotate y="1" angle="20"/>',
+}
+
+
+@pytest.mark.parametrize("body", BODIES)
+def test_glass_in_uniform_light_stays_invisible(stage, derivatives, agree, body):
+    """Image 1 and derivative 0 for ball, cube and mesh, if paths are followed to their end."""
+    scene = without_roulette(stage(**{body: BODIES[body]}))
+    image, slopes = derivatives(scene, [GLASS], 32, step=0.01)
+    agree(image, 1)
+    agree(slopes[GLASS], 0)
+    assert slopes[GLASS].variance.max() > 0
+
+
+def test_truncated_glass_shows_what_is_cut_off(stage, derivatives, agree):
+    """Two vertices leave only the front reflection, I = R and dI/deta = dR/deta: what a small max_depth does."""
+    scene = without_roulette(stage(ball="", fov=1e-3), 2)
+    image, slopes = derivatives(scene, [GLASS], 64, step=0.01)
+    R, dR = reflectance(IOR)
+    agree(image, R)
+    agree(slopes[GLASS], difference(lambda eta: reflectance(eta)[0], 0.01))
+    np.testing.assert_allclose(slopes[GLASS].mean.mean(), dR, rtol=0.05)
+    assert dR == pytest.approx(0.128)
+
+
+def test_clear_slab_with_all_its_internal_reflections(stage, derivatives, agree):
+    """Before a black screen under radiance 1 a slab shows 1 - T, with T = 2 eta / (eta^2 + 1)."""
+    slab, screen = '<scale x="5" y="5" z="0.2"/>', '<scale value="50"/><translate z="-1"/>'
+    scene = without_roulette(stage(slab=slab, screen=screen, fov=1e-3))
+    image, slopes = derivatives(scene, [GLASS], 64, step=0.01)
+
+    def T(eta):
+        return 2 * eta / (eta**2 + 1)
+
+    agree(image, 1 - T(IOR))
+    agree(slopes[GLASS], -difference(T, 0.01))
+    # The step's own error is 1e-5.
+    agree(slopes[GLASS], 0.236686, rounding=1e-4)
+
+
+# A slab of thickness 0.5 tilted by 45 degrees before a screen 100 away: it hides 1e-4 of the light from the screen.
+THICKNESS, TILT, FAR = 0.5, np.radians(45), 100
+SLAB = f'<scale x="1" y="1" z="{THICKNESS / 2}"/><rotate y="1" angle="45"/>'
+
+
+def shift(eta):
+    """Of what is seen through the tilted slab, and its derivative."""
+    s, c = np.sin(TILT), np.cos(TILT)
+    root = eta**2 - s**2
+    return THICKNESS * s * (1 - c / np.sqrt(root)), THICKNESS * s * c * eta / root**1.5
+
+
+def slab_reflectance(eta):
+    s, c = np.sin(TILT), np.cos(TILT)
+    c_t = np.sqrt(1 - (s / eta) ** 2)
+    return ((c - eta * c_t) ** 2 / (c + eta * c_t) ** 2 + (eta * c - c_t) ** 2 / (eta * c + c_t) ** 2) / 2
+
+
+def through_slab(eta, albedo):
+    """Radiance at depth 4: front reflection, one internal reflection, and what comes through from the screen."""
+    R = slab_reflectance(eta)
+    return R + R * (1 - R) ** 2 + (1 - R) ** 2 * albedo
+
+
+def ramp_image(eta):
+    return through_slab(eta, 0.5 - RAMP * shift(eta)[0])
+
+
+def test_oblique_slab_before_a_ramp(stage, derivatives, agree):
+    """The ramp shifts by d(eta) towards the side that the slab is turned to."""
+    scene = without_roulette(stage(slab=SLAB, screen=f'<translate z="{-FAR}"/>', picture="ramp", fov=1e-3, far=1e6), 4)
+    image, slopes = derivatives(scene, [GLASS], 256, step=0.02)
+    rounding = 3e-4  # what the slab hides, and the ulp of positions 100 away over the step
+    agree(image, ramp_image(IOR), rounding=rounding)
+    agree(slopes[GLASS], difference(ramp_image, 0.02), rounding=rounding, pixelwise=False)
+
+
+@pytest.fixture(scope="module")
+def edge_seen_through_a_slab(stage):
+    """The edge of the picture in the middle of the image. Returns the scene, and the image's width on the screen."""
+    fov = 0.1
+    # The eye is 4 from the slab, which is short against the way to the screen.
+    width = 2 * np.tan(np.radians(fov / 2)) * (FAR + 4)
+    at_edge = f'<translate x="{-shift(IOR)[0]}" z="{-FAR}"/>'
+    return without_roulette(stage(slab=SLAB, screen=at_edge, picture="edge", fov=fov), 4), width
+
+
+def edge_image(eta, width):
+    """Mean of the image: as the shift grows, more of the dark left side comes in."""
+    moved = shift(eta)[0] - shift(IOR)[0]
+    return through_slab(eta, (0.1 + 0.8) / 2 - 0.7 * moved / width)
+
+
+def test_oblique_slab_before_a_step_edge(edge_seen_through_a_slab, derivatives, agree):
+    """The edge term is there: a jump of 0.7, at the density 1 / width, moves with dd/deta."""
+    scene, width = edge_seen_through_a_slab
+    step = 0.02
+    image, slopes = derivatives(scene, [GLASS], 256, step=step)
+    edge = -0.7 / width * shift(IOR)[1] * (1 - slab_reflectance(IOR)) ** 2
+    exact = difference(lambda eta: edge_image(eta, width), step)
+    assert edge < -0.5 and abs(exact - edge) < 0.3 * abs(edge)
+    agree(image, edge_image(IOR, width), rounding=3e-4, pixelwise=False)
+    agree(slopes[GLASS], exact, rounding=1e-3, pixelwise=False)
+
+
+def test_attached_derivatives_know_no_edges(edge_seen_through_a_slab, derivatives, agree):
+    """They find the Fresnel terms alone; before a ramp they are right, without any step."""
+    scene, width = edge_seen_through_a_slab
+    image, slopes = derivatives(scene, [GLASS], 64, method="attached")
+    fresnel_alone = difference(lambda eta: through_slab(eta, 0.45), 1e-6)
+    agree(image, edge_image(IOR, width), rounding=3e-4, pixelwise=False)
+    agree(slopes[GLASS], fresnel_alone, rounding=1e-3, pixelwise=False)
+    ramp = named.put(scene, ("materials", "tables", 0, "textures", "bitmaps", "nearest"), jnp.asarray([False]))
+    texels = jnp.asarray(PICTURES["ramp"].reshape(-1, 3), jnp.float32)
+    ramp = named.put(ramp, ("materials", "tables", 0, "textures", "bitmaps", "texels"), texels)
+    _, slopes = derivatives(ramp, [GLASS], 64, method="attached")
+    # The screen is moved here so that the image's middle sees the ramp's.
+    exact = difference(lambda eta: through_slab(eta, 0.5 - RAMP * (shift(eta)[0] - shift(IOR)[0])), 1e-6)
+    agree(slopes[GLASS], exact, rounding=1e-3, pixelwise=False)
+
+
+# A ball of radius 0.1, seen from 4 away by a ray that meets it at a height of 0.002, and a screen 3 behind it.
+BALL, EYE, BEHIND, HEIGHT = 0.1, 4, 3, 0.002
+
+
+def focal_length(eta):
+    """And its derivative, -2 R at 1.5."""
+    return eta * BALL / (2 * (eta - 1)), -BALL / (2 * (eta - 1) ** 2)
+
+
+def seen_at(eta):
+    """Height on the screen, by the lens equation."""
+    return HEIGHT / EYE * (EYE + BEHIND - BEHIND * EYE / focal_length(eta)[0])
+
+
+def test_ball_lens_in_the_paraxial_limit(stage, derivatives, agree):
+    """Twice the ramp's height at +y, less that at -y: all that is the same on both sides drops out."""
+    f, df = focal_length(IOR)
+    assert df == pytest.approx(-2 * BALL)
+    half = 0.1
+    means = {}
+    for side in (1, -1):
+        scene = without_roulette(
+            stage(
+                ball=f'<scale value="{BALL}"/>',
+                screen=f'<scale value="{half}"/><translate z="{-BEHIND}"/>',
+                picture="ramp",
+                fov=1e-4,
+                target=f"{side * HEIGHT}, 0, 0",
+            ),
+            4,
+        )
+        means[side] = derivatives(scene, [GLASS], 256, step=0.02, first_seed=1 if side > 0 else 101)
+    image, slope = (
+        up._replace(mean=up.mean - down.mean, variance=up.variance + down.variance)
+        for up, down in ((means[1][0], means[-1][0]), (means[1][1][GLASS], means[-1][1][GLASS]))
+    )
+    light = 1 - (BALL / BEHIND) ** 2  # of the sky, what the ball leaves to the screen
+
+    def odd(eta):
+        return 2 * RAMP / half * seen_at(eta) * (1 - reflectance(eta)[0]) ** 2 * light
+
+    # Heights of 2 % of the radius are off by their square, times the order of 1.
+    agree(image, odd(IOR), rounding=2e-3, pixelwise=False)
+    agree(slope, difference(odd, 0.02), rounding=2e-3, pixelwise=False)
+    dy = HEIGHT / EYE * BEHIND * EYE / f**2 * df
+    R, dR = reflectance(IOR)
+    exact = 2 * RAMP / half * light * ((1 - R) ** 2 * dy - 2 * (1 - R) * dR * seen_at(IOR))
+    np.testing.assert_allclose(slope.mean.mean((0, 1)), exact, rtol=0.02)
+
+
+def test_motion_of_the_image_behind_a_ball_lens(stage):
+    """What chooses the step: pixels by which the image moves, from the same lens equation."""
+    scene = stage(
+        ball=f'<scale value="{BALL}"/>',
+        screen=f'<scale value="0.2"/><translate z="{-BEHIND}"/>',
+        fov=1e-4,
+        target=f"{HEIGHT}, 0, 0",
+    )
+    f, df = focal_length(IOR)
+    dy_deta = HEIGHT * BEHIND / f**2 * df
+    pixel = 2 * np.tan(np.radians(1e-4 / 2)) / 16
+    dy_dpixel = pixel * (EYE + BEHIND - BEHIND * EYE / f)
+    (motion,) = gradient._motions(replace(scene, about=None), jnp.asarray([0], jnp.int32))
+    assert float(motion) == pytest.approx(abs(dy_deta / dy_dpixel), rel=5e-3)
+
+
+def test_glass_of_ior_1(stage, derivatives, agree):
+    """Nothing is reflected and nothing bends, but what is seen through it is about to."""
+    scene = stage(ball="", screen=SCREEN, picture="checkerboard")
+    clear = pj.with_parameters(scene, {GLASS: 1.0})
+    image, slopes = derivatives(clear, [GLASS], 32, step=0.01)
+    bare, _ = derivatives(stage(screen=SCREEN, picture="checkerboard"), [GLASS], 32, step=0.01)
+    agree(image, bare, rounding=1e-4)
+    assert np.isfinite(slopes[GLASS].mean).all() and np.abs(slopes[GLASS].mean).max() > 0.5
+    # Reflection alone: R is even about 1 up to the third order, step^2 / 4.
+    mirror = pj.with_parameters(without_roulette(stage(ball="", fov=1e-3), 2), {GLASS: 1.0})
+    _, slopes = derivatives(mirror, [GLASS], step=0.01)
+    np.testing.assert_allclose(slopes[GLASS].mean, 0, atol=1e-4)
+    _, J = pj.jacobian(mirror, [GLASS], 4, method="attached")
+    np.testing.assert_allclose(J[GLASS], 0, atol=1e-6)
+    _, J = pj.jacobian(clear, [GLASS], 4, method="attached")
+    assert np.isfinite(J[GLASS]).all()
