@@ -213,15 +213,15 @@ def _pixel_jacobian(pixel_number, scene, choice, tangents, first_sample, spp, se
     dtype = scene.camera.origin.dtype
     n_glass = len(wanted.glass)
 
-    def sample(scene, number):
-        return pixel.sample(scene, choice, pixel_number, stream, number, strategy, derivative=True)
+    def sample(scene, number, derivative=False):
+        return pixel.sample(scene, choice, pixel_number, stream, number, strategy, derivative)
 
     def with_tangents(number):
         def of(tables):
             varied = scene
             for table_path, table in zip(_tables(wanted.colors), tables, strict=True):
                 varied = named.put(varied, table_path, table)
-            return sample(varied, number)
+            return sample(varied, number, derivative=True)
 
         def push(tangents):
             return jax.jvp(of, (tables,), (tangents,), has_aux=True)
