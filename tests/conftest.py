@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from pathjax import gradient
 from pathjax.film import image_shape, pixel_count
 from pathjax.io import mitsuba_xml
 from pathjax.render import _render_pixels
@@ -133,6 +134,44 @@ def kernel_of(shipped):
         numbers = (jnp.uint32(n) for n in (0, 1, 1))
         lowered = _render_pixels.lower(replace(scene, about=None), pixels, *numbers, strategy="mis")
         return Kernel(scene, lowered.compile())
+
+    return compile
+
+
+class JacobianKernel(NamedTuple):
+    """A shipped scene at 16 pixels wide, and its compiled kernel of image and derivatives."""
+
+    scene: pathjax.Scene
+    compiled: jax.stages.Compiled
+
+    def __call__(self, spp, seed=1, first_sample=0, step=0.02):
+        """Means of all pixels (N, 3), derivatives in colours (N, T, 3) and in IORs (N, G, 3), biases (N, G, 3)."""
+        pixels = jnp.arange(pixel_count(self.scene.film), dtype=jnp.int32)
+        numbers = (jnp.uint32(n) for n in (first_sample, spp, seed))
+        glass = self.compiled.in_avals[0][-1].shape
+        return jax.tree.map(
+            np.asarray, self.compiled(replace(self.scene, about=None), pixels, *numbers, jnp.full(glass, step))
+        )
+
+
+@pytest.fixture(scope="session")
+def jacobian_kernel_of(shipped):
+    """(name, which) -> JacobianKernel of all its "colours", of its "glass", or of "both"."""
+
+    @functools.cache
+    def compile(name, which):
+        scene = shipped(name, res=16)
+        parameters = scene.about.parameters.values()
+        glass = sorted({p.index[0] for p in parameters if gradient.is_glass(p)}) if which != "colours" else ()
+        colors = [(p.path, p.index) for p in parameters if not gradient.is_glass(p)] if which != "glass" else ()
+        wanted = gradient.Wanted(tuple(colors), tuple(glass), False)
+        pixels = jnp.arange(pixel_count(scene.film), dtype=jnp.int32)
+        numbers = (jnp.uint32(n) for n in (0, 1, 1))
+        steps = jnp.full(len(glass), 0.02)
+        lowered = gradient._jacobians.lower(
+            replace(scene, about=None), pixels, *numbers, steps, wanted=wanted, strategy="mis"
+        )
+        return JacobianKernel(scene, lowered.compile())
 
     return compile
 

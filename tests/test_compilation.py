@@ -77,6 +77,28 @@ def test_render_in_the_users_jit_is_one_native_kernel(shipped):
     assert_one_native_kernel(render.lower(jnp.float32(0.5)).compile())
 
 
+def kernels_of_derivatives():
+    """Quick: each kind once. Slow: all scenes."""
+    cases = []
+    for name in NAMES:
+        has_glass = "dielectric" in next(ROOT.glob(f"**/scenes/{name}.xml")).read_text()
+        for which in ("colours", "glass", "both") if has_glass else ("colours",):
+            quick = (name, which) in (("furnace", "colours"), ("glass_ball", "both"))
+            cases.append(pytest.param(name, which, marks=() if quick else pytest.mark.slow))
+    return cases
+
+
+@pytest.mark.parametrize("name, which", kernels_of_derivatives())
+def test_image_and_derivatives_are_one_native_kernel_and_finite(jacobian_kernel_of, name, which):
+    kernel = jacobian_kernel_of(name, which)
+    assert_one_native_kernel(kernel.compiled)
+    parts = kernel(spp=16)
+    assert all(np.isfinite(part).all() for part in parts)
+    _, colors, glass, _ = parts
+    # Nothing is constant in the picture, but what it does not show.
+    assert colors.size + glass.size > 0 and max(np.abs(x).max(initial=0) for x in (colors, glass)) > 1e-3
+
+
 # ---- nothing that the scene lacks -----------------------------------------------------------------------------------
 
 # Source files that the debug information of a lowered program names.
@@ -150,6 +172,17 @@ def test_other_values_never_compile_again(shipped, compilations):
         image = pj.render(changed, **({"spp": 2} | how))
         assert compilations.count == before, what
         assert not np.array_equal(image, base), what
+
+
+def test_a_sweep_over_32_iors_compiles_once(shipped, compilations):
+    """The kernel, and what chooses its step."""
+    scene = shipped("glass_ball", res=16)
+    sweep = [pj.with_parameters(scene, {"glass.int_ior": 1.1 + 0.03 * i}) for i in range(32)]
+    pj.jacobian(sweep[0], ["glass.int_ior"], 1)
+    before = compilations.count
+    slopes = [np.asarray(pj.jacobian(scene, ["glass.int_ior"], 1)[1]["glass.int_ior"]) for scene in sweep]
+    assert compilations.count == before
+    assert len({slope.tobytes() for slope in slopes}) == 32
 
 
 BALLS = """

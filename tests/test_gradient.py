@@ -1,15 +1,19 @@
 """Derivatives of images: against closed forms, against differences of independent images, and against each other."""
 
 from dataclasses import replace
+from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import pathjax as pj
 from pathjax import gradient, named
+from pathjax.film import pixel_count
 from pathjax.io.image import write_exr
 
+ROOT = Path(__file__).resolve().parents[1]
 NO_LIMIT = 1 << 30
 RHO = np.array([0.2, 0.5, 0.8])
 IOR = 1.5
@@ -91,12 +95,14 @@ def test_black_walls_and_dark_lamps_keep_their_derivatives(furnace, derivatives,
         agree(slopes["glow.radiance"], series(RHO, 6)[0])
 
 
-def test_emission_scales(shipped):
-    """The image is linear in each lamp and all of it comes from lamps: with s all radiances, s dI/ds = I."""
-    scene = shipped("nine_spheres", res=8)
-    light = pj.parameters(scene)["light.radiance"]
-    image, J = pj.jacobian(scene, ["light.radiance"], 16)
-    np.testing.assert_allclose(J["light.radiance"] @ light, image, rtol=1e-5, atol=1e-6)
+def test_emission_scales(furnace):
+    """The image is linear in its one light, sample by sample: s dI/ds = I."""
+    scene = pj.with_parameters(furnace, {"glow.radiance": [0.5, 2.0, 7.0]})
+    image, J = pj.jacobian(scene, FURNACE_NAMES, 16)
+    np.testing.assert_allclose(J["glow.radiance"] @ pj.parameters(scene)["glow.radiance"], image, rtol=1e-5)
+
+
+PLATE = "plate.reflectance"
 
 
 @pytest.fixture(scope="module")
@@ -232,7 +238,7 @@ def test_checkerboard_colours(shipped):
     h = 0.1
     for name in names[:2]:
         value = pj.parameters(scene)[name]
-        up, down = (pj.render(pj.with_parameters(scene, {name: value + s * h}), 16) for s in (1, -1))
+        up, down = (pj.jacobian(pj.with_parameters(scene, {name: value + s * h}), names, 16)[0] for s in (1, -1))
         slope = np.diagonal(J[name], axis1=-2, axis2=-1)
         assert slope.max() > 0.1
         np.testing.assert_allclose(slope, (up - down) / (2 * h), rtol=1e-4, atol=1e-5)
@@ -380,7 +386,7 @@ def ramp_image(eta):
 def test_oblique_slab_before_a_ramp(stage, derivatives, agree):
     """The ramp shifts by d(eta) towards the side that the slab is turned to."""
     scene = without_roulette(stage(slab=SLAB, screen=f'<translate z="{-FAR}"/>', picture="ramp", fov=1e-3, far=1e6), 4)
-    image, slopes = derivatives(scene, [GLASS], 256, step=0.02)
+    image, slopes = derivatives(scene, [GLASS], 64, step=0.02)
     rounding = 3e-4  # what the slab hides, and the ulp of positions 100 away over the step
     agree(image, ramp_image(IOR), rounding=rounding)
     agree(slopes[GLASS], difference(ramp_image, 0.02), rounding=rounding, pixelwise=False)
@@ -406,7 +412,7 @@ def test_oblique_slab_before_a_step_edge(edge_seen_through_a_slab, derivatives, 
     """The edge term is there: a jump of 0.7, at the density 1 / width, moves with dd/deta."""
     scene, width = edge_seen_through_a_slab
     step = 0.02
-    image, slopes = derivatives(scene, [GLASS], 256, step=step)
+    image, slopes = derivatives(scene, [GLASS], 64, step=step)
     edge = -0.7 / width * shift(IOR)[1] * (1 - slab_reflectance(IOR)) ** 2
     exact = difference(lambda eta: edge_image(eta, width), step)
     assert edge < -0.5 and abs(exact - edge) < 0.3 * abs(edge)
@@ -417,14 +423,14 @@ def test_oblique_slab_before_a_step_edge(edge_seen_through_a_slab, derivatives, 
 def test_attached_derivatives_know_no_edges(edge_seen_through_a_slab, derivatives, agree):
     """They find the Fresnel terms alone; before a ramp they are right, without any step."""
     scene, width = edge_seen_through_a_slab
-    image, slopes = derivatives(scene, [GLASS], 64, method="attached")
+    image, slopes = derivatives(scene, [GLASS], 32, method="attached")
     fresnel_alone = difference(lambda eta: through_slab(eta, 0.45), 1e-6)
     agree(image, edge_image(IOR, width), rounding=3e-4, pixelwise=False)
     agree(slopes[GLASS], fresnel_alone, rounding=1e-3, pixelwise=False)
     ramp = named.put(scene, ("materials", "tables", 0, "textures", "bitmaps", "nearest"), jnp.asarray([False]))
     texels = jnp.asarray(PICTURES["ramp"].reshape(-1, 3), jnp.float32)
     ramp = named.put(ramp, ("materials", "tables", 0, "textures", "bitmaps", "texels"), texels)
-    _, slopes = derivatives(ramp, [GLASS], 64, method="attached")
+    _, slopes = derivatives(ramp, [GLASS], 32, method="attached")
     # The screen is moved here so that the image's middle sees the ramp's.
     exact = difference(lambda eta: through_slab(eta, 0.5 - RAMP * (shift(eta)[0] - shift(IOR)[0])), 1e-6)
     agree(slopes[GLASS], exact, rounding=1e-3, pixelwise=False)
@@ -461,7 +467,7 @@ def test_ball_lens_in_the_paraxial_limit(stage, derivatives, agree):
             ),
             4,
         )
-        means[side] = derivatives(scene, [GLASS], 256, step=0.02, first_seed=1 if side > 0 else 101)
+        means[side] = derivatives(scene, [GLASS], 64, step=0.02, first_seed=1 if side > 0 else 101)
     image, slope = (
         up._replace(mean=up.mean - down.mean, variance=up.variance + down.variance)
         for up, down in ((means[1][0], means[-1][0]), (means[1][1][GLASS], means[-1][1][GLASS]))
@@ -480,6 +486,7 @@ def test_ball_lens_in_the_paraxial_limit(stage, derivatives, agree):
     np.testing.assert_allclose(slope.mean.mean((0, 1)), exact, rtol=0.02)
 
 
+@pytest.mark.slow
 def test_motion_of_the_image_behind_a_ball_lens(stage):
     """What chooses the step: pixels by which the image moves, from the same lens equation."""
     scene = stage(
@@ -512,3 +519,343 @@ def test_glass_of_ior_1(stage, derivatives, agree):
     np.testing.assert_allclose(J[GLASS], 0, atol=1e-6)
     _, J = pj.jacobian(clear, [GLASS], 4, method="attached")
     assert np.isfinite(J[GLASS]).all()
+
+
+# ---- glass: against independent images ------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def ball_before_checkerboard(stage):
+    """The unit ball at the origin, the eye at z = 4, the checkerboard at z = -3."""
+    return stage(ball="", screen=SCREEN, picture="checkerboard")
+
+
+def rendered_difference(estimate, scene, name, step, spp, count):
+    """Estimate of the central difference of images that share no random number."""
+    value = pj.parameters(scene)[name]
+    up, down = (
+        estimate(pj.with_parameters(scene, {name: value + sign * step}), spp, count, first_seed=first)
+        for sign, first in ((1, 1001), (-1, 2001))
+    )
+    return up._replace(
+        mean=(up.mean - down.mean) / (2 * step), variance=(up.variance + down.variance) / (2 * step) ** 2
+    )
+
+
+def test_ball_before_checkerboard(ball_before_checkerboard, derivatives, estimate, agree):
+    """Pixel by pixel against differences of independent plain images."""
+    scene, step = ball_before_checkerboard, 0.02
+    _, slopes = derivatives(scene, [GLASS], 64, step=step)
+    reference = rendered_difference(estimate, scene, GLASS, step, 512, 16)
+    agree(slopes[GLASS], reference, rounding=1e-4)
+    z = (slopes[GLASS].mean - reference.mean) / np.sqrt(slopes[GLASS].variance + reference.variance + 1e-12)
+    # Variances of 16 seeds widen z^2 to (15 / 13); pixels that see no glass have none.
+    touched = reference.variance[..., 0] > 1e-6
+    assert np.mean(z[touched] ** 2) <= 1.5
+    # What is compared is there to be seen.
+    assert np.sqrt(np.mean(slopes[GLASS].mean ** 2)) > 5 * np.sqrt(np.mean(slopes[GLASS].variance))
+
+
+def test_exterior_ior_is_the_same_derivative_scaled(ball_before_checkerboard):
+    """Only the ratio counts: dI/dext = -(int / ext) dI/dint / 1, sample by sample."""
+    outside = 1.2
+    scene = pj.with_parameters(ball_before_checkerboard, {"glass.ext_ior": outside})
+    _, J = pj.jacobian(scene, [GLASS, "glass.ext_ior"], 8, step=0.01)
+    assert np.abs(J[GLASS]).max() > 0.5
+    np.testing.assert_allclose(J["glass.ext_ior"], -IOR / outside * J[GLASS], rtol=1e-6)
+    np.testing.assert_allclose(J.bias["glass.ext_ior"], -IOR / outside * J.bias[GLASS], rtol=1e-6)
+    assert set(J.step) == {GLASS, "glass.ext_ior"} and float(J.step[GLASS]) == pytest.approx(0.01)
+
+
+def test_estimated_bias_is_that_of_the_step(stage, derivatives, agree):
+    """Through a slab before a ramp, where closed forms know both: derivative - bias is right to a higher order."""
+    scene = without_roulette(stage(ball="", fov=1e-3), 2)
+    step = 0.2
+    biases = []
+    for seed in range(1, 17):
+        _, J = pj.jacobian(scene, [GLASS], 256, seed, step=step)
+        biases.append(np.asarray(J.bias[GLASS]).mean())
+    wanted = (difference(lambda e: reflectance(e)[0], 2 * step) - difference(lambda e: reflectance(e)[0], step)) / 3
+    error = np.std(biases, ddof=1) / 4
+    assert abs(np.mean(biases) - wanted) < 4.5 * error
+    assert error < 0.3 * abs(wanted)
+
+
+def test_roulette_changes_no_derivative_of_glass(ball_before_checkerboard, derivatives, agree):
+    few = replace(ball_before_checkerboard, rr_depth=jnp.int32(1))
+    off = replace(ball_before_checkerboard, rr_depth=jnp.int32(NO_LIMIT))
+    (image, slopes), (other_image, others) = (
+        derivatives(scene, [GLASS], 64, step=0.02, first_seed=first) for scene, first in ((few, 1), (off, 101))
+    )
+    agree(image, other_image)
+    agree(slopes[GLASS], others[GLASS])
+
+
+# ---- jacobian and render --------------------------------------------------------------------------------------------
+
+
+def test_image_is_that_of_render(ball_before_checkerboard, plane):
+    """With the same seed, to rounding; so a fit sees what a render shows."""
+    for scene, names, how in ((ball_before_checkerboard, [GLASS], {"step": 0.01}), (plane, [PLATE], {})):
+        image, J = pj.jacobian(scene, names, 16, 7, **how)
+        np.testing.assert_allclose(image, pj.render(scene, 16, 7), rtol=1e-5, atol=1e-6)
+        assert set(J) == J.keys() == set(names) and len(J) == len(names)
+        assert {name: value.shape for name, value in J.items()} == {
+            name: (*image.shape, *pj.parameters(scene)[name].shape) for name in names
+        }
+
+
+# Every transformation compiles anew: the plane does so fastest.
+
+
+@pytest.fixture(scope="module")
+def dim_plane(plane):
+    """Whose sky may vary too."""
+    return pj.with_parameters(plane, {"sky.radiance": [0.5, 1.0, 2.0]})
+
+
+def plane_image(scene):
+    def image(albedo, radiance):
+        return pj.render(pj.with_parameters(scene, {PLATE: albedo, "sky.radiance": radiance}), 2)
+
+    return image
+
+
+def assert_adjoint(f, at):
+    rng = np.random.default_rng(5)
+    image, J = jax.linearize(f, *at)
+    _, transpose = jax.vjp(f, *at)
+    for _ in range(3):
+        u = [jnp.asarray(rng.normal(size=x.shape), jnp.float32) for x in at]
+        v = jnp.asarray(rng.normal(size=image.shape), jnp.float32)
+        Ju = np.asarray(J(*u), float)
+        left = np.vdot(np.asarray(v, float), Ju)
+        right = sum(np.vdot(np.asarray(a, float), np.asarray(b, float)) for a, b in zip(transpose(v), u, strict=True))
+        scale = np.linalg.norm(v) * np.linalg.norm(Ju)
+        assert scale > 0.1
+        # Sums of some 1000 products in float32.
+        assert abs(left - right) < 1e-5 * scale
+
+
+def test_adjoint_is_the_transpose(dim_plane):
+    """<v, J u> = <J'v, u>, through jvp and vjp of render, for any u and v."""
+    parameters = pj.parameters(dim_plane)
+    assert_adjoint(plane_image(dim_plane), (parameters[PLATE], parameters["sky.radiance"]))
+
+
+@pytest.mark.slow
+def test_adjoint_is_the_transpose_for_glass(ball_before_checkerboard):
+    def image(ior, radiance):
+        return pj.render(pj.with_parameters(ball_before_checkerboard, {GLASS: ior, "sky.radiance": radiance}), 4)
+
+    assert_adjoint(image, (jnp.float32(IOR), jnp.ones(3)))
+
+
+def test_every_transformation_gives_the_jacobian(dim_plane):
+    """jvp, linearize, jacfwd, vjp, and grad in a user's own jit."""
+    f = plane_image(dim_plane)
+    at = pj.parameters(dim_plane)[PLATE], pj.parameters(dim_plane)["sky.radiance"]
+    _, J = pj.jacobian(dim_plane, [PLATE, "sky.radiance"], 2)
+    wanted = J[PLATE], J["sky.radiance"]
+    direction = jnp.asarray([0.3, -0.2, 0.5]), jnp.asarray([1.0, 2.0, -1.0])
+    along = sum(d @ u for d, u in zip(wanted, direction, strict=True))
+    v = jnp.linspace(-1, 1, 8 * 8 * 3).reshape(8, 8, 3)
+    back = [jnp.einsum("hwc,hwck->k", v, d) for d in wanted]
+    close = {"rtol": 1e-5, "atol": 1e-6}
+    np.testing.assert_allclose(jax.jvp(f, at, direction)[1], along, **close)
+    np.testing.assert_allclose(jax.linearize(f, *at)[1](*direction), along, **close)
+    for mine, its in zip(wanted, jax.jacfwd(f, (0, 1))(*at), strict=True):
+        np.testing.assert_allclose(its, mine, **close)
+    for mine, its in zip(back, jax.vjp(f, *at)[1](v), strict=True):
+        np.testing.assert_allclose(its, mine, **close)
+    for mine, its in zip(back, jax.jit(jax.grad(lambda a, b: jnp.vdot(v, f(a, b)), (0, 1)))(*at), strict=True):
+        np.testing.assert_allclose(its, mine, **close)
+
+
+def test_jacobian_inside_the_users_jit(dim_plane):
+    def weighted(albedo):
+        scene = pj.with_parameters(dim_plane, {PLATE: albedo})
+        image, J = pj.jacobian(scene, [PLATE], 2)
+        return image, J[PLATE]
+
+    albedo = pj.parameters(dim_plane)[PLATE] * 0.9
+    for a, b in zip(jax.jit(weighted)(albedo), weighted(albedo), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-6)
+
+
+# ---- vmap -----------------------------------------------------------------------------------------------------------
+
+
+def test_batches_of_parameters_equal_single_calls(dim_plane):
+    albedos = jnp.asarray([[0.1, 0.2, 0.3], [0.9, 0.5, 0.4], [0.0, 0.6, 1.0]])
+
+    def image(albedo):
+        return pj.render(pj.with_parameters(dim_plane, {PLATE: albedo}), 2)
+
+    def derivative(albedo):
+        image, J = pj.jacobian(pj.with_parameters(dim_plane, {PLATE: albedo}), [PLATE], 2)
+        return image, J[PLATE]
+
+    images, (same, slopes) = jax.vmap(image)(albedos), jax.vmap(derivative)(albedos)
+    for i, albedo in enumerate(albedos):
+        np.testing.assert_allclose(images[i], image(albedo), rtol=1e-6)
+        np.testing.assert_allclose(same[i], image(albedo), rtol=1e-6)
+        np.testing.assert_allclose(slopes[i], derivative(albedo)[1], rtol=1e-6)
+
+
+def test_batches_of_cameras_equal_single_calls(dim_plane):
+    origins = jnp.asarray([[0.0, 0.0, 4.0], [1.0, 0.5, 6.0]])  # the second sees past the plate
+
+    def seen_from(origin):
+        return replace(dim_plane, camera=replace(dim_plane.camera, origin=origin))
+
+    def derivative(origin):
+        image, J = pj.jacobian(seen_from(origin), [PLATE], 2)
+        return image, J[PLATE]
+
+    images, slopes = jax.vmap(derivative)(origins)
+    assert not np.array_equal(images[0], images[1])
+    for i, origin in enumerate(origins):
+        np.testing.assert_allclose(images[i], pj.render(seen_from(origin), 2), rtol=1e-6)
+        np.testing.assert_allclose(slopes[i], derivative(origin)[1], rtol=1e-6)
+
+
+@pytest.mark.slow
+def test_batches_of_iors_equal_single_calls(ball_before_checkerboard):
+    def derivative(ior):
+        scene = pj.with_parameters(ball_before_checkerboard, {GLASS: ior})
+        image, J = pj.jacobian(scene, [GLASS], 4)
+        return image, J[GLASS], J.step[GLASS]
+
+    iors = jnp.asarray([1.3, 1.5, 1.9])
+    batched = jax.vmap(derivative)(iors)
+    for i, ior in enumerate(iors):
+        for a, b in zip(batched, derivative(ior), strict=True):
+            # Another order of operations may turn a path at an edge.
+            assert np.mean(np.abs(a[i] - b) > 1e-4 * (1 + np.abs(b))) < 2e-3
+
+
+# ---- devices --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.skipif(len(jax.local_devices()) < 2, reason="needs two devices")
+@pytest.mark.parametrize("kind", ["colours", pytest.param("glass", marks=pytest.mark.slow)])
+def test_jacobian_is_the_same_to_the_bit_on_every_number_of_devices(plane, ball_before_checkerboard, kind):
+    scene, names = (plane, [PLATE]) if kind == "colours" else (ball_before_checkerboard, [GLASS])
+    wanted = {name: named.find(scene, name) for name in names}
+    pixels = jnp.arange(pixel_count(scene.film), dtype=jnp.int32)
+    one, all_of_them = (
+        gradient.pixel_jacobians(
+            scene, wanted, pixels, 0, 4, 1, strategy="mis", method="difference", step=0.01, **devices
+        )
+        for devices in ({"devices": 1}, {})
+    )
+    jax.tree.map(np.testing.assert_array_equal, one, all_of_them)
+
+
+# ---- what is refused ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "names, how, message",
+    [
+        (["plate.reflectanse"], {}, "plate.reflectanse.*did you mean plate.reflectance"),
+        (PLATE, {}, r"write \['plate.reflectance'\]"),
+        ([PLATE], {"method": "automatic"}, "method 'automatic' is unknown; use one of difference, attached"),
+        ([PLATE], {"step": 0}, "step = 0"),
+        ([PLATE], {"step": -0.01}, "step = -0.01"),
+        ([PLATE], {"step": 1.5}, "step = 1.5"),
+        ([PLATE], {"step": float("nan")}, "step = nan"),
+        ([PLATE], {"strategy": "mix"}, "strategy 'mix'"),
+        ([PLATE], {"spp": 0}, "spp = 0"),
+        ([PLATE], {"seed": -1}, "seed = -1"),
+    ],
+)
+def test_wrong_arguments_are_refused(plane, names, how, message):
+    with pytest.raises(pj.InputError, match=message):
+        pj.jacobian(plane, names, **how)
+
+
+def test_bitmaps_are_refused_by_name(stage):
+    with pytest.raises(pj.InputError, match="screen.reflectance is a bitmap"):
+        pj.jacobian(stage(), ["screen.reflectance"])
+
+
+def test_scenes_without_names_are_refused(plane):
+    with pytest.raises(pj.InputError, match="stripped of its names"):
+        pj.jacobian(replace(plane, about=None), [PLATE])
+
+
+def moved_camera(scene, x):
+    return replace(scene, camera=replace(scene.camera, origin=scene.camera.origin + x))
+
+
+def moved_plate(scene, x):
+    return named.put(scene, ("geometry", "tables", 0, "frames"), scene.geometry.tables[0].frames + x)
+
+
+@pytest.mark.parametrize("move, place", [(moved_camera, "camera.origin"), (moved_plate, "geometry.tables.0.frames")])
+@pytest.mark.parametrize("transform", [jax.jacfwd, lambda f: jax.grad(lambda x: jnp.sum(f(x)))])
+def test_derivatives_of_geometry_and_cameras_are_refused(plane, move, place, transform):
+    with pytest.raises(pj.InputError, match=f"scene.{place}"):
+        transform(lambda x: pj.render(move(plane, x), 1))(0.0)
+
+
+# ---- at length ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_ball_before_checkerboard_in_blocks(stage, derivatives, estimate):
+    """64 x 64 pixels in blocks of 8 x 8, against differences of independent images: mean z^2 is 1 but for its noise."""
+    scene, step = stage(ball="", screen=SCREEN, picture="checkerboard", res=64), 0.01
+    _, slopes = derivatives(scene, [GLASS], 64, 32, step=step)
+    reference = rendered_difference(estimate, scene, GLASS, step, 1024, 32)
+
+    def blocks(x, power):
+        return x.reshape(8, 8, 8, 8, 3).sum((1, 3)) / 64**power
+
+    difference = blocks(slopes[GLASS].mean - reference.mean, 1)
+    variance = blocks(slopes[GLASS].variance + reference.variance, 2)
+    touched = variance[..., 0] > 1e-7
+    assert touched.sum() > 20
+    z2 = difference[touched] ** 2 / variance[touched]
+    assert z2.mean() <= 1.5
+
+
+SCENES = sorted(path.stem for folder in ("scenes", "tests/scenes") for path in (ROOT / folder).glob("*.xml"))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SCENES)
+def test_colours_of_every_scene_against_differences(shipped, derivatives, agree, name):
+    """Every colour of every material and light: against central differences of plain images with the same seeds.
+
+    Without roulette, which depends on the colours. A light's power also changes how often it is chosen, so these
+    differences have some noise; all others are polynomials in the colour, of third order here.
+    """
+    scene = without_roulette(shipped(name, res=16), 4)
+    names = [n for n in pj.parameters(scene) if not n.endswith("_ior")]
+    spp, count = 16, 8
+    _, slopes = derivatives(scene, names, spp, count)
+    for parameter in names:
+        value = np.asarray(pj.parameters(scene)[parameter])
+        low, high = named.find(scene, parameter).bounds
+        middle = np.clip(value, low + 0.02, high - 0.02)
+        if not np.array_equal(middle, value):
+            # At a bound there is no room to both sides.
+            moved = pj.with_parameters(scene, {parameter: middle})
+            _, moved_slopes = derivatives(moved, names, spp, count)
+            slope = moved_slopes[parameter]
+        else:
+            slope = slopes[parameter]
+        difference = []
+        for seed in range(1, count + 1):
+            up, down = (
+                np.asarray(pj.render(pj.with_parameters(scene, {parameter: middle + sign * 0.02}), spp, seed), float)
+                for sign in (1, -1)
+            )
+            difference.append((up - down) / 0.04)
+        difference = np.asarray(difference)
+        other = slope._replace(mean=difference.mean(0), variance=difference.var(0, ddof=1) / count)
+        # Rounding of images over twice the step, and the third order.
+        agree(slope, other, rounding=2e-3)
