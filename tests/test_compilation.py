@@ -10,6 +10,7 @@ import pytest
 
 import pathjax as pj
 from pathjax import query, runtime
+from pathjax.film import pixel_count
 from pathjax.render import _render_pixels
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -97,6 +98,15 @@ def test_image_and_derivatives_are_one_native_kernel_and_finite(jacobian_kernel_
     _, colors, glass, _ = parts
     # Nothing is constant in the picture, but what it does not show.
     assert colors.size + glass.size > 0 and max(np.abs(x).max(initial=0) for x in (colors, glass)) > 1e-3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", NAMES)
+def test_no_derivative_of_a_million_paths_is_nan(jacobian_kernel_of, name):
+    which = "both" if any(case.values == (name, "both") for case in kernels_of_derivatives()) else "colours"
+    kernel = jacobian_kernel_of(name, which)
+    parts = kernel(spp=10**6 // pixel_count(kernel.scene.film), seed=2)
+    assert all(np.isfinite(part).all() for part in parts)
 
 
 # ---- nothing that the scene lacks -----------------------------------------------------------------------------------
