@@ -68,6 +68,15 @@ def test_closed_diffuse_sphere_per_sample(furnace, derivatives, depth):
         np.testing.assert_allclose(estimate.mean, np.broadcast_to(exact, (8, 8, 3)), rtol=2e-6)
 
 
+def test_many_samples_keep_their_digits(furnace):
+    """Every sample is the same number, so plain float32 sums would all round one way: by 1 % after a million."""
+    scene = without_roulette(furnace, 2)
+    _, J = pj.jacobian(scene, FURNACE_NAMES, 1 << 16, strategy="bsdf")
+    L, dL = series(RHO, 2)
+    np.testing.assert_allclose(J["glow.radiance"], np.broadcast_to(np.diag(L), (8, 8, 3, 3)), rtol=2e-6)
+    np.testing.assert_allclose(J["wall.reflectance"], np.broadcast_to(np.diag(dL), (8, 8, 3, 3)), rtol=2e-6)
+
+
 @pytest.mark.parametrize("strategy", ["mis", "light", "bsdf"])
 def test_strategies_agree_with_the_closed_form(furnace, derivatives, agree, strategy):
     """At depth 6, with roulette from the second vertex on and without."""
