@@ -221,15 +221,15 @@ def _pixel_jacobian(pixel_number, scene, choice, tangents, first_sample, spp, se
     dtype = scene.camera.origin.dtype
     n_glass = len(wanted.glass)
 
-    def sample(scene, number):
-        return pixel.sample(scene, choice, pixel_number, stream, number, strategy, derivative=True)
+    def sample(scene, number, derivative=False):
+        return pixel.sample(scene, choice, pixel_number, stream, number, strategy, derivative)
 
     def with_tangents(number):
         def of(tables):
             varied = scene
             for table_path, table in zip(_tables(wanted.colors), tables, strict=True):
                 varied = named.put(varied, table_path, table)
-            return sample(varied, number)
+            return sample(varied, number, derivative=True)
 
         def push(tangents):
             return jax.jvp(of, (tables,), (tangents,), has_aux=True)
@@ -267,22 +267,18 @@ def _pixel_jacobian(pixel_number, scene, choice, tangents, first_sample, spp, se
         return lax.fori_loop(0, n_glass, of_row, (zero, zero))
 
     def add(i, state):
-        total, d_colors, d_glass, bias = state
         number = first_sample + i.astype(jnp.uint32)
         if wanted.colors:
-            L, dL, met = with_tangents(number)
-            d_colors = d_colors + dL
+            L, d_colors, met = with_tangents(number)
         else:
-            L, met = sample(scene, number)
-        if wanted.glass:
-            quotient, its_bias = differences(number, met)
-            d_glass, bias = d_glass + quotient, bias + its_bias
-        return pixel.add_compensated(total, L), d_colors, d_glass, bias
+            (L, met), d_colors = sample(scene, number), no_colors
+        d_glass, bias = differences(number, met) if wanted.glass else (no_glass, no_glass)
+        return [pixel.add_compensated(*pair) for pair in zip(state, (L, d_colors, d_glass, bias), strict=True)]
 
-    zero = jnp.zeros((3,), dtype)
-    zeros = jnp.zeros((len(wanted.colors), 3), dtype), jnp.zeros((n_glass, 3), dtype), jnp.zeros((n_glass, 3), dtype)
-    (total, _), *sums = lax.fori_loop(0, spp.astype(jnp.int32), add, ((zero, zero), *zeros))
-    return tuple(x / spp.astype(dtype) for x in (total, *sums))
+    no_colors, no_glass = jnp.zeros((len(wanted.colors), 3), dtype), jnp.zeros((n_glass, 3), dtype)
+    start = [(zero, zero) for zero in (jnp.zeros((3,), dtype), no_colors, no_glass, no_glass)]
+    sums = lax.fori_loop(0, spp.astype(jnp.int32), add, start)
+    return tuple(total / spp.astype(dtype) for total, _ in sums)
 
 
 # ---- step of the differences ---------------------------------------------------------------------------------------

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from pathjax import gradient
 from pathjax.film import image_shape, pixel_count
 from pathjax.io import mitsuba_xml
 from pathjax.render import _render_pixels
@@ -137,6 +138,44 @@ def kernel_of(shipped):
     return compile
 
 
+class JacobianKernel(NamedTuple):
+    """A shipped scene at 16 pixels wide, and its compiled kernel of image and derivatives."""
+
+    scene: pathjax.Scene
+    compiled: jax.stages.Compiled
+
+    def __call__(self, spp, seed=1, first_sample=0, step=0.02):
+        """Means of all pixels (N, 3), derivatives in colours (N, T, 3) and in IORs (N, G, 3), biases (N, G, 3)."""
+        pixels = jnp.arange(pixel_count(self.scene.film), dtype=jnp.int32)
+        numbers = (jnp.uint32(n) for n in (first_sample, spp, seed))
+        glass = self.compiled.in_avals[0][-1].shape
+        return jax.tree.map(
+            np.asarray, self.compiled(replace(self.scene, about=None), pixels, *numbers, jnp.full(glass, step))
+        )
+
+
+@pytest.fixture(scope="session")
+def jacobian_kernel_of(shipped):
+    """(name, which) -> JacobianKernel of all its "colours", of its "glass", or of "both"."""
+
+    @functools.cache
+    def compile(name, which):
+        scene = shipped(name, res=16)
+        parameters = scene.about.parameters.values()
+        glass = sorted({p.index[0] for p in parameters if gradient.is_glass(p)}) if which != "colours" else ()
+        colors = [(p.path, p.index) for p in parameters if not gradient.is_glass(p)] if which != "glass" else ()
+        wanted = gradient.Wanted(tuple(colors), tuple(glass), False)
+        pixels = jnp.arange(pixel_count(scene.film), dtype=jnp.int32)
+        numbers = (jnp.uint32(n) for n in (0, 1, 1))
+        steps = jnp.full(len(glass), 0.02)
+        lowered = gradient._jacobians.lower(
+            replace(scene, about=None), pixels, *numbers, steps, wanted=wanted, strategy="mis"
+        )
+        return JacobianKernel(scene, lowered.compile())
+
+    return compile
+
+
 # ---- statistics -----------------------------------------------------------------------------------------------------
 
 
@@ -171,6 +210,30 @@ def estimate():
         return estimate_of([np.asarray(pathjax.render(scene, spp, seed, strategy)) * scale for seed in seeds])
 
     return render
+
+
+@pytest.fixture(scope="session")
+def derivatives():
+    """(scene, names, spp, count, **how of `jacobian`) -> Estimates over `count` seeds: of the image, and by name of the
+    derivative; for a colour that in the same channel, the others being 0.
+    """
+
+    def diagonal(derivative):
+        if derivative.ndim == 3:
+            return derivative
+        assert not derivative[..., ~np.eye(3, dtype=bool)].any()
+        return np.diagonal(derivative, axis1=-2, axis2=-1)
+
+    def estimates(scene, names, spp=16, count=16, first_seed=1, **how):
+        images, slopes = [], {name: [] for name in names}
+        for seed in range(first_seed, first_seed + count):
+            image, J = pathjax.jacobian(scene, names, spp, seed, **how)
+            images.append(np.asarray(image))
+            for name in names:
+                slopes[name].append(diagonal(np.asarray(J[name])))
+        return estimate_of(images), {name: estimate_of(values) for name, values in slopes.items()}
+
+    return estimates
 
 
 @pytest.fixture(scope="session")

@@ -10,6 +10,7 @@ import pytest
 
 import pathjax as pj
 from pathjax import query, runtime
+from pathjax.film import pixel_count
 from pathjax.render import _render_pixels
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -75,6 +76,37 @@ def test_render_in_the_users_jit_is_one_native_kernel(shipped):
     scene = shipped("cornell_box", res=16)
     render = jax.jit(lambda r: pj.render(pj.with_parameters(scene, {"white.reflectance": r}), 4))
     assert_one_native_kernel(render.lower(jnp.float32(0.5)).compile())
+
+
+def kernels_of_derivatives():
+    """Quick: each kind once. Slow: all scenes."""
+    cases = []
+    for name in NAMES:
+        has_glass = "dielectric" in next(ROOT.glob(f"**/scenes/{name}.xml")).read_text()
+        for which in ("colours", "glass", "both") if has_glass else ("colours",):
+            quick = (name, which) in (("furnace", "colours"), ("glass_ball", "both"))
+            cases.append(pytest.param(name, which, marks=() if quick else pytest.mark.slow))
+    return cases
+
+
+@pytest.mark.parametrize("name, which", kernels_of_derivatives())
+def test_image_and_derivatives_are_one_native_kernel_and_finite(jacobian_kernel_of, name, which):
+    kernel = jacobian_kernel_of(name, which)
+    assert_one_native_kernel(kernel.compiled)
+    parts = kernel(spp=16)
+    assert all(np.isfinite(part).all() for part in parts)
+    _, colors, glass, _ = parts
+    # Nothing is constant in the picture, but what it does not show.
+    assert colors.size + glass.size > 0 and max(np.abs(x).max(initial=0) for x in (colors, glass)) > 1e-3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", NAMES)
+def test_no_derivative_of_a_million_paths_is_nan(jacobian_kernel_of, name):
+    which = "both" if any(case.values == (name, "both") for case in kernels_of_derivatives()) else "colours"
+    kernel = jacobian_kernel_of(name, which)
+    parts = kernel(spp=10**6 // pixel_count(kernel.scene.film), seed=2)
+    assert all(np.isfinite(part).all() for part in parts)
 
 
 # ---- nothing that the scene lacks -----------------------------------------------------------------------------------
@@ -150,6 +182,17 @@ def test_other_values_never_compile_again(shipped, compilations):
         image = pj.render(changed, **({"spp": 2} | how))
         assert compilations.count == before, what
         assert not np.array_equal(image, base), what
+
+
+def test_a_sweep_over_32_iors_compiles_once(shipped, compilations):
+    """The kernel, and what chooses its step."""
+    scene = shipped("glass_ball", res=16)
+    sweep = [pj.with_parameters(scene, {"glass.int_ior": 1.1 + 0.03 * i}) for i in range(32)]
+    pj.jacobian(sweep[0], ["glass.int_ior"], 1)
+    before = compilations.count
+    slopes = [np.asarray(pj.jacobian(scene, ["glass.int_ior"], 1)[1]["glass.int_ior"]) for scene in sweep]
+    assert compilations.count == before
+    assert len({slope.tobytes() for slope in slopes}) == 32
 
 
 BALLS = """

@@ -124,6 +124,33 @@ def test_dielectric_derivatives_are_the_analytic_ones(x64):
         np.testing.assert_allclose(slopes, [r.imag / step for r in exact], rtol=1e-8, atol=1e-12)
 
 
+def test_derivative_at_normal_incidence():
+    eta = np.float32([1.0, 1.33, 1.5, 2.419, 1 / 1.5])
+    slope = jax.jit(jax.vmap(jax.grad(lambda e: fresnel.dielectric(jnp.ones_like(e), e)[0])))(eta)
+    exact = 4 * (eta - 1.0) / (eta + 1.0) ** 3
+    np.testing.assert_allclose(slope, exact, rtol=1e-5, atol=1e-7)
+    assert slope[2] == pytest.approx(0.128)
+
+
+@pytest.mark.parametrize("eta", [1 / 1.33, 1 / 1.5, 1 / 2.419])
+def test_derivatives_around_the_critical_angle(x64, eta):
+    """1e-3 rad before it they are large and right; 1e-3 rad beyond it reflection is total and stays so."""
+    critical = np.arcsin(eta)
+    gradient = jax.jit(jax.grad(lambda c, e: fresnel.dielectric(c, e)[0], (0, 1)))
+    cos_i = np.cos(critical - 1e-3)
+    step = 1e-30
+    exact = [exact_dielectric(cos_i + 1j * step, eta).imag / step, exact_dielectric(cos_i, eta + 1j * step).imag / step]
+    slopes = gradient(cos_i, eta)
+    np.testing.assert_allclose(slopes, exact, rtol=1e-8)
+    assert abs(slopes[1]) > 10
+    # In float32 the small cos_t^2 keeps its digits up to a rounding of the cosine over it.
+    rounded = np.float32([cos_i, eta]).astype(float)
+    exact = exact_dielectric(rounded[0], rounded[1] + 1j * step).imag / step
+    slope = jax.jit(jax.grad(lambda e, c: fresnel.dielectric(c, e)[0]))(np.float32(eta), np.float32(cos_i))
+    np.testing.assert_allclose(slope, exact, rtol=1e-3)
+    assert gradient(np.cos(critical + 1e-3), eta) == (0, 0)
+
+
 def test_dielectric_derivatives_are_finite_everywhere():
     cos_i, eta = [], []
     for e in [*ETAS, 1.0, np.nextafter(np.float32(1), 0), np.nextafter(np.float32(1), 2), 1e-3, 1e3]:
