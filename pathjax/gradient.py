@@ -131,6 +131,8 @@ def pixel_jacobians(
     glass = () if attached else tuple(rows)
     static = Wanted(tuple((wanted[name].path, wanted[name].index) for name in colors), glass, attached and bool(rows))
     scene = replace(scene, about=None)
+    if rows:
+        scene = _differentiated_once(scene)
     if static.attached:
         scene = _choosing_by(scene, rows)
     steps = _steps(scene, glass, step)
@@ -149,6 +151,16 @@ def pixel_jacobians(
             derivatives[name], biases[name] = by_ior[:, place] * scale, bias[:, place] * scale
             used[name] = steps[place]
     return image, derivatives, biases, used
+
+
+@jax.custom_jvp
+def _differentiated_once(scene):
+    return scene
+
+
+@partial(_differentiated_once.defjvp, symbolic_zeros=True)
+def _refuse(primals, tangents):
+    raise InputError("second derivatives are not supported where the IOR of smooth glass is differentiated")
 
 
 def is_glass(parameter: Parameter) -> bool:
@@ -238,7 +250,7 @@ def _pixel_jacobian(pixel_number, scene, choice, tangents, first_sample, spp, se
 
     def differences(number, met):
         """Of one path (G, 3): difference quotients, and what a second step says of their bias."""
-        twice = (pixel_number.astype(jnp.uint32) + number) % RICHARDSON_EVERY == 0
+        twice = sampler.combine(stream, number) % RICHARDSON_EVERY == 0
         rows = jnp.asarray(wanted.glass, jnp.int32)
         _, table = _dielectrics(scene)
 
@@ -291,12 +303,13 @@ def _steps(scene, rows, step):
     """(G,) steps of the relative IOR."""
     _, table = _dielectrics(scene) if rows else (None, None)
     dtype = scene.camera.origin.dtype
-    if step is not None:
-        return jnp.full((len(rows),), step, dtype)
     if not rows:
         return jnp.zeros((0,), dtype)
     rows = jnp.asarray(rows, jnp.int32)
     ratio = (table.int_ior / table.ext_ior)[rows]
+    if step is not None:
+        # Twice the step must leave a positive IOR.
+        return jnp.minimum(jnp.asarray(step, dtype), 0.4 * ratio)
     motion = _motions(scene, rows)
     wished = STEP_PIXELS / jnp.where(motion > 0, motion, 1)
     # Glass that no pilot saw (small, or met after a diffuse bounce) gets a step in the middle of the range.

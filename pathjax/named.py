@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import difflib
+import weakref
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import jax
@@ -31,20 +32,20 @@ class Parameter:
 
 @dataclass(frozen=True, eq=False)
 class About:
-    """What people ask of a scene and kernels do not: names, the file, reports. Compared by identity of the scene."""
+    """What people ask of a scene and kernels do not: names, the file, reports. Equal where it is of one file's scene."""
 
     description: desc.Description
     parameters: Mapping[str, Parameter]
     trees: Mapping[str, Tree]  # kind of shape -> its hierarchy, for reports
-    # Parameters that hold traced values: what a derivative may be wanted for. Tables hold many parameters, and a
-    # derivative costs time for each.
-    traced: frozenset[str] = frozenset()
+    # Of tables that `with_parameters` made: a weak reference to the array, and which of its parameters are traced.
+    # Tables hold many parameters, and a derivative costs time for each that may be wanted.
+    traced: Mapping[tuple, tuple[weakref.ref, frozenset[str]]] = field(default_factory=dict)
 
     def __eq__(self, other):
-        return isinstance(other, About) and self.parameters is other.parameters and self.traced == other.traced
+        return isinstance(other, About) and self.parameters is other.parameters
 
     def __hash__(self):
-        return hash((id(self.parameters), self.traced))
+        return id(self.parameters)
 
 
 def parameters(scene: Scene) -> dict[str, jax.Array]:
@@ -61,18 +62,27 @@ def with_parameters(scene: Scene, values: Mapping) -> Scene:
         InputError: unknown name, wrong shape, or a value outside the parameter's bounds.
     """
     known = about(scene)
-    traced = set(known.traced)
+    traced = dict(known.traced)
     for name, value in values.items():
         parameter = find(scene, name)
         array = get(scene, parameter.path)
         value = checked(name, value, parameter, array.dtype)
-        if isinstance(array, jax.core.Tracer) and not traced & set(at_path(known, parameter.path)):
-            # Traced by someone else, who may differentiate in any of the table.
-            traced.update(at_path(known, parameter.path))
+        names = traced_in(scene, parameter.path) if isinstance(array, jax.core.Tracer) else frozenset()
         if isinstance(value, jax.core.Tracer):
-            traced.add(name)
-        scene = put(scene, parameter.path, array.at[parameter.index].set(value))
-    return replace(scene, about=replace(known, traced=frozenset(traced)))
+            names |= {name}
+        array = array.at[parameter.index].set(value)
+        traced[parameter.path] = weakref.ref(array), names
+        scene = replace(put(scene, parameter.path, array), about=replace(known, traced=traced))
+    return scene
+
+
+def traced_in(scene: Scene, path) -> frozenset[str]:
+    """Names of the parameters of a table that may hold traced values: all, unless `with_parameters` made the table."""
+    known = about(scene)
+    made, names = known.traced.get(path, (lambda: None, frozenset()))
+    if made() is get(scene, path):
+        return names
+    return frozenset(name for name, parameter in known.parameters.items() if parameter.path == path)
 
 
 def about(scene: Scene) -> About:
@@ -105,11 +115,6 @@ def _textured(description: desc.Description) -> set[str]:
         for bsdf in sides
         if isinstance(bsdf, desc.Diffuse) and isinstance(bsdf.reflectance, desc.Bitmap)
     }
-
-
-def at_path(known: About, path) -> list[str]:
-    """Names of the parameters that one table holds."""
-    return [name for name, parameter in known.parameters.items() if parameter.path == path]
 
 
 def _offer(near, parameters):

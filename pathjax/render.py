@@ -12,7 +12,7 @@ from jax.custom_derivatives import SymbolicZero
 from pathjax import emitters, film, gradient, named
 from pathjax.errors import InputError
 from pathjax.integrators import path, pixel
-from pathjax.named import About
+from pathjax.named import Parameter
 from pathjax.runtime import native_map
 from pathjax.scene import Scene
 
@@ -46,13 +46,13 @@ def render_pixels(scene: Scene, pixels, first_sample, spp, seed, strategy: str =
     """
     path.check_sampling(strategy, spp, seed)
     numbers = (jnp.asarray(x, jnp.uint32) for x in (first_sample, spp, seed))
-    static = _Static(scene.about, strategy, tuple(how.items()))
+    static = _Static(_differentiable(scene), strategy, tuple(how.items()))
     return _means(static, replace(scene, about=None), pixels, *numbers)
 
 
 @dataclass(frozen=True)
 class _Static:
-    about: About | None
+    wanted: tuple[tuple[str, Parameter], ...]  # parameters in which a derivative may be wanted
     strategy: str
     how: tuple[tuple[str, object], ...]
 
@@ -67,7 +67,7 @@ def _means_jvp(static: _Static, primals, tangents):
     """Tangent J @ d(parameters): linear, so that it also transposes."""
     scene, *arguments = primals
     scene_tangent, *_ = tangents
-    wanted = _differentiated(static.about, scene_tangent)
+    wanted = _differentiated(static.wanted, scene_tangent)
     image, derivatives, _, _ = gradient.pixel_jacobians(
         scene, wanted, *arguments, strategy=static.strategy, method="difference", step=None, **dict(static.how)
     )
@@ -78,7 +78,16 @@ def _means_jvp(static: _Static, primals, tangents):
     return image, tangent
 
 
-def _differentiated(about: About | None, scene_tangent):
+def _differentiable(scene: Scene):
+    """Parameters that may be traced, by name."""
+    if scene.about is None:
+        return ()
+    parameters = scene.about.parameters
+    names = frozenset().union(*(named.traced_in(scene, path) for path in {p.path for p in parameters.values()}))
+    return tuple((name, parameters[name]) for name in parameters if name in names)
+
+
+def _differentiated(candidates, scene_tangent):
     """Parameters by name whose tangents may be other than zero."""
     leaves, _ = jax.tree_util.tree_flatten_with_path(scene_tangent, is_leaf=lambda x: isinstance(x, SymbolicZero))
     wanted = {}
@@ -86,16 +95,14 @@ def _differentiated(about: About | None, scene_tangent):
         if isinstance(leaf, SymbolicZero):
             continue
         place = tuple(key.name if isinstance(key, jax.tree_util.GetAttrKey) else key.idx for key in keys)
-        names = [] if about is None else [name for name, p in about.parameters.items() if p.path == place]
-        if not names:
-            where = ".".join(map(str, place))
-            reason = "the scene was stripped of its names" if about is None else "pathjax does not differentiate in it"
+        held = {name: parameter for name, parameter in candidates if parameter.path == place}
+        if not held:
             raise InputError(
-                f"a derivative in scene.{where} was asked for, and {reason}; set named parameters by with_parameters "
-                "and differentiate in their values (`pathjax info` lists them)"
+                f"a derivative in scene.{'.'.join(map(str, place))} was asked for, and pathjax does not differentiate in "
+                "it; set named parameters by with_parameters and differentiate in their values (`pathjax info` lists "
+                "them)"
             )
-        chosen = [name for name in names if name in about.traced] or names
-        wanted.update((name, about.parameters[name]) for name in chosen)
+        wanted |= held
     return wanted
 
 
