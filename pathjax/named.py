@@ -32,7 +32,7 @@ class Parameter:
 
 @dataclass(frozen=True, eq=False)
 class About:
-    """What people ask of a scene and kernels do not: names, the file, reports. Equal where it is of one file's scene."""
+    """What people ask of a scene and kernels do not: names, the file, reports. Equal for scenes of one loading."""
 
     description: desc.Description
     parameters: Mapping[str, Parameter]

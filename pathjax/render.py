@@ -98,9 +98,9 @@ def _differentiated(candidates, scene_tangent):
         held = {name: parameter for name, parameter in candidates if parameter.path == place}
         if not held:
             raise InputError(
-                f"a derivative in scene.{'.'.join(map(str, place))} was asked for, and pathjax does not differentiate in "
-                "it; set named parameters by with_parameters and differentiate in their values (`pathjax info` lists "
-                "them)"
+                f"a derivative in scene.{'.'.join(map(str, place))} was asked for, and pathjax does not differentiate "
+                "in it; set named parameters by with_parameters and differentiate in their values (`pathjax info` "
+                "lists them)"
             )
         wanted |= held
     return wanted
