@@ -58,7 +58,9 @@ def solve(evidence: Evidence, weights, scale, free) -> Solution:
     a, b = jacobians @ vectors
     by_pixel = np.einsum("pci,pci,pc->pi", a, b, weights)
     noise = by_pixel.std(0) * np.sqrt(len(by_pixel))
-    significant = curvature > MIN_SIGNIFICANCE * noise
+    # Columns that are the same up to the rounding of float32 leave a curvature of its square.
+    rounding = curvature.max() * (10 * np.finfo(np.float32).eps) ** 2
+    significant = curvature > np.maximum(MIN_SIGNIFICANCE * noise, rounding)
     # Pixels are independent: their scatter is that of the score, with target, renders and Jacobians (White 1980).
     along = evidence.scores(weights, np) @ vectors
     spread = along - along.mean(0)
