@@ -17,7 +17,7 @@ from pathjax.scene import Scene
 # Chance that a right derivative is called wrong.
 FALSE_ALARM = 1e-3
 # Reach of the differences in colours, relative to the value or range.
-_REACH = 0.2
+_REACH = 0.1
 
 
 @dataclass

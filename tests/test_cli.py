@@ -12,7 +12,7 @@ import pytest
 
 import pathjax as pj
 from pathjax import cli
-from pathjax.io.image import linear_to_srgb, read_exr
+from pathjax.io.image import linear_to_srgb, read_exr, write_exr
 
 FURNACE = "scenes/furnace.xml"
 SMALL = ("-D", "res=8")
@@ -251,6 +251,58 @@ def test_help_is_no_error(run):
     status, out, _ = run("render", "--help")
     assert status == 0
     assert "--spp" in out and "--set" in out
+
+
+# ---- fit ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def target(tmp_path):
+    """The furnace's image, of another albedo than its file's."""
+    scene = pj.with_parameters(pj.load_scene(FURNACE, res=8), {"wall.reflectance": [0.3, 0.5, 0.7]})
+    image = np.asarray(pj.render(scene, 256, seed=1))
+    write_exr(tmp_path / "target.exr", {c: image[..., i] for i, c in enumerate("RGB")}, {})
+    return tmp_path / "target.exr"
+
+
+def test_fit_prints_a_table_and_writes_its_files(run, target, tmp_path):
+    status, out, err = run("fit", FURNACE, target, *SMALL, "--param", "wall.reflectance=0.6", "-o", tmp_path / "f")
+    assert status == 0
+    assert all(f"wall.reflectance.{c}" in out and "+-" in out for c in "rgb")
+    facts = json.loads((tmp_path / "f.json").read_text())
+    assert facts["converged"] and facts["values"].keys() == {"wall.reflectance"}
+    z = (np.array(facts["values"]["wall.reflectance"]) - [0.3, 0.5, 0.7]) / facts["standard_errors"]["wall.reflectance"]
+    assert np.abs(z).max() < 4.5
+    assert (tmp_path / "f.png").stat().st_size > 0
+
+
+def test_fit_as_json(run, target, tmp_path):
+    status, out, _ = run(
+        "fit", FURNACE, target, *SMALL, "--param", "wall.reflectance", "--spp", "16", "-o", tmp_path / "f", "--json"
+    )
+    assert status == 0
+    assert json.loads(out) == json.loads((tmp_path / "f.json").read_text())
+
+
+@pytest.mark.parametrize(
+    "arguments, says",
+    [
+        (["--param", "wal.reflectance"], ["wal.reflectance", "did you mean wall.reflectance"]),
+        (["--param", "wall.reflectance=2"], ["wall.reflectance", "outside its bounds"]),
+        (["--param", "wall.reflectance=red"], ["--param", "a value is a number"]),
+        (["--param", "wall.reflectance", "-D", "res=9"], ["(8, 8, 3)", "(9, 9, 3)"]),
+        ([], ["--param"]),
+    ],
+)
+def test_fits_that_cannot_be(refused, target, tmp_path, arguments, says):
+    refused("fit", FURNACE, target, *SMALL, *arguments, "-o", tmp_path / "f", says=says)
+
+
+def test_fit_without_a_target_or_a_folder(refused, target, tmp_path):
+    param = ["--param", "wall.reflectance"]
+    absent = tmp_path / "none.exr"
+    refused("fit", FURNACE, absent, *SMALL, *param, "-o", tmp_path / "f", says=["none.exr", "no such file"])
+    refused("fit", FURNACE, target, *SMALL, *param, "-o", tmp_path / "none" / "f", says=["there is no folder"])
 
 
 # ---- info -----------------------------------------------------------------------------------------------------------
