@@ -1,10 +1,8 @@
 """pathjax: a differentiable Monte Carlo path tracer in pure JAX."""
 
 from pathjax import runtime as _runtime  # noqa: F401  first: sets XLA up before a backend starts
-from pathjax.check import GradientCheck, check_gradient
 from pathjax.errors import InputError
 from pathjax.gradient import Jacobian, jacobian
-from pathjax.inverse import Fit, fit
 from pathjax.named import parameters, with_parameters
 from pathjax.query import closest_hit
 from pathjax.render import render
@@ -39,3 +37,16 @@ def load_scene(file, **parameters) -> Scene:
     from pathjax.io import mitsuba_xml
 
     return scene.build(mitsuba_xml.load(file, **parameters))
+
+
+def __getattr__(name):
+    # What needs optimistix or scipy.stats, half a second of imports, is loaded when it is asked for.
+    if name in ("Fit", "fit"):
+        from pathjax import inverse
+
+        return getattr(inverse, name)
+    if name in ("GradientCheck", "check_gradient"):
+        from pathjax import check
+
+        return getattr(check, name)
+    raise AttributeError(f"module 'pathjax' has no attribute {name!r}")

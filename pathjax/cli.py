@@ -252,6 +252,7 @@ def _fit(options) -> int:
 
     from pathjax import inverse
     from pathjax.inverse import report
+    from pathjax.inverse.fitting import step_text
     from pathjax.io import image as files
     from pathjax.io.files import write_text
 
@@ -270,8 +271,7 @@ def _fit(options) -> int:
     with console.status("compiling") as status:
 
         def show(entry):
-            values = "  ".join(f"{name} {value:.4g}" for name, value in entry["values"].items())
-            status.update(f"{entry['stage']}, {entry['spp']} spp: {values}")
+            status.update(step_text(entry))
 
         fit = inverse.fit(scene, target, names, start=start, spp=options.spp, seed=options.seed, progress=show)
     facts = {"scene": str(options.scene), "target": str(options.target), "spp": options.spp, "seed": options.seed}

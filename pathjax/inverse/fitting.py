@@ -12,6 +12,7 @@ large either. Newton's method finds its root; its scatter over the pixels, which
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -92,7 +93,7 @@ def fit(
     seed: int = 0,
     solver=None,
     scan: bool = True,
-    progress: Callable[[dict], None] | None = None,
+    progress: bool | Callable[[dict], None] = False,
 ) -> Fit:
     """Find parameters with which the scene looks like the target.
 
@@ -105,7 +106,7 @@ def fit(
         spp: samples per pixel of each of the two independent renders of the last stage.
         solver: an optimistix least-squares solver or minimiser for the approach; default: LevenbergMarquardt.
         scan: try indices of refraction over their whole range first, since a local method finds the nearest minimum.
-        progress: called with each entry of the history.
+        progress: True for a line on stderr at each step, or a function that is called with each entry of the history.
     Returns:
         Fit. Ctrl-C ends it with what it has, marked as not converged.
     Raises:
@@ -123,7 +124,19 @@ def fit(
     solver = solver or optx.LevenbergMarquardt(rtol=1e-4, atol=1e-4)
     if not isinstance(solver, optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser):
         raise InputError(f"{type(solver).__name__} is no least-squares solver or minimiser of optimistix")
+    if progress is True:
+        progress = _tell
     return _Run(problem.build(scene, target, names, start or {}), spp, seed, solver, progress).run(scan)
+
+
+def step_text(entry: dict) -> str:
+    """One line for an entry of the history."""
+    values = "  ".join(f"{label} {value:.4g}" for label, value in entry["values"].items())
+    return f"{entry['stage']}, {entry['spp']} spp: {values}"
+
+
+def _tell(entry: dict) -> None:
+    print(step_text(entry), file=sys.stderr)
 
 
 # ---- what is compiled ----------------------------------------------------------------------------------------------
