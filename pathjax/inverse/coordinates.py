@@ -60,11 +60,11 @@ class Coordinates:
         return jnp.concatenate(parts, axis=-1)
 
     def bounded(self, x):
-        """Unbounded (n,) to values: logistic between two bounds, exponential above one."""
+        """Unbounded (n,) to values: logistic between two bounds; above one, exponential where small, else linear."""
         low, high = (jnp.asarray(b, x.dtype) for b in self.bounds.T)
         two = jnp.isfinite(high)
         width = jnp.where(two, high - low, 1)
-        return low + jnp.where(two, width * jax.nn.sigmoid(x), jnp.exp(jnp.where(two, 0, x)))
+        return low + jnp.where(two, width * jax.nn.sigmoid(x), jax.nn.softplus(jnp.where(two, 0, x)))
 
     def unbounded(self, v) -> np.ndarray:
         """Inverse of `bounded`; values at a bound are taken a little inside."""
@@ -72,7 +72,7 @@ class Coordinates:
         two = np.isfinite(high)
         width = np.where(two, high - low, 1)
         share = np.clip((v - low) / width, _EDGE, np.where(two, 1 - _EDGE, np.inf))
-        return np.where(two, np.log(share) - np.log1p(-np.where(two, share, 0)), np.log(share))
+        return np.where(two, np.log(share) - np.log1p(-np.where(two, share, 0)), share + np.log(-np.expm1(-share)))
 
     def scale(self, v) -> np.ndarray:
         """(n,) what counts as a large change: the range between two bounds, else the value itself."""

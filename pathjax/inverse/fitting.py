@@ -36,13 +36,15 @@ from pathjax.scene import Scene
 
 # Samples per pixel of the approach. Newton's method begins with a part of the samples that `fit` is given.
 APPROACH_SPP, COARSE_PART = 16, 4
-MAX_STEPS, MAX_REJECTED, MAX_NEWTON_STEPS = 30, 6, 8
+MAX_STEPS, MAX_REJECTED, MAX_NEWTON_STEPS = 30, 3, 8
 # Newton's method ends with a step below this part of the standard errors, and takes none beyond this part of the scale.
 SMALL_STEP, LARGE_STEP = 0.3, 0.3
 # Samples per pixel of each of the two renders that tell how noisy every pixel is.
 NOISE_SPP = 8
 # Variances are floored at this part of their mean, so that no pixel weighs beyond measure.
 NOISE_FLOOR = 0.05
+# What float32 leaves of the mean of a pixel; scenes without noise are fitted to that.
+ROUNDING = 1e-5
 # Relative indices of refraction to try before a local method begins, from almost none to diamond's; a few at a time.
 SCAN, SCAN_SPP, SCAN_CHUNK = np.geomspace(1.02, 2.6, 64), 4, 16
 SCAN_CANDIDATES = 3
@@ -148,7 +150,7 @@ def _residuals(x, arguments, coordinates):
     values = coordinates.unpack(coordinates.bounded(x))
     parts = []
     for views, weight in zip(groups, weights, strict=True):
-        images = views.map(partial(_image, views=views, values=values, spp=spp), views.seeds(seed, draw))
+        images = views.map(partial(_image, views=views, values=values, spp=spp), views.seeds(seed, draw, 0))
         parts.append(((images - views.targets) * jnp.sqrt(weight)).ravel())
     r = jnp.concatenate(parts)
     return r, jnp.sum(r * r) / 2
@@ -195,7 +197,7 @@ def _evidence(v, groups, spp, seed, draw, coordinates) -> Evidence:
             image, J = jacobian(views.with_values(scene, values), views.names, spp, seed)
             return image, coordinates.columns(J, image.shape)
 
-        seeds = jnp.stack([views.seeds(seed, 2 * draw), views.seeds(seed, 2 * draw + 1)])
+        seeds = jnp.stack([views.seeds(seed, draw, half) for half in (0, 1)])
         images, columns = jax.vmap(partial(views.map, image_and_columns))(seeds)
         parts.append(((images - views.targets).reshape(2, -1, 3), columns.reshape(2, -1, *columns.shape[-2:])))
     residuals, jacobians = (jnp.concatenate(part, axis=1) for part in zip(*parts, strict=True))
@@ -210,7 +212,7 @@ def _misfits(candidates, arguments, coordinates):
         values = coordinates.unpack(v)
         total = 0.0
         for views, weight in zip(groups, weights, strict=True):
-            images = views.map(partial(_image, views=views, values=values, spp=spp), views.seeds(seed, draw))
+            images = views.map(partial(_image, views=views, values=values, spp=spp), views.seeds(seed, draw, 0))
             total = total + jnp.sum(weight * (images - views.targets) ** 2)
         return total
 
@@ -289,13 +291,13 @@ class _Run:
             self._weigh()
             self._approach_with(min(APPROACH_SPP, self.spp))
             self._weigh()
-            share, significance = self._structure()
+            share, structured = self._structure()
             if best is None or share < best[0]:
                 best = share, self.v
-            if not _structured(share, significance):
+            if not structured:
                 break
-        self.v = best[1]
-        if len(candidates) > 1:
+        if self.v is not best[1]:
+            self.v = best[1]
             self._weigh()
         return self._refined()
 
@@ -303,8 +305,11 @@ class _Run:
 
     def _approach_with(self, spp):
         x = jnp.asarray(self.coordinates.unbounded(self.v), self.dtype)
-        # In units of the noise at this level.
-        weights = [weight * (spp / NOISE_SPP) for weight in self.weights]
+        # In units of the noise at this level; but a start far off is no more than 1 on average, since the first steps
+        # of solvers suppose numbers of that size.
+        squares = self._flat_weights() * self.evidence.residuals[0] ** 2
+        shrink = 1 / max(1, float(squares.mean()) * spp / NOISE_SPP)
+        weights = [weight * (shrink * spp / NOISE_SPP) for weight in self.weights]
         arguments = self.groups, weights, jnp.uint32(spp), self.seed, self._next_draw()
         if self._approach is None:
             least_squares = isinstance(self.solver, optx.AbstractLeastSquaresSolver)
@@ -315,7 +320,7 @@ class _Run:
         lowest, rejected = np.inf, 0
         for _ in range(MAX_STEPS):
             x, state, loss, done = self._approach.step(x, state, arguments)
-            loss = float(loss)
+            loss = float(loss) / shrink
             self.v = np.asarray(self.coordinates.bounded(x), float)
             self._record("approach", spp, loss)
             # The solver tells the loss one step late, and the same one again after a step that it took back. A step
@@ -343,8 +348,8 @@ class _Run:
         # Where a bound holds a component, the curvature still says how well it is known.
         everything = np.ones(self.n, bool)
         self.solution = uncertainty.solve(self.evidence, self._flat_weights(), self.scale, everything)
-        share, significance = self._structure()
-        if _structured(share, significance):
+        share, structured = self._structure()
+        if structured:
             return False, (
                 f"the residuals have structure: neighbouring pixels share {share:.0%} of their variance. This is a "
                 "local minimum, or the scene cannot look like the target; try other starts, and look at the residuals"
@@ -392,10 +397,12 @@ class _Run:
         self._newton_step(zero, self.v, scale, nowhere, NOISE_SPP, self._next_draw())
         a, b = self.evidence.residuals
         weights = []
-        for images in self._by_view((a - b) ** 2 / 2):
-            variance = ndimage.uniform_filter(images.mean(-1, keepdims=True), (3, 3, 1))
-            floor = NOISE_FLOOR * variance.mean() + np.finfo(self.dtype).tiny
-            weights.append(np.broadcast_to(1 / (variance + floor), images.shape))
+        targets = self._by_view(self._flat_targets())
+        brightness = max(np.mean([target.mean() for target in targets]), np.finfo(np.float32).tiny ** 0.25)
+        for squares in self._by_view((a - b) ** 2 / 2):
+            variance = ndimage.uniform_filter(squares.mean(-1, keepdims=True), (3, 3, 1))
+            floor = NOISE_FLOOR * variance.mean() + (ROUNDING * brightness) ** 2
+            weights.append(np.broadcast_to(1 / (variance + floor), squares.shape))
         self.weights = [jnp.asarray(np.stack([weights[i] for i in views.numbers]), self.dtype) for views in self.groups]
 
     # ---- scan: where a local method should begin --------------------------------------------------------------------
@@ -480,8 +487,13 @@ class _Run:
         return (self._flat_weights() * a * b).sum() / 2
 
     def _structure(self):
+        """Share of the residuals' variance that neighbouring pixels have in common, and whether that is no chance."""
         pairs = [np.stack(pair) for pair in zip(*map(self._by_view, self.evidence.residuals), strict=True)]
-        return uncertainty.structure(pairs, self._by_view(self._flat_weights()))
+        share, significance = uncertainty.structure(pairs, self._by_view(self._flat_weights()))
+        rms = np.sqrt(np.mean(self.evidence.residuals.mean(0) ** 2))
+        more_than_rounding = rms > ROUNDING * self._flat_targets().mean()
+        certain = share > uncertainty.STRUCTURE_SHARE and significance > uncertainty.STRUCTURE_SIGNIFICANCE
+        return share, certain and more_than_rounding
 
     def _result(self, converged, message) -> Fit:
         labels, values = self.coordinates.labels, self.coordinates.unpack(self.v)
@@ -525,7 +537,3 @@ class _Run:
 
     def _flat_targets(self):
         return np.concatenate([np.asarray(views.targets).reshape(-1, 3) for views in self.groups])
-
-
-def _structured(share, significance):
-    return share > uncertainty.STRUCTURE_SHARE and significance > uncertainty.STRUCTURE_SIGNIFICANCE

@@ -36,9 +36,12 @@ class Views:
 
         return jax.vmap(one)([leaf for leaf, axis in zip(leaves, self.axes, strict=True) if axis == 0], seeds)
 
-    def seeds(self, seed, draw):
-        """(V,) uint32, others for every draw; their upper bit keeps them apart from any seed that a user can give."""
-        mixed = (seed * jnp.uint32(4099) + draw) * jnp.uint32(2053) + jnp.asarray(self.numbers, jnp.uint32)
+    def seeds(self, seed, draw, half: int):
+        """(V,) uint32 of one of two independent halves, others for every draw.
+
+        Their upper bit keeps them apart from any seed that a user can give.
+        """
+        mixed = (seed * jnp.uint32(4099) + 2 * draw + half) * jnp.uint32(2053) + jnp.asarray(self.numbers, jnp.uint32)
         return mixed | jnp.uint32(1 << 31)
 
     def with_values(self, scene: Scene, values) -> Scene:

@@ -147,6 +147,16 @@ def test_an_interrupted_fit_returns_what_it_has(room, target):
     report.text(fit), json.dumps(report.facts(fit), allow_nan=False)
 
 
+@pytest.mark.parametrize("start", [0.0, 7.0])
+def test_a_scene_without_noise_is_fitted_to_rounding(make_scene, start):
+    body = """<shape type="rectangle"><emitter type="area" id="lamp"><rgb name="radiance" value="2, 0.5, 1"/></emitter>
+</shape>"""
+    scene = make_scene(body, res=4, depth=1, fov=20)
+    fit = pj.fit(scene, np.broadcast_to([2.0, 0.5, 1.0], (4, 4, 3)), ["lamp.radiance"], start={"lamp.radiance": start})
+    assert fit.converged
+    np.testing.assert_allclose(fit.values["lamp.radiance"], [2, 0.5, 1], rtol=1e-5)
+
+
 def test_a_scene_that_cannot_look_like_its_target_is_told(room, target):
     fit = pj.fit(room, target[::-1], NAMES, start=START, spp=32)
     assert not fit.converged and "structure" in fit.message
