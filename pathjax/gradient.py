@@ -12,6 +12,7 @@ moving geometry or cameras.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -24,7 +25,7 @@ from pathjax import bsdfs, emitters, film, named
 from pathjax.bsdfs import DielectricTable
 from pathjax.camera import sample_ray
 from pathjax.core import sampler
-from pathjax.core.math import at, dot, frame_from_normal, safe_divide, spawn_ray, to_local, to_world
+from pathjax.core.math import at, dot, safe_divide, spawn_ray, to_world
 from pathjax.errors import InputError
 from pathjax.integrators import path, pixel
 from pathjax.named import Parameter
@@ -43,8 +44,8 @@ MIN_STEP, MAX_STEP = 2e-4, 0.03
 
 
 @jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class Jacobian:
+@dataclass(frozen=True, eq=False)
+class Jacobian(Mapping):
     """Derivatives of an image by the names of parameters: `J[name]` is (H, W, 3, *shape of the parameter).
 
     bias: of those that are differences, an estimate of derivative minus truth (H, W, 3) from a second step; noisy in a
@@ -65,12 +66,6 @@ class Jacobian:
     def __len__(self):
         return len(self.derivatives)
 
-    def keys(self):
-        return self.derivatives.keys()
-
-    def items(self):
-        return self.derivatives.items()
-
 
 @dataclass(frozen=True)
 class Wanted:
@@ -78,7 +73,6 @@ class Wanted:
 
     colors: tuple[tuple[tuple, tuple], ...]  # path and index of each entry that gets a tangent
     glass: tuple[int, ...]  # rows of the dielectrics that get a difference
-    attached: bool  # rows of glass are among `colors`, and move the path
 
 
 def jacobian(scene: Scene, names, spp: int = 64, seed: int = 0, *, strategy="mis", method="difference", step=None):
@@ -129,11 +123,11 @@ def pixel_jacobians(
     colors = [name for name, p in wanted.items() if attached or not is_glass(p)]
     rows = sorted({p.index[0] for p in wanted.values() if is_glass(p)})
     glass = () if attached else tuple(rows)
-    static = Wanted(tuple((wanted[name].path, wanted[name].index) for name in colors), glass, attached and bool(rows))
+    static = Wanted(tuple((wanted[name].path, wanted[name].index) for name in colors), glass)
     scene = replace(scene, about=None)
     if rows:
         scene = _differentiated_once(scene)
-    if static.attached:
+    if attached and rows:
         scene = _choosing_by(scene, rows)
     steps = _steps(scene, glass, step)
     numbers = (jnp.asarray(x, jnp.uint32) for x in (first_sample, spp, seed))
@@ -233,15 +227,17 @@ def _pixel_jacobian(pixel_number, scene, choice, tangents, first_sample, spp, se
     dtype = scene.camera.origin.dtype
     n_glass = len(wanted.glass)
 
-    def sample(scene, number, derivative=False):
-        return pixel.sample(scene, choice, pixel_number, stream, number, strategy, derivative)
+    def sample(scene, number, **how):
+        return pixel.sample(scene, choice, pixel_number, stream, number, strategy, **how)
+
+    watch = bool(wanted.glass)
 
     def with_tangents(number):
         def of(tables):
             varied = scene
             for table_path, table in zip(_tables(wanted.colors), tables, strict=True):
                 varied = named.put(varied, table_path, table)
-            return sample(varied, number, derivative=True)
+            return sample(varied, number, derivative=True, watch_glass=watch)
 
         def push(tangents):
             return jax.jvp(of, (tables,), (tangents,), has_aux=True)
@@ -283,7 +279,7 @@ def _pixel_jacobian(pixel_number, scene, choice, tangents, first_sample, spp, se
         if wanted.colors:
             L, d_colors, met = with_tangents(number)
         else:
-            (L, met), d_colors = sample(scene, number), no_colors
+            (L, met), d_colors = sample(scene, number, watch_glass=watch), no_colors
         d_glass, bias = differences(number, met) if wanted.glass else (no_glass, no_glass)
         return [pixel.add_compensated(*pair) for pair in zip(state, (L, d_colors, d_glass, bias), strict=True)]
 
@@ -349,17 +345,12 @@ def _motion(pixel_number, scene, row):
             hit = geometry.closest_hit(scene.geometry, ray)
             found = hit.primitive >= 0
             surface = geometry.surface(scene.geometry, ray, hit)
-            frame = frame_from_normal(surface.shading_n)
-            wi = to_local(frame, -ray.d)
-            kind, at_row = bsdfs.select(materials, hit.shape, wi[2] > 0)
-            glass = bsdfs.is_two_sided_medium(materials, kind)
-            side = jnp.where(glass | (wi[2] > 0), 1, -1).astype(wi.dtype)
-            wi = wi.at[2].multiply(side)
+            frame, wi, kind, at_row = path.shading(materials, ray, hit, surface)
             drawn = bsdfs.sample(materials, kind, at_row, surface.uv, wi, jnp.full_like(half, 1 - 2**-24))
-            d = to_world(frame, drawn.wo.at[2].multiply(side))
+            d = to_world(frame, drawn.wo)
             on = found & drawn.delta & (kind >= 0)
             end = jnp.where(found, surface.p, ray.d)
-            met = met | (found & glass & (at_row == row))
+            met = met | (found & bsdfs.is_glass(materials, kind) & (at_row == row))
             return spawn_ray(surface, d, hit.primitive), end, met, depth + 1, on
 
         start = ray, ray.o, jnp.bool_(False), jnp.int32(0), jnp.bool_(True)

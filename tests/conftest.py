@@ -164,7 +164,7 @@ def jacobian_kernel_of(shipped):
         parameters = scene.about.parameters.values()
         glass = sorted({p.index[0] for p in parameters if gradient.is_glass(p)}) if which != "colours" else ()
         colors = [(p.path, p.index) for p in parameters if not gradient.is_glass(p)] if which != "glass" else ()
-        wanted = gradient.Wanted(tuple(colors), tuple(glass), False)
+        wanted = gradient.Wanted(tuple(colors), tuple(glass))
         pixels = jnp.arange(pixel_count(scene.film), dtype=jnp.int32)
         numbers = (jnp.uint32(n) for n in (0, 1, 1))
         steps = jnp.full(len(glass), 0.02)

@@ -35,6 +35,11 @@ def any_smooth(materials: Materials) -> bool:
     return any(MODULES[type(table)].SMOOTH for table in materials.tables)
 
 
+def any_glass(materials: Materials) -> bool:
+    """Whether some kind present lies between two media."""
+    return any(isinstance(table, DielectricTable) for table in materials.tables)
+
+
 def select(materials: Materials, shape, front):
     """Kind and row, () int32 each, of the side of a shape."""
     kind, row = at(materials.sides, shape, jnp.where(front, 0, 1))
@@ -49,7 +54,7 @@ def is_smooth(materials: Materials, kind):
     return at(jnp.array(flags), jnp.maximum(kind, 0)) & (kind >= 0)
 
 
-def is_two_sided_medium(materials: Materials, kind):
+def is_glass(materials: Materials, kind):
     """() bool: this bsdf lies between two media and tells its sides apart; the others reflect in front of them."""
     flags = [isinstance(table, DielectricTable) for table in materials.tables]
     if not any(flags):
@@ -59,7 +64,7 @@ def is_two_sided_medium(materials: Materials, kind):
 
 def glass_bit(materials: Materials, kind, row):
     """() int32: bit row % 31 where the kind is a dielectric, else 0."""
-    return jnp.where(is_two_sided_medium(materials, kind), jnp.left_shift(jnp.int32(1), row % 31), 0)
+    return jnp.where(is_glass(materials, kind), jnp.left_shift(jnp.int32(1), row % 31), 0)
 
 
 def evaluate(materials: Materials, kind, row, uv, wi, wo):

@@ -31,10 +31,10 @@ class Path(NamedTuple):
     L: jax.Array  # (3,) radiance gathered so far
     throughput: jax.Array  # (3,) product of the weights so far
     pdf: jax.Array  # () density [1/sr] of ray.d by bsdf sampling; inf from a camera or a Dirac lobe
-    passive: jax.Array  # () what glass did to the throughput, which roulette takes out
+    passive: jax.Array | None  # () what glass did to the throughput, which roulette takes out; None: there is no glass
     depth: jax.Array  # () int32 vertices so far
     alive: jax.Array  # () bool
-    glass: jax.Array  # () int32 bit r % 31 is set once the path met row r of the dielectrics
+    glass: jax.Array | None  # () int32 bit r % 31 is set once the path met row r of the dielectrics; None: not asked
 
 
 class Bounce(NamedTuple):
@@ -55,7 +55,15 @@ def check_sampling(strategy, spp, seed) -> None:
             raise InputError(f"{name} = {value}; it must lie in [{least}, 2^31)")
 
 
-def trace(scene, choice: Choice | None, ray: Ray, numbers, strategy: str, derivative: bool = False) -> Path:
+def trace(
+    scene,
+    choice: Choice | None,
+    ray: Ray,
+    numbers,
+    strategy: str,
+    derivative: bool = False,
+    watch_glass: bool = False,
+) -> Path:
     """Follow a path from a camera ray to its end.
 
     Args:
@@ -65,6 +73,7 @@ def trace(scene, choice: Choice | None, ray: Ray, numbers, strategy: str, deriva
         numbers: depth -> Bounce.
         strategy: "mis", or for experiments "light" (next-event estimation alone) or "bsdf" (without it).
         derivative: follow also what carries nothing, since its derivative may; the value is the same.
+        watch_glass: tell which dielectrics the path met.
     Returns:
         Path; `L` is the radiance that arrives, unbiased up to max_depth.
     Gradient: what is drawn is detached from albedos and radiances, so weights carry the derivative, unbiased. Where the
@@ -72,6 +81,7 @@ def trace(scene, choice: Choice | None, ray: Ray, numbers, strategy: str, deriva
     """
     shapes, materials = scene.geometry, scene.materials
     least, most = (jnp.full_like(ray.t_max, x) for x in (MIN_SURVIVAL, MAX_SURVIVAL))
+    has_glass = bsdfs.any_glass(materials)
     sample_lights = strategy != "bsdf" and choice is not None and bsdfs.any_smooth(materials)
 
     def end(path: Path) -> Path:
@@ -114,12 +124,7 @@ def trace(scene, choice: Choice | None, ray: Ray, numbers, strategy: str, deriva
 
         def scatter(path: Path) -> Path:
             u = numbers(path.depth - 1)
-            frame = frame_from_normal(surface.shading_n)
-            wi = to_local(frame, -ray.d)
-            kind, row = bsdfs.select(materials, hit.shape, wi[2] > 0)
-            # Reflectors see either side as their front; glass tells its sides apart.
-            side = jnp.where(bsdfs.is_two_sided_medium(materials, kind) | (wi[2] > 0), 1, -1).astype(wi.dtype)
-            wi = wi.at[2].multiply(side)
+            frame, wi, kind, row = shading(materials, ray, hit, surface)
 
             # ---- light sample -------------------------------------------------------------------------------------
             L = path.L
@@ -127,7 +132,7 @@ def trace(scene, choice: Choice | None, ray: Ray, numbers, strategy: str, deriva
 
                 def direct():
                     drawn = emitters.sample(scene.emitters, shapes, choice, surface.p, u.light, u.triangle)
-                    wo = to_local(frame, drawn.d).at[2].multiply(side)
+                    wo = to_local(frame, drawn.d)
                     f, pdf_bsdf = bsdfs.evaluate(materials, kind, row, surface.uv, wi, wo)
                     share = mis_weight(drawn.pdf, pdf_bsdf) if strategy == "mis" else 1
                     possible = (drawn.pdf > 0) & (pdf_bsdf > 0)
@@ -145,19 +150,23 @@ def trace(scene, choice: Choice | None, ray: Ray, numbers, strategy: str, deriva
 
             # ---- bsdf sample --------------------------------------------------------------------------------------
             drawn = bsdfs.sample(materials, kind, row, surface.uv, wi, u.bsdf)
-            d = to_world(frame, drawn.wo.at[2].multiply(side))
+            d = to_world(frame, drawn.wo)
             throughput = path.throughput * drawn.weight
-            passive = lax.stop_gradient(path.passive * drawn.passive)
 
             # ---- roulette -----------------------------------------------------------------------------------------
-            # Refraction scales radiance, not importance: by the plain throughput, paths in glass would end too soon.
             largest = lax.stop_gradient(larger(larger(throughput[0], throughput[1]), throughput[2]))
-            survival = larger(smaller(safe_divide(largest, passive), most), least)
+            left, passive, glass = largest, None, None
+            if has_glass:
+                # Refraction scales radiance, not importance: without this, paths in glass would end too soon.
+                passive = lax.stop_gradient(path.passive * drawn.passive)
+                left = safe_divide(largest, passive)
+            survival = larger(smaller(left, most), least)
             survival = jnp.where(path.depth >= scene.rr_depth, survival, 1)
             # A direction of density 0 (a random number of exactly 0 can give one) carries nothing.
             alive = (kind >= 0) & (drawn.pdf > 0) & (derivative | (largest > 0)) & (u.roulette < survival)
             pdf = jnp.where(drawn.delta, jnp.inf, drawn.pdf)
-            glass = path.glass | bsdfs.glass_bit(materials, kind, row)
+            if watch_glass:
+                glass = path.glass | bsdfs.glass_bit(materials, kind, row)
             ray_on = spawn_ray(surface, d, hit.primitive)
             return Path(ray_on, L, throughput / survival, pdf, passive, path.depth, alive, glass)
 
@@ -172,8 +181,23 @@ def trace(scene, choice: Choice | None, ray: Ray, numbers, strategy: str, deriva
 
     one = jnp.ones_like(ray.t_max)
     zero3 = jnp.zeros_like(ray.o)
-    start = Path(ray, zero3, zero3 + 1, one * jnp.inf, one, jnp.int32(0), scene.max_depth > 0, jnp.int32(0))
+    passive, glass = one if has_glass else None, jnp.int32(0) if watch_glass else None
+    start = Path(ray, zero3, zero3 + 1, one * jnp.inf, passive, jnp.int32(0), scene.max_depth > 0, glass)
     return lax.while_loop(lambda path: path.alive, extend, start)
+
+
+def shading(materials, ray: Ray, hit, surface):
+    """What scatters a ray at its hit.
+
+    Returns:
+        frame around the shading normal, wi (3,) in it, kind and row () int32 of the bsdf. Reflectors see either side as
+        their front, so their frame is turned towards the ray; glass tells its sides apart.
+    """
+    frame = frame_from_normal(surface.shading_n)
+    wi = to_local(frame, -ray.d)
+    kind, row = bsdfs.select(materials, hit.shape, wi[2] > 0)
+    side = jnp.where(bsdfs.is_glass(materials, kind) | (wi[2] > 0), 1, -1).astype(wi.dtype)
+    return frame._replace(n=frame.n * side), wi.at[2].multiply(side), kind, row
 
 
 def mis_weight(pdf, other_pdf):

@@ -11,17 +11,17 @@ from pathjax.core import sampler
 from pathjax.integrators import path
 
 
-def sample(scene, choice, pixel, stream, number, strategy, derivative=False):
-    """Weighted radiance (3,) of one sample, and the dielectrics that its path met as `path.Path.glass` has them.
+def sample(scene, choice, pixel, stream, number, strategy, **how):
+    """Weighted radiance (3,) of one sample, and the dielectrics that its path met, as `path.Path.glass` has them.
 
     Args:
         choice: of `emitters.choice`; pixel: () int32; stream: its `sampler.pixel_stream`; number: () uint32.
-        derivative: of `path.trace`.
+        how: `derivative` and `watch_glass` of `path.trace`.
     """
     u_film, u_lens, numbers = path.sample_numbers(scene, stream, number)
     position, weight = film.sample_position(scene.film, pixel, u_film)
     ray = sample_ray(scene.camera, position, u_lens)
-    ended = path.trace(scene, choice, ray, numbers, strategy, derivative)
+    ended = path.trace(scene, choice, ray, numbers, strategy, **how)
     return weight * ended.L, ended.glass
 
 

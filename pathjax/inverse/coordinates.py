@@ -53,7 +53,7 @@ class Coordinates:
         parts = []
         for name, p in self.parameters:
             size = p.shape[0] if p.shape else 1
-            if name in jacobian.keys():
+            if name in jacobian:
                 parts.append(jacobian[name].reshape(*image_shape, size))
             else:
                 parts.append(jnp.zeros((*image_shape, size)))

@@ -347,7 +347,7 @@ def test_sides_of_a_shape_are_told_apart():
     def draw_side(shape, front):
         kind, row = bsdfs.select(materials, shape, front)
         drawn = bsdfs.sample(materials, kind, row, UV, wi, u)
-        return kind, drawn, bsdfs.is_smooth(materials, kind), bsdfs.is_two_sided_medium(materials, kind)
+        return kind, drawn, bsdfs.is_smooth(materials, kind), bsdfs.is_glass(materials, kind)
 
     def weight(shape, front):
         kind, drawn, smooth, _ = draw_side(shape, front)
