@@ -117,6 +117,7 @@ def pixel_jacobians(
 ):
     """Means (N, 3), and by name: derivatives (N, 3, *shape), biases (N, 3), steps ().
 
+    first_sample, spp, seed: each one number, or (N,) of the pixels.
     how: `form` and `devices` of `runtime.native_map`.
     """
     attached = method == "attached"
@@ -130,7 +131,7 @@ def pixel_jacobians(
     if attached and rows:
         scene = _choosing_by(scene, rows)
     steps = _steps(scene, glass, step)
-    numbers = (jnp.asarray(x, jnp.uint32) for x in (first_sample, spp, seed))
+    numbers = pixel.numbers(pixels, first_sample, spp, seed)
     image, by_color, by_ior, bias = _jacobians(scene, pixels, *numbers, steps, wanted=static, strategy=strategy, **how)
 
     derivatives, biases, used = {}, {}, {}
@@ -198,8 +199,9 @@ def ratio_by(scene: Scene, parameter: Parameter):
 def _jacobians(scene, pixels, first_sample, spp, seed, steps, *, wanted, strategy, form=None, devices=None):
     choice = emitters.choice(scene.emitters, strategy)
     one_pixel = partial(_pixel_jacobian, wanted=wanted, strategy=strategy)
-    shared = scene, choice, _tangents(scene, wanted.colors), first_sample, spp, seed, steps
-    return native_map(one_pixel, pixels, *shared, form=form, devices=devices)
+    work = pixels, first_sample, spp, seed
+    shared = scene, choice, _tangents(scene, wanted.colors), steps
+    return native_map(one_pixel, work, *shared, form=form, devices=devices)
 
 
 def _tables(colors):
@@ -220,8 +222,12 @@ def _tangents(scene, colors):
     return tangents
 
 
-def _pixel_jacobian(pixel_number, scene, choice, tangents, first_sample, spp, seed, steps, wanted, strategy):
-    """Means of a pixel: radiance (3,), tangents (T, 3), differences (G, 3) and their biases (G, 3)."""
+def _pixel_jacobian(work, scene, choice, tangents, steps, wanted, strategy):
+    """Means of a pixel: radiance (3,), tangents (T, 3), differences (G, 3) and their biases (G, 3).
+
+    work: the pixel () int32, and its `pixel.numbers`.
+    """
+    pixel_number, first_sample, spp, seed = work
     stream = sampler.pixel_stream(seed, pixel_number)
     tables = [named.get(scene, table_path) for table_path in _tables(wanted.colors)]
     dtype = scene.camera.origin.dtype

@@ -42,10 +42,11 @@ def render(scene: Scene, spp: int = 64, seed: int = 0, strategy: str = "mis"):
 def render_pixels(scene: Scene, pixels, first_sample, spp, seed, strategy: str = "mis", **how):
     """Means over the samples first_sample, ..., first_sample + spp - 1 of some pixels: (N,) int32 -> (N, 3).
 
+    first_sample, spp, seed: each one number, or (N,) of the pixels.
     how: `form` and `devices` of `runtime.native_map`.
     """
     path.check_sampling(strategy, spp, seed)
-    numbers = (jnp.asarray(x, jnp.uint32) for x in (first_sample, spp, seed))
+    numbers = pixel.numbers(pixels, first_sample, spp, seed)
     static = _Static(_differentiable(scene), strategy, tuple(how.items()))
     return _means(static, replace(scene, about=None), pixels, *numbers)
 
@@ -110,4 +111,5 @@ def _differentiated(candidates, scene_tangent):
 def _render_pixels(scene, pixels, first_sample, spp, seed, *, strategy, form=None, devices=None):
     choice = emitters.choice(scene.emitters, strategy)
     pixel_mean = partial(pixel.mean, strategy=strategy)
-    return native_map(pixel_mean, pixels, scene, choice, first_sample, spp, seed, form=form, devices=devices)
+    work = pixels, first_sample, spp, seed
+    return native_map(pixel_mean, work, scene, choice, form=form, devices=devices)

@@ -15,6 +15,7 @@ import pytest
 
 from pathjax import gradient
 from pathjax.film import image_shape, pixel_count
+from pathjax.integrators import pixel
 from pathjax.io import mitsuba_xml
 from pathjax.render import _render_pixels
 from pathjax.scene import build
@@ -118,7 +119,7 @@ class Kernel(NamedTuple):
     def image(self, spp, seed=1):
         """(H, W, 3)."""
         pixels = jnp.arange(pixel_count(self.scene.film), dtype=jnp.int32)
-        numbers = (jnp.uint32(n) for n in (0, spp, seed))
+        numbers = pixel.numbers(pixels, 0, spp, seed)
         means = self.compiled(replace(self.scene, about=None), pixels, *numbers)
         return np.asarray(means).reshape(*image_shape(self.scene.film), 3)
 
@@ -131,7 +132,7 @@ def kernel_of(shipped):
     def compile(name, dtype=jnp.float32):
         scene = shipped(name, dtype, res=16)
         pixels = jnp.arange(pixel_count(scene.film), dtype=jnp.int32)
-        numbers = (jnp.uint32(n) for n in (0, 1, 1))
+        numbers = pixel.numbers(pixels, 0, 1, 1)
         lowered = _render_pixels.lower(replace(scene, about=None), pixels, *numbers, strategy="mis")
         return Kernel(scene, lowered.compile())
 
@@ -147,7 +148,7 @@ class JacobianKernel(NamedTuple):
     def __call__(self, spp, seed=1, first_sample=0, step=0.02):
         """Means of all pixels (N, 3), derivatives in colours (N, T, 3) and in IORs (N, G, 3), biases (N, G, 3)."""
         pixels = jnp.arange(pixel_count(self.scene.film), dtype=jnp.int32)
-        numbers = (jnp.uint32(n) for n in (first_sample, spp, seed))
+        numbers = pixel.numbers(pixels, first_sample, spp, seed)
         glass = self.compiled.in_avals[0][-1].shape
         return jax.tree.map(
             np.asarray, self.compiled(replace(self.scene, about=None), pixels, *numbers, jnp.full(glass, step))
@@ -166,7 +167,7 @@ def jacobian_kernel_of(shipped):
         colors = [(p.path, p.index) for p in parameters if not gradient.is_glass(p)] if which != "glass" else ()
         wanted = gradient.Wanted(tuple(colors), tuple(glass))
         pixels = jnp.arange(pixel_count(scene.film), dtype=jnp.int32)
-        numbers = (jnp.uint32(n) for n in (0, 1, 1))
+        numbers = pixel.numbers(pixels, 0, 1, 1)
         steps = jnp.full(len(glass), 0.02)
         lowered = gradient._jacobians.lower(
             replace(scene, about=None), pixels, *numbers, steps, wanted=wanted, strategy="mis"

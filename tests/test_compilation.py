@@ -11,6 +11,7 @@ import pytest
 import pathjax as pj
 from pathjax import query, runtime
 from pathjax.film import pixel_count
+from pathjax.integrators import pixel
 from pathjax.render import _render_pixels
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -24,8 +25,8 @@ pytestmark = pytest.mark.skipif(not runtime.native(), reason="native loops are o
 
 
 def lowered(scene, strategy="mis", devices=None, pixels=256):
-    numbers = (jnp.uint32(n) for n in (0, 4, 1))
     pixels = jnp.arange(pixels, dtype=jnp.int32)
+    numbers = pixel.numbers(pixels, 0, 4, 1)
     return _render_pixels.lower(replace(scene, about=None), pixels, *numbers, strategy=strategy, devices=devices)
 
 

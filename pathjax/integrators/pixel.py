@@ -25,8 +25,14 @@ def sample(scene, choice, pixel, stream, number, strategy, **how):
     return weight * ended.L, ended.glass
 
 
-def mean(pixel, scene, choice, first_sample, spp, seed, strategy):
-    """(3,) mean of a pixel's samples."""
+def numbers(pixels, first_sample, spp, seed):
+    """What to sample of each pixel: (N,) uint32 each, of numbers or arrays (N,)."""
+    return tuple(jnp.broadcast_to(jnp.asarray(x, jnp.uint32), pixels.shape) for x in (first_sample, spp, seed))
+
+
+def mean(work, scene, choice, strategy):
+    """(3,) mean of a pixel's samples. work: the pixel () int32, and its `numbers`."""
+    pixel, first_sample, spp, seed = work
     stream = sampler.pixel_stream(seed, pixel)
 
     def add(i, state):
