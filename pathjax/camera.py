@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 
 from pathjax import description
 from pathjax.core.math import dot
@@ -85,7 +86,7 @@ def sample_ray(camera: Camera, position, u_lens) -> Ray:
     def to_world(v):
         return v[0] * right + v[1] * up + v[2] * forward
 
-    v = to_world(local)
+    v, start = lax.optimization_barrier((to_world(local), start))
     length = jnp.sqrt(dot(v, v))
     d = v / length
     along = length / local[2]

@@ -227,72 +227,94 @@ def _pixel_jacobian(work, scene, choice, tangents, steps, wanted, strategy):
 
     work: the pixel () int32, and its `pixel.numbers`.
     """
+    places = _tables(wanted.colors)
+
+    def of(tables):
+        varied = scene
+        for place, table in zip(places, tables, strict=True):
+            varied = named.put(varied, place, table)
+        derivative = bool(wanted.colors)
+        if not wanted.glass:
+            none = jnp.zeros((0, 3), scene.camera.origin.dtype)
+            return pixel.mean(work, varied, choice, strategy, derivative), (none, none)
+        return _mean_and_differences(work, varied, choice, steps, wanted.glass, strategy, derivative)
+
+    def push(tangents):
+        return jax.jvp(of, (tables,), (tangents,), has_aux=True)
+
+    tables = [named.get(scene, place) for place in places]
+    if not wanted.colors:
+        mean, differences = of(tables)
+        return mean, jnp.zeros((0, 3), mean.dtype), *differences
+    mean, by_color, differences = jax.vmap(push, out_axes=(None, 0, None))(tangents)
+    return mean, by_color, *differences
+
+
+def _mean_and_differences(work, scene, choice, steps, rows, strategy, derivative):
+    """Mean of a pixel (3,), and of its central differences in the IOR of some dielectrics (G, 3), with biases (G, 3).
+
+    A sample is a path at the IORs of the scene, then four for each of the dielectrics that it met: at + h, - h, and now
+    and then at + 2 h, - 2 h. A path that never met a glass is the same at every IOR of it.
+    """
     pixel_number, first_sample, spp, seed = work
     stream = sampler.pixel_stream(seed, pixel_number)
-    tables = [named.get(scene, table_path) for table_path in _tables(wanted.colors)]
-    dtype = scene.camera.origin.dtype
-    n_glass = len(wanted.glass)
+    _, table = _dielectrics(scene)
+    ratios = table.int_ior / table.ext_ior
+    rows = jnp.asarray(rows, jnp.int32)
+    shifts = jnp.arange(4 * len(rows), dtype=jnp.int32)  # dielectric 4 k, 4 k + 1, ...
 
-    def sample(scene, number, **how):
-        return pixel.sample(scene, choice, pixel_number, stream, number, strategy, **how)
+    def begin(number):
+        return pixel.camera_path(scene, pixel_number, stream, number, watch_glass=True)
 
-    watch = bool(wanted.glass)
+    def shifted(shift):
+        """The scene at a shift, choosing its branches by the IORs that it has; as it is where shift < 0."""
+        place, k = jnp.maximum(shift, 0) // 4, shift % 4
+        row, h = at(rows, place), at(steps, place)
+        moves = (jnp.arange(len(ratios)) == row) & (shift >= 0)
+        change = jnp.where(k % 2 == 0, h, -h) * (1 + k // 2).astype(h.dtype)
+        int_ior = jnp.where(moves, (ratios + change) * table.ext_ior, table.int_ior)
+        return _with_dielectrics(scene, DielectricTable(int_ior, table.ext_ior, jnp.where(moves, ratios, 0)))
 
-    def with_tangents(number):
-        def of(tables):
-            varied = scene
-            for table_path, table in zip(_tables(wanted.colors), tables, strict=True):
-                varied = named.put(varied, table_path, table)
-            return sample(varied, number, derivative=True, watch_glass=watch)
+    def twice(number):
+        return sampler.combine(stream, number) % RICHARDSON_EVERY == 0
 
-        def push(tangents):
-            return jax.jvp(of, (tables,), (tangents,), has_aux=True)
+    def step(state):
+        number, shift, todo, now, weight, plus, sums = state
+        u = path.bounce_numbers(scene, stream, number, now.depth)
+        now = path.extend(shifted(shift), choice, now, u, strategy, derivative)
 
-        return jax.vmap(push, out_axes=(None, 0, None))(tangents)
+        def renew():
+            place, k = jnp.maximum(shift, 0) // 4, shift % 4
+            value, place, k, again = lax.optimization_barrier((weight * now.L, place, k, twice(number)))
+            # The sample itself, or the second of a pair, whose first was kept.
+            mean, by_ior, bias = sums
+            mean = pixel.add_compensated(mean, jnp.where(shift < 0, value, 0))
+            width = 2 * at(steps, place) * (1 + k // 2).astype(value.dtype)
+            quotient = lax.optimization_barrier((plus - value) / width)
+            mine = ((jnp.arange(len(rows)) == place) & (shift >= 0) & (k % 2 == 1))[:, None]
+            by_ior = pixel.add_compensated(by_ior, jnp.where(mine & (k == 1), quotient, 0))
+            doubled = (RICHARDSON_EVERY / 3) * jnp.where(k == 1, -quotient, quotient)
+            bias = pixel.add_compensated(bias, jnp.where(mine & again, doubled, 0))
+            # Shifts of this sample that are still to do are the bits of `todo`.
+            touched = (jnp.right_shift(now.glass, rows % 31) & 1) == 1
+            wanted = jnp.repeat(touched, 4, total_repeat_length=len(shifts)) & ((shifts % 4 < 2) | again)
+            bits = jnp.sum(jnp.where(wanted, jnp.left_shift(jnp.int32(1), shifts), 0), dtype=jnp.int32)
+            left = jnp.where(shift < 0, bits, todo)
+            next_shift = jnp.where(left == 0, -1, lax.population_count(~left & (left - 1)))
+            next_number = number + (left == 0).astype(number.dtype)
+            # What many results share is computed once.
+            todo_next = lax.optimization_barrier((next_number, next_shift, left & (left - 1)))
+            return *todo_next, *begin(todo_next[0]), value, (mean, by_ior, bias)
 
-    def differences(number, met):
-        """Of one path (G, 3): difference quotients, and what a second step says of their bias."""
-        twice = sampler.combine(stream, number) % RICHARDSON_EVERY == 0
-        rows = jnp.asarray(wanted.glass, jnp.int32)
-        _, table = _dielectrics(scene)
+        return lax.cond(now.alive, lambda: (number, shift, todo, now, weight, plus, sums), renew)
 
-        def of_row(place, out):
-            row, h = at(rows, place), at(steps, place)
-            touched = (jnp.right_shift(met, row % 31) & 1) == 1
-            ratio, outside = at(table.int_ior, row) / at(table.ext_ior, row), at(table.ext_ior, row)
-            choose_by = jnp.zeros_like(table.int_ior).at[row].set(ratio)
-
-            def shifted(k, sums):
-                # k = 0, 1, 2, 3: + h, - h, + 2 h, - 2 h
-                sign = (1 - 2 * (k % 2)).astype(dtype)
-                shift = sign * h * (1 + k // 2).astype(dtype)
-                moved = table.int_ior.at[row].set((ratio + shift) * outside)
-                L, _ = sample(_with_dielectrics(scene, DielectricTable(moved, table.ext_ior, choose_by)), number)
-                return sums.at[k // 2].add(sign * L)
-
-            # A path that never met this glass is the same at every IOR.
-            count = jnp.where(touched, jnp.where(twice, 4, 2), 0)
-            near, far = lax.fori_loop(0, count, shifted, jnp.zeros((2, 3), dtype))
-            quotient = near / (2 * h)
-            bias = jnp.where(twice, (far / (4 * h) - quotient) * (RICHARDSON_EVERY / 3), 0)
-            return out[0].at[place].set(quotient), out[1].at[place].set(bias)
-
-        zero = jnp.zeros((n_glass, 3), dtype)
-        return lax.fori_loop(0, n_glass, of_row, (zero, zero))
-
-    def add(i, state):
-        number = first_sample + i.astype(jnp.uint32)
-        if wanted.colors:
-            L, d_colors, met = with_tangents(number)
-        else:
-            (L, met), d_colors = sample(scene, number, watch_glass=watch), no_colors
-        d_glass, bias = differences(number, met) if wanted.glass else (no_glass, no_glass)
-        return [pixel.add_compensated(*pair) for pair in zip(state, (L, d_colors, d_glass, bias), strict=True)]
-
-    no_colors, no_glass = jnp.zeros((len(wanted.colors), 3), dtype), jnp.zeros((n_glass, 3), dtype)
-    start = [(zero, zero) for zero in (jnp.zeros((3,), dtype), no_colors, no_glass, no_glass)]
-    sums = lax.fori_loop(0, spp.astype(jnp.int32), add, start)
-    return tuple(total / spp.astype(dtype) for total, _ in sums)
+    zero = jnp.zeros((3,), scene.camera.origin.dtype)
+    zeros = jnp.zeros((len(rows), 3), zero.dtype)
+    base = jnp.int32(-1)
+    start = first_sample, base, jnp.int32(0), *begin(first_sample), zero, tuple((z, z) for z in (zero, zeros, zeros))
+    *_, sums = lax.while_loop(lambda state: state[0] != first_sample + spp, step, start)
+    mean, by_ior, bias = (total / spp.astype(zero.dtype) for total, _ in sums)
+    return mean, (by_ior, bias)
 
 
 # ---- step of the differences ---------------------------------------------------------------------------------------

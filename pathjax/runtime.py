@@ -23,9 +23,14 @@ from jax import lax
 from jax.custom_batching import custom_vmap
 from jax.sharding import Mesh, PartitionSpec
 
+from pathjax.lanes import lanes
+
 _OPTION = "xla_cpu_small_while_loop_byte_threshold"
 _FLAG = f"--xla_backend_extra_options={_OPTION}=1000000000000"
 _DEVICE_FLAG = "xla_force_host_platform_device_count"
+# Items that a native loop takes at once: enough that loops over them vectorise and their overheads vanish, few enough
+# that what they keep stays in the first cache. Few items would leave most of the lanes idle.
+_LANES, _FEW_LANES = 64, 16
 # Bytes of live values that one lane of a vmapped path keeps; sizes the chunks on an accelerator.
 _BYTES_PER_LANE = 4096
 _CHUNK_BYTES = 1 << 30
@@ -77,8 +82,9 @@ def native_map(f: Callable, xs, *shared, form: str | None = None, devices: int |
         f: pure function of one item, with real control flow.
         xs: pytree of arrays (N, ...).
         shared: pytrees that every item sees whole.
-        form: "loop" (one native sequential loop a device), "vmap" (chunks of vectorised lanes), or None: what suits
-            the backend. Both give the same results up to rounding.
+        form: "lanes" (one native loop a device over groups of items, see `lanes`), "loop" (the same, item by item),
+            "vmap" (chunks of vectorised items), or None: what suits the backend. All give the same results up to
+            rounding.
         devices: how many local devices to use; None: all.
     Returns:
         pytree of arrays (N, ...); bitwise the same for every number of devices.
@@ -115,10 +121,15 @@ def native_map(f: Callable, xs, *shared, form: str | None = None, devices: int |
 
 def _map(f, xs, shared, form, devices):
     count = jax.tree.leaves(xs)[0].shape[0]
-    form = form or ("loop" if native() else "vmap")
+    form = form or ("lanes" if native() else "vmap")
     devices = jax.local_devices()[:devices]
     each = -(-count // len(devices))
-    run = _loop if form == "loop" else partial(_vmap_chunks, chunk=_CHUNK_BYTES // _BYTES_PER_LANE)
+    run = {
+        # By the items of all devices, so that their number does not change the program.
+        "lanes": partial(_lanes, width=_LANES if count >= 2 * _LANES else _FEW_LANES),
+        "loop": _loop,
+        "vmap": partial(_vmap_chunks, chunk=_CHUNK_BYTES // _BYTES_PER_LANE),
+    }[form]
     if len(devices) == 1:
         return run(f, xs, shared)
 
@@ -146,6 +157,19 @@ def _map(f, xs, shared, form, devices):
 
 def _loop(f, xs, shared):
     return lax.map(lambda x: f(x, *shared), xs)
+
+
+def _lanes(f, xs, shared, width):
+    count = jax.tree.leaves(xs)[0].shape[0]
+    groups = -(-count // width)
+
+    def grouped(x):
+        x = jnp.concatenate([x, jnp.broadcast_to(x[:1], (groups * width - count, *x.shape[1:]))])
+        return x.reshape(groups, width, *x.shape[1:])
+
+    one_group = lanes(f, width)
+    ys = lax.map(lambda x: one_group(x, *shared), jax.tree.map(grouped, xs))
+    return jax.tree.map(lambda y: y.reshape(groups * width, *y.shape[2:])[:count], ys)
 
 
 def _vmap_chunks(f, xs, shared, chunk):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -69,10 +71,50 @@ def rescale(v):
     return v / lax.stop_gradient(jnp.where(largest > 0, largest, 1))
 
 
+# Taylor's series on short ranges, to rounding: a few multiply-adds where the general functions are calls to a library.
+
+
+def _series(x, coefficients):
+    """sum(coefficients[k] x^k), k ascending."""
+    total = jnp.zeros_like(x)
+    for c in reversed(coefficients):
+        total = total * x + c
+    return total
+
+
+def cos_sin_octant(x):
+    """Cosine and sine for |x| <= pi/4."""
+    terms = range(5 if x.dtype == jnp.float32 else 9)
+    squared = x * x
+    cos, sin = ([(-1) ** k / math.factorial(2 * k + first) for k in terms] for first in (0, 1))
+    return _series(squared, cos), x * _series(squared, sin)
+
+
+def cos_sin_turns(u):
+    """Cosine and sine of 2 pi u for 0 <= u <= 1."""
+    quarter = jnp.floor(4 * u + jnp.asarray(0.5, u.dtype))
+    cos, sin = cos_sin_octant((u - quarter / 4) * (2 * math.pi))
+    quarter = quarter.astype(jnp.int32)
+    cos, sin = jnp.where(quarter & 1 == 1, -sin, cos), jnp.where(quarter & 1 == 1, cos, sin)
+    sign = jnp.where(quarter & 2 == 2, -1, 1).astype(u.dtype)
+    return sign * cos, sign * sin
+
+
 def safe_atan2(y, x):
     """atan2 with value and derivatives 0 at the origin."""
     origin = (x == 0) & (y == 0)
-    return jnp.where(origin, 0, jnp.arctan2(y, jnp.where(origin, 1, x)))
+    steep = jnp.abs(y) > jnp.abs(x)
+    low, high = jnp.where(steep, jnp.abs(x), jnp.abs(y)), jnp.where(steep, jnp.abs(y), jnp.abs(x))
+    slope = low / jnp.where(origin, 1, high)
+    # atan(s) = pi/4 + atan((s - 1) / (s + 1)) leaves |s| <= tan(pi/8).
+    far = slope > math.tan(math.pi / 8)
+    s = jnp.where(far, (slope - 1) / (slope + 1), slope)
+    terms = range(10 if s.dtype == jnp.float32 else 20)
+    angle = s * _series(s * s, [(-1) ** k / (2 * k + 1) for k in terms])
+    angle = jnp.where(far, math.pi / 4 + angle, angle)
+    angle = jnp.where(steep, math.pi / 2 - angle, angle)
+    angle = jnp.where(x < 0, math.pi - angle, angle)
+    return jnp.where(origin, 0, jnp.where(y < 0, -angle, angle))
 
 
 def luminance(rgb):

@@ -9,6 +9,7 @@ Every pixel and every seed is an independent randomisation; within one, the numb
 from __future__ import annotations
 
 import jax.numpy as jnp
+from jax import lax
 
 _LANES = 8
 
@@ -57,22 +58,20 @@ def _pascal(x):
     return x
 
 
-def sobol_pairs(stream, sample, pairs: int):
-    """The first pairs of dimensions of one sample.
+def sobol_pair(stream, sample, pair):
+    """Two dimensions of one sample: (2,) float32.
 
     Args:
         stream: () uint32, of `pixel_stream`.
         sample: () uint32 number of the sample.
-        pairs: how many; computed in registers of 8.
-    Returns:
-        (pairs, 2) float32.
+        pair: () int32 which two.
     """
-    lanes = -(-pairs // _LANES) * _LANES
-    seeds = combine(jnp.arange(lanes, dtype=jnp.uint32), stream)
-    index = reverse_bits(_owen_reversed(reverse_bits(_u32(sample)), seeds))
-    x = reverse_bits(_owen_reversed(index, hash_u32(seeds + jnp.uint32(1))))
-    y = reverse_bits(_owen_reversed(_pascal(index), hash_u32(seeds + jnp.uint32(2))))
-    return jnp.stack([to_unit(x), to_unit(y)], axis=-1)[:pairs]
+    seed = combine(pair, stream)
+    index = reverse_bits(_owen_reversed(reverse_bits(_u32(sample)), seed))
+    seed, index = lax.optimization_barrier((seed, index))
+    x = reverse_bits(_owen_reversed(index, hash_u32(seed + jnp.uint32(1))))
+    y = reverse_bits(_owen_reversed(_pascal(index), hash_u32(seed + jnp.uint32(2))))
+    return jnp.stack([to_unit(x), to_unit(y)])
 
 
 def pixel_stream(seed, pixel):

@@ -64,7 +64,8 @@ def sample(emitters: Emitters, shapes: Geometry, chosen: Choice, ref, u, u_trian
         row = jnp.minimum(row, count - 1)
         pdf = at(chosen.pdf, row)
         below = at(chosen.cdf, row) - pdf
-        u = u.at[0].set(jnp.clip((u[0] - below) / jnp.where(pdf > 0, pdf, 1), 0, 1 - 2**-24))
+        again = jnp.clip((u[0] - below) / jnp.where(pdf > 0, pdf, 1), 0, 1 - 2**-24)
+        u = jnp.stack([again, u[1]])
 
     def of_area():
         return area.sample(emitters.area, shapes, row, ref, u, u_triangle)

@@ -10,7 +10,7 @@ from jax import lax
 
 from pathjax import bsdfs, emitters
 from pathjax.core import sampler
-from pathjax.core.math import at, dot, frame_from_normal, larger, safe_divide, smaller, spawn_ray, to_local, to_world
+from pathjax.core.math import dot, frame_from_normal, larger, safe_divide, smaller, spawn_ray, to_local, to_world
 from pathjax.core.types import Ray
 from pathjax.emitters import Choice
 from pathjax.errors import InputError
@@ -55,135 +55,141 @@ def check_sampling(strategy, spp, seed) -> None:
             raise InputError(f"{name} = {value}; it must lie in [{least}, 2^31)")
 
 
-def trace(
-    scene,
-    choice: Choice | None,
-    ray: Ray,
-    numbers,
-    strategy: str,
-    derivative: bool = False,
-    watch_glass: bool = False,
-) -> Path:
-    """Follow a path from a camera ray to its end.
+def trace(scene, choice: Choice | None, ray: Ray, numbers, strategy: str) -> Path:
+    """Follow a path from a camera ray to its end; numbers: depth -> Bounce. For the rest see `extend`."""
+
+    def on(path: Path) -> Path:
+        return extend(scene, choice, path, numbers(path.depth), strategy)
+
+    return lax.while_loop(lambda path: path.alive, on, start(scene, ray))
+
+
+def start(scene, ray: Ray, watch_glass: bool = False) -> Path:
+    """A path that has its camera ray. watch_glass: tell which dielectrics it meets."""
+    one, zero3 = jnp.ones_like(ray.t_max), jnp.zeros_like(ray.o)
+    passive = one if bsdfs.any_glass(scene.materials) else None
+    glass = jnp.int32(0) if watch_glass else None
+    return Path(ray, zero3, zero3 + 1, one * jnp.inf, passive, jnp.int32(0), scene.max_depth > 0, glass)
+
+
+def extend(scene, choice: Choice | None, path: Path, u: Bounce, strategy: str, derivative: bool = False) -> Path:
+    """Follow a path to its next vertex.
 
     Args:
-        scene: Scene.
         choice: how lights are chosen, of `emitters.choice`.
-        ray: Ray.
-        numbers: depth -> Bounce.
+        path: Path, alive.
+        u: Bounce, the vertex's own.
         strategy: "mis", or for experiments "light" (next-event estimation alone) or "bsdf" (without it).
         derivative: follow also what carries nothing, since its derivative may; the value is the same.
-        watch_glass: tell which dielectrics the path met.
     Returns:
-        Path; `L` is the radiance that arrives, unbiased up to max_depth.
+        Path; once it is not alive, `L` is the radiance that arrives, unbiased up to max_depth.
     Gradient: what is drawn is detached from albedos and radiances, so weights carry the derivative, unbiased. Where the
     IOR of glass moves the path, the derivative is that of the moving points (attached), and edges are missing from it.
     """
     shapes, materials = scene.geometry, scene.materials
-    least, most = (jnp.full_like(ray.t_max, x) for x in (MIN_SURVIVAL, MAX_SURVIVAL))
+    least, most = (jnp.full_like(path.ray.t_max, x) for x in (MIN_SURVIVAL, MAX_SURVIVAL))
     has_glass = bsdfs.any_glass(materials)
     sample_lights = strategy != "bsdf" and choice is not None and bsdfs.any_smooth(materials)
 
     def end(path: Path) -> Path:
         return path._replace(alive=jnp.bool_(False))
 
-    def extend(path: Path) -> Path:
-        ray = path.ray
-        hit = geometry.closest_hit(shapes, ray)
-        found = hit.primitive >= 0
+    ray = path.ray
+    hit = geometry.closest_hit(shapes, ray)
+    found = hit.primitive >= 0
 
-        # ---- emission: bsdf sampling's share of the light that the ray ends on --------------------------------------
-        surface = geometry.surface(shapes, ray, hit) if shapes.tables else None  # of a miss: not used
+    goes_on = found & (path.depth + 1 < scene.max_depth)
+    surface = frame = wi = kind = row = None
+    if shapes.tables:
+        surface = geometry.surface(shapes, ray, hit)  # of a miss: not used
+        frame, wi, kind, row = shading(materials, ray, hit, surface)
+    # What many results share is computed once.
+    u, surface, frame, wi, kind, row = lax.optimization_barrier((u, surface, frame, wi, kind, row))
 
-        def emission():
-            def at_surface():
-                arrival = hit._replace(t=dot(surface.p - ray.o, ray.d)) if derivative else hit
-                return emitters.hit(scene.emitters, shapes, choice, ray, arrival, surface)
+    # ---- emission: bsdf sampling's share of the light that the ray ends on ------------------------------------------
+    def emission():
+        def at_surface():
+            arrival = hit._replace(t=dot(surface.p - ray.o, ray.d)) if derivative else hit
+            return emitters.hit(scene.emitters, shapes, choice, ray, arrival, surface)
 
-            def at_infinity():
-                return emitters.background(scene.emitters, choice, ray.d)
+        def at_infinity():
+            return emitters.background(scene.emitters, choice, ray.d)
 
-            Le, pdf_light = lax.cond(found, at_surface, at_infinity) if shapes.tables else at_infinity()
-            if strategy == "mis":
-                share = mis_weight(path.pdf, pdf_light)
-            else:
-                share = jnp.where(
-                    (strategy == "light") & sample_lights & jnp.isfinite(path.pdf) & (pdf_light > 0), 0, 1
-                )
-            if scene.hide_emitters:
-                # What emits lets camera rays through, as in Mitsuba; the background is black to them.
-                share = jnp.where(path.depth == 0, 0, share)
-            return path.throughput * Le * share
-
-        # Most surfaces are dark.
-        bright = ~found | geometry.emits(shapes, hit) if shapes.tables else True
-        L = path.L + lax.cond(bright, emission, lambda: jnp.zeros_like(path.L))
+        Le, pdf_light = lax.cond(found, at_surface, at_infinity) if shapes.tables else at_infinity()
+        if strategy == "mis":
+            share = mis_weight(path.pdf, pdf_light)
+        else:
+            share = jnp.where(
+                (strategy == "light") & sample_lights & jnp.isfinite(path.pdf) & (pdf_light > 0), 0, 1
+            )
         if scene.hide_emitters:
-            hidden = found & (path.depth == 0) & geometry.emits(shapes, hit)
-        path = path._replace(L=L, depth=path.depth + 1)
+            # What emits lets camera rays through, as in Mitsuba; the background is black to them.
+            share = jnp.where(path.depth == 0, 0, share)
+        return path.throughput * Le * share
 
-        def scatter(path: Path) -> Path:
-            u = numbers(path.depth - 1)
-            frame, wi, kind, row = shading(materials, ray, hit, surface)
+    # Most surfaces are dark.
+    bright = ~found | geometry.emits(shapes, hit) if shapes.tables else True
+    L = path.L + lax.cond(bright, emission, lambda: jnp.zeros_like(path.L))
+    if scene.hide_emitters:
+        hidden = found & (path.depth == 0) & geometry.emits(shapes, hit)
+    path = path._replace(L=L, depth=path.depth + 1)
 
-            # ---- light sample -------------------------------------------------------------------------------------
-            L = path.L
-            if sample_lights:
+    def scatter(path: Path) -> Path:
+        # ---- light sample -----------------------------------------------------------------------------------------
+        L = path.L
+        if sample_lights:
 
-                def direct():
-                    drawn = emitters.sample(scene.emitters, shapes, choice, surface.p, u.light, u.triangle)
-                    wo = to_local(frame, drawn.d)
-                    f, pdf_bsdf = bsdfs.evaluate(materials, kind, row, surface.uv, wi, wo)
-                    share = mis_weight(drawn.pdf, pdf_bsdf) if strategy == "mis" else 1
-                    possible = (drawn.pdf > 0) & (pdf_bsdf > 0)
-                    contribution = f * drawn.Le * (share / jnp.where(possible, drawn.pdf, 1))
-                    shadow_ray = spawn_ray(surface, drawn.d, hit.primitive)._replace(t_max=drawn.distance)
-                    visible = lax.cond(
-                        possible & (derivative | jnp.any(contribution > 0)),
-                        lambda: ~geometry.occluded(shapes, shadow_ray, drawn.primitive),
-                        lambda: jnp.bool_(False),
-                    )
-                    return jnp.where(visible, contribution, 0)
+            smooth = bsdfs.is_smooth(materials, kind)
 
-                smooth = bsdfs.is_smooth(materials, kind)
-                L = L + path.throughput * lax.cond(smooth, direct, lambda: jnp.zeros_like(L))
+            def direct():
+                drawn = emitters.sample(scene.emitters, shapes, choice, surface.p, u.light, u.triangle)
+                drawn = lax.optimization_barrier(drawn)
+                wo = to_local(frame, drawn.d)
+                f, pdf_bsdf = bsdfs.evaluate(materials, kind, row, surface.uv, wi, wo)
+                share = mis_weight(drawn.pdf, pdf_bsdf) if strategy == "mis" else 1
+                possible = (drawn.pdf > 0) & (pdf_bsdf > 0)
+                scale = lax.optimization_barrier(share / jnp.where(possible, drawn.pdf, 1))
+                contribution = f * drawn.Le * scale
+                # A shadow ray of negative length is not traced.
+                useful = goes_on & smooth & possible & (derivative | jnp.any(contribution > 0))
+                reach = jnp.where(useful, drawn.distance, -1)
+                shadow_ray = spawn_ray(surface, drawn.d, hit.primitive)._replace(t_max=reach)
+                shadow_ray, contribution = lax.optimization_barrier((shadow_ray, contribution))
+                visible = useful & ~geometry.occluded(shapes, shadow_ray, drawn.primitive)
+                return jnp.where(visible, contribution, 0)
 
-            # ---- bsdf sample --------------------------------------------------------------------------------------
-            drawn = bsdfs.sample(materials, kind, row, surface.uv, wi, u.bsdf)
-            d = to_world(frame, drawn.wo)
-            throughput = path.throughput * drawn.weight
+            L = L + path.throughput * lax.cond(smooth, direct, lambda: jnp.zeros_like(L))
 
-            # ---- roulette -----------------------------------------------------------------------------------------
-            largest = lax.stop_gradient(larger(larger(throughput[0], throughput[1]), throughput[2]))
-            left, passive, glass = largest, None, None
-            if has_glass:
-                # Refraction scales radiance, not importance: without this, paths in glass would end too soon.
-                passive = lax.stop_gradient(path.passive * drawn.passive)
-                left = safe_divide(largest, passive)
-            survival = larger(smaller(left, most), least)
-            survival = jnp.where(path.depth >= scene.rr_depth, survival, 1)
-            # A direction of density 0 (a random number of exactly 0 can give one) carries nothing.
-            alive = (kind >= 0) & (drawn.pdf > 0) & (derivative | (largest > 0)) & (u.roulette < survival)
-            pdf = jnp.where(drawn.delta, jnp.inf, drawn.pdf)
-            if watch_glass:
-                glass = path.glass | bsdfs.glass_bit(materials, kind, row)
-            ray_on = spawn_ray(surface, d, hit.primitive)
-            return Path(ray_on, L, throughput / survival, pdf, passive, path.depth, alive, glass)
+        # ---- bsdf sample ------------------------------------------------------------------------------------------
+        drawn = bsdfs.sample(materials, kind, row, surface.uv, wi, u.bsdf)
+        d = to_world(frame, drawn.wo)
+        drawn, d = lax.optimization_barrier((drawn, d))
+        throughput = path.throughput * drawn.weight
 
-        if not shapes.tables:
-            return end(path)
-        goes_on = found & (path.depth < scene.max_depth)
-        if scene.hide_emitters:
-            beyond = spawn_ray(surface, ray.d, hit.primitive)._replace(t_max=ray.t_max - hit.t)
-            through = path._replace(ray=beyond, depth=jnp.int32(0))
-            return lax.cond(hidden, lambda path: through, lambda path: lax.cond(goes_on, scatter, end, path), path)
-        return lax.cond(goes_on, scatter, end, path)
+        # ---- roulette ---------------------------------------------------------------------------------------------
+        largest = lax.stop_gradient(larger(larger(throughput[0], throughput[1]), throughput[2]))
+        left, passive, glass = largest, None, None
+        if has_glass:
+            # Refraction scales radiance, not importance: without this, paths in glass would end too soon.
+            passive = lax.stop_gradient(path.passive * drawn.passive)
+            left = safe_divide(largest, passive)
+        survival = larger(smaller(left, most), least)
+        survival = lax.optimization_barrier(jnp.where(path.depth >= scene.rr_depth, survival, 1))
+        # A direction of density 0 (a random number of exactly 0 can give one) carries nothing.
+        alive = (kind >= 0) & (drawn.pdf > 0) & (derivative | (largest > 0)) & (u.roulette < survival)
+        pdf = jnp.where(drawn.delta, jnp.inf, drawn.pdf)
+        if path.glass is not None:
+            glass = path.glass | bsdfs.glass_bit(materials, kind, row)
+        ray_on = spawn_ray(surface, d, hit.primitive)
+        return Path(ray_on, L, throughput / survival, pdf, passive, path.depth, alive, glass)
 
-    one = jnp.ones_like(ray.t_max)
-    zero3 = jnp.zeros_like(ray.o)
-    passive, glass = one if has_glass else None, jnp.int32(0) if watch_glass else None
-    start = Path(ray, zero3, zero3 + 1, one * jnp.inf, passive, jnp.int32(0), scene.max_depth > 0, glass)
-    return lax.while_loop(lambda path: path.alive, extend, start)
+    if not shapes.tables:
+        return end(path)
+    if scene.hide_emitters:
+        beyond = spawn_ray(surface, ray.d, hit.primitive)._replace(t_max=ray.t_max - hit.t)
+        through = path._replace(ray=beyond, depth=jnp.int32(0))
+        return lax.cond(hidden, lambda path: through, lambda path: lax.cond(goes_on, scatter, end, path), path)
+    return lax.cond(goes_on, scatter, end, path)
 
 
 def shading(materials, ray: Ray, hit, surface):
@@ -197,7 +203,7 @@ def shading(materials, ray: Ray, hit, surface):
     wi = to_local(frame, -ray.d)
     kind, row = bsdfs.select(materials, hit.shape, wi[2] > 0)
     side = jnp.where(bsdfs.is_glass(materials, kind) | (wi[2] > 0), 1, -1).astype(wi.dtype)
-    return frame._replace(n=frame.n * side), wi.at[2].multiply(side), kind, row
+    return frame._replace(n=frame.n * side), jnp.stack([wi[0], wi[1], wi[2] * side]), kind, row
 
 
 def mis_weight(pdf, other_pdf):
@@ -209,30 +215,22 @@ def mis_weight(pdf, other_pdf):
     return jnp.where(jnp.isinf(pdf), 1, 1 / (1 + ratio * ratio))
 
 
-def sample_numbers(scene, stream, sample):
-    """Random numbers of one path.
+# Dimensions of the sampler: pairs 0 and 1 for film and lens, then two of each vertex.
+
+
+def camera_numbers(scene, stream, sample):
+    """Film (2,) and lens (2,).
 
     Args:
         stream: () uint32 of `sampler.pixel_stream`; sample: () uint32 number of the sample.
-    Returns:
-        film (2,), lens (2,), and a function depth -> Bounce.
     """
     dtype = scene.camera.origin.dtype
-    pairs = sampler.sobol_pairs(stream, sample, 2 + 2 * SOBOL_BOUNCES).astype(dtype)
-    pairs, key = lax.optimization_barrier((pairs, sampler.path_key(stream, sample)))
+    return tuple(sampler.sobol_pair(stream, sample, pair).astype(dtype) for pair in (0, 1))
 
-    def numbers(depth):
-        def hashed(place, count):
-            return sampler.hashed(key, depth * 8 + place, count).astype(dtype)
 
-        def early():
-            return at(pairs, 2 + 2 * depth), at(pairs, 3 + 2 * depth)
-
-        def late():
-            u = hashed(0, 4)
-            return u[0:2], u[2:4]
-
-        light, bsdf = lax.cond(depth < SOBOL_BOUNCES, early, late)
-        return Bounce(light, bsdf, hashed(4, 1)[0], hashed(5, 1)[0])
-
-    return pairs[0], pairs[1], numbers
+def bounce_numbers(scene, stream, sample, depth) -> Bounce:
+    """Random numbers of the vertex number depth."""
+    dtype = scene.camera.origin.dtype
+    light, bsdf = (sampler.sobol_pair(stream, sample, 2 + 2 * depth + k).astype(dtype) for k in (0, 1))
+    rest = sampler.hashed(sampler.path_key(stream, sample), 2 * depth, 2).astype(dtype)
+    return Bounce(light, bsdf, rest[0], rest[1])

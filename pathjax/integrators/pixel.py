@@ -1,4 +1,4 @@
-"""One pixel: a sample of its radiance, from the film to the light, and the mean of many."""
+"""One pixel: the mean of its samples, from the film to the light."""
 
 from __future__ import annotations
 
@@ -11,36 +11,44 @@ from pathjax.core import sampler
 from pathjax.integrators import path
 
 
-def sample(scene, choice, pixel, stream, number, strategy, **how):
-    """Weighted radiance (3,) of one sample, and the dielectrics that its path met, as `path.Path.glass` has them.
-
-    Args:
-        choice: of `emitters.choice`; pixel: () int32; stream: its `sampler.pixel_stream`; number: () uint32.
-        how: `derivative` and `watch_glass` of `path.trace`.
-    """
-    u_film, u_lens, numbers = path.sample_numbers(scene, stream, number)
-    position, weight = film.sample_position(scene.film, pixel, u_film)
-    ray = sample_ray(scene.camera, position, u_lens)
-    ended = path.trace(scene, choice, ray, numbers, strategy, **how)
-    return weight * ended.L, ended.glass
-
-
 def numbers(pixels, first_sample, spp, seed):
     """What to sample of each pixel: (N,) uint32 each, of numbers or arrays (N,)."""
     return tuple(jnp.broadcast_to(jnp.asarray(x, jnp.uint32), pixels.shape) for x in (first_sample, spp, seed))
 
 
-def mean(work, scene, choice, strategy):
-    """(3,) mean of a pixel's samples. work: the pixel () int32, and its `numbers`."""
+def camera_path(scene, pixel, stream, number, **how):
+    """Path of one sample at the camera, and the sample's weight ().
+
+    Args:
+        pixel: () int32; stream: () uint32, its `sampler.pixel_stream`; number: () uint32.
+        how: `watch_glass` of `path.start`.
+    """
+    u_film, u_lens = lax.optimization_barrier(path.camera_numbers(scene, stream, number))
+    position, weight = film.sample_position(scene.film, pixel, u_film)
+    ray = sample_ray(scene.camera, position, u_lens)
+    return lax.optimization_barrier((path.start(scene, ray, **how), weight))
+
+
+def mean(work, scene, choice, strategy, derivative=False):
+    """(3,) mean of a pixel's samples. work: the pixel () int32, and its `numbers`; derivative: of `path.extend`."""
     pixel, first_sample, spp, seed = work
     stream = sampler.pixel_stream(seed, pixel)
 
-    def add(i, state):
-        number = first_sample + i.astype(jnp.uint32)
-        return add_compensated(state, sample(scene, choice, pixel, stream, number, strategy)[0])
+    # One loop over the vertices of all samples, so that no lane waits for the longest path of another.
+    def step(state):
+        number, now, weight, sums = state
+        u = path.bounce_numbers(scene, stream, number, now.depth)
+        now = path.extend(scene, choice, now, u, strategy, derivative)
+
+        def renew():
+            value = lax.optimization_barrier(weight * now.L)
+            return number + 1, *camera_path(scene, pixel, stream, number + 1), add_compensated(sums, value)
+
+        return lax.cond(now.alive, lambda: (number, now, weight, sums), renew)
 
     zero = jnp.zeros((3,), scene.camera.origin.dtype)
-    total, _ = lax.fori_loop(0, spp.astype(jnp.int32), add, (zero, zero))
+    start = first_sample, *camera_path(scene, pixel, stream, first_sample), (zero, zero)
+    *_, (total, _) = lax.while_loop(lambda state: state[0] != first_sample + spp, step, start)
     return total / spp.astype(total.dtype)
 
 

@@ -14,6 +14,7 @@ from jax import lax
 
 from pathjax.core.math import at, integer_like, smaller
 from pathjax.core.types import Hit, Ray, Surface
+from pathjax.lanes import one_by_one
 from pathjax.shapes import bvh, bvh_build, planar, sphere, triangle
 from pathjax.shapes.planar import Planar
 from pathjax.shapes.sphere import Spheres
@@ -21,7 +22,7 @@ from pathjax.shapes.triangle import Triangles
 
 # As a primitive: none. As the bits of a float32 distance: beyond infinity.
 NO_HIT = np.int32(0x7FFFFFFF)
-# Up to here every ray tests all primitives of a kind, in registers of 8; above, a tree pays.
+# Up to here every ray tests all primitives of a kind, one after another; above, a tree pays.
 FLAT_LIMIT = 32
 LEAF_WIDTH = 8
 
@@ -43,14 +44,13 @@ def leaves_of(numbers, lo, hi, dtype, rule="sah"):
         numbers: (P, K) what the intersection wants to know of each primitive.
         lo, hi: (P, 3) bounds.
     Returns:
-        leaves (L, K + 1, W), tree (None for a few primitives), built tree for reports or None. The last numbers of a
-        leaf are the bits of its rows: one block, so that a visit misses the cache once.
+        leaves (L, K + 1, W), tree (None for a few primitives, each a leaf of its own), built tree for reports or None.
+        The last numbers of a leaf are the bits of its rows: one block, so that a visit misses the cache once.
     """
     count = len(numbers)
     if count <= FLAT_LIMIT:
         built, tree = None, None
-        rows = np.full((1, -(-count // LEAF_WIDTH) * LEAF_WIDTH), -1, np.int32)
-        rows[0, :count] = np.arange(count)
+        rows = np.arange(count, dtype=np.int32)[:, None]
     else:
         built = bvh_build.build(lo, hi, rule=rule, leaf_size=LEAF_WIDTH)
         lane = np.arange(LEAF_WIDTH)
@@ -82,6 +82,10 @@ def closest_hit(geometry: Geometry, ray: Ray) -> Hit:
     ray = jax.tree.map(lax.stop_gradient, ray)
 
     def leaf_test(distances, primitives, t, primitive):
+        if len(distances) == 1:
+            (distance,) = lax.optimization_barrier(distances)
+            nearer = (distance > 0) & (distance < t)
+            return jnp.where(nearer, distance, t), jnp.where(nearer, primitives[0], primitive)
         # Positive floats order as integers, and integer minima vectorise. A miss is the bits of infinity or more.
         bits = jnp.where((distances > 0) & (distances <= t), _bits(distances), beyond)
         bits = lax.optimization_barrier(bits)
@@ -144,19 +148,23 @@ def switch_by_range(number, first: list[int], branches):
 def _visit(geometry: Geometry, ray: Ray, leaf_test, t, primitive):
     """Give every leaf that the ray may meet to `leaf_test(distances (W,), primitives (W,), t, primitive)`."""
     for table, first in zip(geometry.tables, firsts(geometry), strict=True):
-        module = _MODULES[type(table)]
-        prepared = lax.optimization_barrier(module.prepare(ray.o, ray.d))
 
-        def leaf(number, t, primitive, table=table, first=first, module=module, prepared=prepared):
-            rows = rows_of(at(table.leaves, number))
-            primitives = rows + first  # of empty lanes: nonsense, but these are never hit
-            distances = module.intersect(table, number, prepared, primitives == ray.exclude)
-            return leaf_test(distances, primitives, t, primitive)
+        def search(o, d, exclude, t, primitive, table=table, first=first):
+            module = _MODULES[type(table)]
+            prepared = lax.optimization_barrier(module.prepare(o, d))
 
-        if table.tree is None:
-            t, primitive = leaf(jnp.int32(0), t, primitive)
-        else:
-            t, primitive = bvh.traverse(table.tree, leaf, ray.o, ray.d, t, primitive)
+            def leaf(number, t, primitive):
+                block = at(table.leaves, number)
+                primitives = rows_of(block) + first  # of empty lanes: nonsense, but these are never hit
+                distances = module.intersect(block, table, prepared, primitives == exclude)
+                return leaf_test(distances, primitives, t, primitive)
+
+            if table.tree is not None:
+                return bvh.traverse(table.tree, leaf, o, d, t, primitive)
+            return lax.fori_loop(0, len(table.leaves), lambda number, state: leaf(number, *state), (t, primitive))
+
+        search = search if table.tree is None else one_by_one(search)
+        t, primitive = search(ray.o, ray.d, ray.exclude, t, primitive)
     return t, primitive
 
 

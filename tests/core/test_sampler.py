@@ -23,7 +23,7 @@ def sidak(p_values):
 def _sobol(seeds, pixels, samples):
     def one(seed, pixel):
         stream = sampler.pixel_stream(seed, pixel)
-        return jax.vmap(lambda i: sampler.sobol_pairs(stream, i, PAIRS))(samples)
+        return jax.vmap(lambda i: jax.vmap(lambda k: sampler.sobol_pair(stream, i, k))(jnp.arange(PAIRS)))(samples)
 
     return jax.vmap(one)(seeds, pixels)
 
