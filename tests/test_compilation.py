@@ -24,10 +24,11 @@ SCENES = [pytest.param(name, marks=pytest.mark.slow if name in LARGE else ()) fo
 pytestmark = pytest.mark.skipif(not runtime.native(), reason="native loops are off")
 
 
-def lowered(scene, strategy="mis", devices=None, pixels=256):
+def lowered(scene, strategy="mis", devices=None, pixels=256, form=None):
     pixels = jnp.arange(pixels, dtype=jnp.int32)
     numbers = pixel.numbers(pixels, 0, 4, 1)
-    return _render_pixels.lower(replace(scene, about=None), pixels, *numbers, strategy=strategy, devices=devices)
+    static = {"strategy": strategy, "devices": devices, "form": form}
+    return _render_pixels.lower(replace(scene, about=None), pixels, *numbers, **static)
 
 
 def assert_one_native_kernel(compiled):
@@ -130,13 +131,14 @@ OPTIONAL = {
 
 @pytest.mark.parametrize("name", sorted(set.union(*OPTIONAL.values())))
 def test_program_holds_code_of_the_kinds_present_and_of_no_others(shipped, name):
-    text = lowered(shipped(name, res=16)).as_text(debug_info=True)
+    # In the form that tells files; the program of one pixel, of which lanes are made, is the same.
+    text = lowered(shipped(name, res=16), form="loop").as_text(debug_info=True)
     holds = {file for file in ALWAYS | set(OPTIONAL) if f"/{file}" in text}
     assert holds == ALWAYS | {file for file, names in OPTIONAL.items() if name in names}
 
 
 def test_background_is_sampled_by_strategy_light_alone(shipped):
-    text = lowered(shipped("glass_and_mirror", res=16), "light").as_text(debug_info=True)
+    text = lowered(shipped("glass_and_mirror", res=16), "light", form="loop").as_text(debug_info=True)
     assert "/constant.py" in text
 
 

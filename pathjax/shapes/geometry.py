@@ -84,7 +84,7 @@ def closest_hit(geometry: Geometry, ray: Ray) -> Hit:
     def leaf_test(distances, primitives, t, primitive):
         if len(distances) == 1:
             (distance,) = lax.optimization_barrier(distances)
-            nearer = (distance > 0) & (distance < t)
+            nearer = (distance > 0) & ((distance < t) | ((distance == t) & (primitive == none)))
             return jnp.where(nearer, distance, t), jnp.where(nearer, primitives[0], primitive)
         # Positive floats order as integers, and integer minima vectorise. A miss is the bits of infinity or more.
         bits = jnp.where((distances > 0) & (distances <= t), _bits(distances), beyond)
@@ -102,7 +102,9 @@ def closest_hit(geometry: Geometry, ray: Ray) -> Hit:
 
         return lax.cond(nearest < beyond, update, lambda: (t, primitive))
 
-    t, primitive = _visit(geometry, ray, leaf_test, ray.t_max, none)
+    # A miss is infinitely far, and no bound may equal that.
+    farthest = smaller(ray.t_max, jnp.full_like(ray.t_max, jnp.finfo(ray.t_max.dtype).max))
+    t, primitive = _visit(geometry, ray, leaf_test, farthest, none)
     found = primitive != none
     shape = at(geometry.shape, jnp.where(found, primitive, 0)) if geometry.tables else none
     return Hit(jnp.where(found, t, jnp.inf), jnp.where(found, primitive, -1), jnp.where(found, shape, -1))

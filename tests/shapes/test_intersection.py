@@ -473,10 +473,10 @@ def test_the_target_does_not_shadow_itself():
 
 
 def test_padded_lanes_are_never_hit():
-    for name in ("one triangle", "10 rectangles", "10 disks", "10 spheres", "400 triangles"):
+    for name in ("400 triangles", "100 rectangles"):
         shapes = scene_of(*SCENES[name])
         rows = np.asarray(geometry.rows_of(shapes.tables[0].leaves))
-        assert (rows < 0).any() or name == "8 triangles"
+        assert (rows < 0).any()
         assert np.isnan(np.moveaxis(np.asarray(shapes.tables[0].leaves), 1, 2)[rows < 0]).all()
         # Through the origin, where zero padding would lie.
         o = unit(np.random.default_rng(1).normal(size=(2000, 3)))
