@@ -161,7 +161,9 @@ def _numbers(option: str, name: str, text: str):
 
 def _load(options):
     import pathjax
+    from pathjax import runtime
 
+    runtime.keep_kernels()
     scene = pathjax.load_scene(options.scene, **dict(options.defines))
     return pathjax.with_parameters(scene, {name: _numbers("--set", name, text) for name, text in options.settings})
 
