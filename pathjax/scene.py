@@ -17,6 +17,7 @@ from pathjax.camera import Camera
 from pathjax.emitters import Emitters
 from pathjax.emitters.area import AreaLights
 from pathjax.emitters.constant import Constant
+from pathjax.errors import InputError
 from pathjax.film import Film
 from pathjax.named import About, Parameter
 from pathjax.shapes import geometry as geometry_module
@@ -52,7 +53,11 @@ def build(description: desc.Description, dtype=jnp.float32, split_rule: str = "s
     Args:
         dtype: of all reals; float64 needs `jax_enable_x64`.
         split_rule: of the hierarchy: "sah", "equal" or "middle".
+    Raises:
+        InputError: float64 without `jax_enable_x64`.
     """
+    if jax.dtypes.canonicalize_dtype(dtype) != np.dtype(dtype):
+        raise InputError('scene.build: float64 is off in JAX; call jax.config.update("jax_enable_x64", True) first')
     parameters: dict[str, Parameter] = {}
     materials = _build_materials(description, dtype, parameters)
     geometry, emitters, trees = _build_shapes(description, dtype, parameters, split_rule)
