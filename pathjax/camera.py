@@ -51,7 +51,7 @@ def build(camera: description.Camera, film: description.Film, dtype) -> Camera:
     shift = 2 * half * np.array([-camera.principal_point_offset[0], -camera.principal_point_offset[1]])
 
     def real(x):
-        return jnp.asarray(x, dtype)
+        return np.asarray(x, dtype)
 
     lens = None
     if camera.aperture_radius is not None:

@@ -1,12 +1,13 @@
 """The command line: parses, calls, prints. Results on stdout; progress and messages on stderr.
 
-Exit status: 0 done, 1 the work failed, 2 the command or a file is wrong.
+Exit status: 0 done, 1 the work failed (of `compare`: the images differ), 2 the command or a file is wrong.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import math
 import os
 import sys
 import threading
@@ -72,6 +73,31 @@ def _parser() -> argparse.ArgumentParser:
     bench.add_argument("-o", "--output", metavar="DIR", help="also write bench.json and bench.md there")
     bench.add_argument("--json", action="store_true", help="print one JSON object on stdout")
     bench.set_defaults(run=_bench)
+
+    compare = commands.add_parser(
+        "compare",
+        help="how an image differs from a reference",
+        description="Of image A against reference B, in linear light: MSE; relMSE = mean((A - B)^2 / (B^2 + 0.01)); "
+        "PSNR, whose peak is B's maximum; HDR-FLIP. If one is PNG or JPEG, the peak is 1 and FLIP is LDR-FLIP.",
+        epilog="Exit status: 0 the images agree, or no limit was set; 1 they differ: relMSE or FLIP is above its "
+        "limit, or with --errors p is below ALPHA; 2 the command or a file is wrong.",
+    )
+    compare.add_argument("image", metavar="A.{exr,png,jpg}")
+    compare.add_argument("reference", metavar="B.{exr,png,jpg}")
+    compare.add_argument(
+        "--errors",
+        action="store_true",
+        help="weigh differences by the standard errors in channels error.R, error.G, error.B of one or both; where "
+        "only one holds them the other is taken as exact",
+    )
+    alpha = "with --errors: the chance that equal scenes are said to differ; default: 0.001"
+    compare.add_argument("--alpha", type=_chance, default=1e-3, help=alpha)
+    compare.add_argument("--max-relmse", type=_limit, metavar="X", help="differ where relMSE is above")
+    compare.add_argument("--max-flip", type=_limit, metavar="X", help="differ where the mean of FLIP is above")
+    picture = "a picture: A, B, their difference (red: A is brighter) and, with --errors, its z-scores"
+    compare.add_argument("-o", "--output", metavar="DIFF.png", help=picture)
+    compare.add_argument("--json", action="store_true", help="print one JSON object on stdout")
+    compare.set_defaults(run=_compare)
     return parser
 
 
@@ -104,6 +130,23 @@ def _seed(text: str) -> int:
     return int(text)
 
 
+def _limit(text: str) -> float:
+    return _between(text, math.inf, "a number that is not negative")
+
+
+def _chance(text: str) -> float:
+    return _between(text, 1, "a number in [0, 1]")
+
+
+def _between(text: str, most: float, what: str) -> float:
+    try:
+        if 0 <= float(text) <= most:
+            return float(text)
+    except ValueError:
+        pass
+    raise argparse.ArgumentTypeError(f"{text!r} is not {what}")
+
+
 def _spp_list(text: str) -> list[int]:
     return [_positive(part) for part in text.split(",")]
 
@@ -118,7 +161,9 @@ def _numbers(option: str, name: str, text: str):
 
 def _load(options):
     import pathjax
+    from pathjax import runtime
 
+    runtime.keep_kernels()
     scene = pathjax.load_scene(options.scene, **dict(options.defines))
     return pathjax.with_parameters(scene, {name: _numbers("--set", name, text) for name, text in options.settings})
 
@@ -281,6 +326,35 @@ def _fit(options) -> int:
         files.write_png(prefix.with_name(prefix.name + ".png"), report.picture(fit, [target]))
     print(json.dumps(facts) if options.json else report.text(fit))
     return DONE if fit.converged else FAILED
+
+
+# ---- compare ------------------------------------------------------------------------------------------------------
+
+
+def _compare(options) -> int:
+    from pathjax import compare
+    from pathjax.io import image as files
+
+    if options.output and Path(options.output).suffix.lower() != ".png":
+        raise InputError(f"{options.output}: the picture is written as .png")
+    comparison = compare.compare(options.image, options.reference, options.errors)
+    if options.max_flip is not None and comparison.flip is None:
+        raise InputError("--max-flip: FLIP needs its authors' package: pip install 'pathjax[flip]'")
+    differ = []
+    if options.max_relmse is not None and comparison.rel_mse > options.max_relmse:
+        differ.append(f"relMSE {comparison.rel_mse:.4g} is above {options.max_relmse:g}")
+    if options.max_flip is not None and comparison.flip > options.max_flip:
+        differ.append(f"FLIP {comparison.flip:.4g} is above {options.max_flip:g}")
+    if options.errors and comparison.p < options.alpha:
+        differ.append(f"p {comparison.p:.3g} is below {options.alpha:g}")
+    lines = [compare.text(comparison), *(f"the images differ: {reason}" for reason in differ)]
+    if options.output:
+        picture, scale = compare.picture(comparison)
+        files.write_png(options.output, picture)
+        lines.insert(1, f"{options.output} shows differences of {scale:.3g} in full colour")
+    facts = {"image": options.image, "reference": options.reference, **compare.facts(comparison), "differ": differ}
+    print(json.dumps(facts) if options.json else "\n".join(lines))
+    return FAILED if differ else DONE
 
 
 # ---- info and bench -----------------------------------------------------------------------------------------------

@@ -48,12 +48,12 @@ def build(film: description.Film, dtype) -> Film:
         running = np.concatenate([[0], np.cumsum((f[1:] + f[:-1]) / 2 * np.diff(x))])
         knots = np.interp(np.linspace(0, running[-1], _STEPS + 1), running, x)
         gaussian = Gaussian(
-            jnp.asarray(knots, dtype),
-            jnp.asarray(film.filter_stddev, dtype),
-            jnp.asarray(film.filter_radius, dtype),
-            jnp.asarray(1 / running[-1], dtype),
+            np.asarray(knots, dtype),
+            np.asarray(film.filter_stddev, dtype),
+            np.asarray(film.filter_radius, dtype),
+            np.asarray(1 / running[-1], dtype),
         )
-    radius = jnp.asarray(film.filter_radius, dtype)
+    radius = np.asarray(film.filter_radius, dtype)
     return Film(gaussian, radius, film.filter, film.width, film.height, tuple(film.crop))
 
 

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pathjax import film
+from pathjax.compare import RELATIVE_FLOOR
 from pathjax.render import render_pixels
 from pathjax.scene import Scene
 
@@ -15,8 +16,6 @@ from pathjax.scene import Scene
 # at once. The schedule is fixed, not timed, so that the same command gives the same image.
 CHUNK_PIXELS = 1 << 14
 MAX_PASS_SPP = 16
-# Added to the squared reference in relative errors, so that black pixels do not rule them; as in relMSE.
-RELATIVE_FLOOR = 0.01
 
 
 class ProgressiveRender:

@@ -17,6 +17,7 @@ from pathjax.camera import Camera
 from pathjax.emitters import Emitters
 from pathjax.emitters.area import AreaLights
 from pathjax.emitters.constant import Constant
+from pathjax.errors import InputError
 from pathjax.film import Film
 from pathjax.named import About, Parameter
 from pathjax.shapes import geometry as geometry_module
@@ -52,23 +53,29 @@ def build(description: desc.Description, dtype=jnp.float32, split_rule: str = "s
     Args:
         dtype: of all reals; float64 needs `jax_enable_x64`.
         split_rule: of the hierarchy: "sah", "equal" or "middle".
+    Raises:
+        InputError: float64 without `jax_enable_x64`.
     """
+    if jax.dtypes.canonicalize_dtype(dtype) != np.dtype(dtype):
+        raise InputError('scene.build: float64 is off in JAX; call jax.config.update("jax_enable_x64", True) first')
     parameters: dict[str, Parameter] = {}
     materials = _build_materials(description, dtype, parameters)
     geometry, emitters, trees = _build_shapes(description, dtype, parameters, split_rule)
     integrator = description.integrator
     max_depth = UNBOUNDED if integrator.max_depth < 0 else integrator.max_depth
-    return Scene(
+    scene = Scene(
         camera_module.build(description.camera, description.film, dtype),
         film_module.build(description.film, dtype),
         geometry,
         materials,
         emitters,
-        jnp.int32(max_depth),
-        jnp.int32(integrator.rr_depth),
+        np.int32(max_depth),
+        np.int32(integrator.rr_depth),
         integrator.hide_emitters,
         About(description, parameters, trees),
     )
+    # NumPy up to here: `jnp.asarray` compiles a program for every shape that it meets.
+    return jax.device_put(scene)
 
 
 # ---- materials ----------------------------------------------------------------------------------------------------
@@ -102,7 +109,7 @@ def _build_materials(description, dtype, parameters) -> Materials:
             path = ("materials", "tables", len(tables))
             tables.append(make(rows[kind], dtype, parameters, path))
     codes = [[(-1, 0) if side is None else (kinds[side[0]], side[1]) for side in pair] for pair in sides]
-    return Materials(tuple(tables), jnp.asarray(np.reshape(codes, (-1, 2, 2)), jnp.int32))
+    return Materials(tuple(tables), np.asarray(np.reshape(codes, (-1, 2, 2)), np.int32))
 
 
 def _diffuse(bsdfs, dtype, parameters, path) -> DiffuseTable:
@@ -118,9 +125,9 @@ def _diffuse(bsdfs, dtype, parameters, path) -> DiffuseTable:
             reflectance[row] = bsdf.reflectance
             parameters[f"{bsdf.name}.reflectance"] = Parameter((*path, "reflectance"), (row,), (3,), (0, 1))
     if not textures:
-        return DiffuseTable(jnp.asarray(reflectance, dtype), None, None)
+        return DiffuseTable(np.asarray(reflectance, dtype), None, None)
     table = _textures(textures, dtype, parameters, (*path, "textures"))
-    return DiffuseTable(jnp.asarray(reflectance, dtype), jnp.asarray(texture_of), table)
+    return DiffuseTable(np.asarray(reflectance, dtype), np.asarray(texture_of), table)
 
 
 def _textures(textures, dtype, parameters, path) -> Textures:
@@ -143,14 +150,14 @@ def _textures(textures, dtype, parameters, path) -> Textures:
     bitmaps = None
     if images:
         bitmaps = Bitmaps(
-            jnp.asarray(np.concatenate(images), dtype),
-            jnp.asarray(first, jnp.int32),
-            jnp.asarray(size, jnp.int32),
-            jnp.asarray(nearest),
-            jnp.asarray(wrap, jnp.int32),
+            np.asarray(np.concatenate(images), dtype),
+            np.asarray(first, np.int32),
+            np.asarray(size, np.int32),
+            np.asarray(nearest),
+            np.asarray(wrap, np.int32),
         )
     checkers = any(isinstance(texture, desc.Checkerboard) for texture in textures)
-    return Textures(jnp.asarray(to_uv, dtype), jnp.asarray(colors, dtype) if checkers else None, bitmaps)
+    return Textures(np.asarray(to_uv, dtype), np.asarray(colors, dtype) if checkers else None, bitmaps)
 
 
 def _conductor(bsdfs, dtype, parameters, path) -> ConductorTable:
@@ -164,10 +171,10 @@ def _conductor(bsdfs, dtype, parameters, path) -> ConductorTable:
         if bsdf.eta is not None:
             parameters[f"{bsdf.name}.eta"] = Parameter((*path, "eta"), (row,), (3,), (0, np.inf))
             parameters[f"{bsdf.name}.k"] = Parameter((*path, "k"), (row,), (3,), (0, np.inf))
-    specular = jnp.asarray(np.stack([bsdf.specular_reflectance for bsdf in bsdfs]), dtype)
+    specular = np.asarray(np.stack([bsdf.specular_reflectance for bsdf in bsdfs]), dtype)
     if ideal.all():
         return ConductorTable(specular, None, None, None)
-    return ConductorTable(specular, jnp.asarray(eta, dtype), jnp.asarray(k, dtype), jnp.asarray(ideal))
+    return ConductorTable(specular, np.asarray(eta, dtype), np.asarray(k, dtype), np.asarray(ideal))
 
 
 def _dielectric(bsdfs, dtype, parameters, path) -> DielectricTable:
@@ -176,7 +183,7 @@ def _dielectric(bsdfs, dtype, parameters, path) -> DielectricTable:
             positive = (float(np.finfo(np.float32).tiny), np.inf)
             parameters[f"{bsdf.name}.{name}"] = Parameter((*path, name), (row,), (), positive)
     int_ior, ext_ior = (np.array([getattr(bsdf, name) for bsdf in bsdfs]) for name in ("int_ior", "ext_ior"))
-    return DielectricTable(jnp.asarray(int_ior, dtype), jnp.asarray(ext_ior, dtype))
+    return DielectricTable(np.asarray(int_ior, dtype), np.asarray(ext_ior, dtype))
 
 
 # ---- shapes and lights --------------------------------------------------------------------------------------------
@@ -267,12 +274,12 @@ def _build_shapes(description, dtype, parameters, split_rule):
             names.append(name)
     geometry = Geometry(
         tuple(tables),
-        jnp.asarray([s for name in names for s in kinds[name].shape], jnp.int32),
-        jnp.asarray([i for name in names for i in kinds[name].light], jnp.int32),
+        np.asarray([s for name in names for s in kinds[name].shape], np.int32),
+        np.asarray([i for name in names for i in kinds[name].light], np.int32),
     )
     constant = None
     if description.background is not None:
-        constant = Constant(jnp.asarray(description.background, dtype))
+        constant = Constant(np.asarray(description.background, dtype))
         index = ("emitters", "constant", "radiance")
         parameters[f"{description.background_name}.radiance"] = Parameter(index, (), (3,), (0, np.inf))
     area = _area_lights(radiance, lights, names, dtype) if lights else None
@@ -284,15 +291,15 @@ def _area_lights(radiance, lights, names, dtype) -> AreaLights:
     cdf, cdf_first = None, None
     if any(a is not None for a in areas):
         sizes = [0 if a is None else len(a) for a in areas]
-        cdf_first = jnp.asarray(np.cumsum([0, *sizes[:-1]]), jnp.int32)
-        cdf = jnp.asarray(np.concatenate([np.cumsum(a) / np.sum(a) for a in areas if a is not None]), dtype)
+        cdf_first = np.asarray(np.cumsum([0, *sizes[:-1]]), np.int32)
+        cdf = np.asarray(np.concatenate([np.cumsum(a) / np.sum(a) for a in areas if a is not None]), dtype)
     return AreaLights(
-        jnp.asarray(np.stack(radiance), dtype),
-        jnp.asarray(emitter, jnp.int32),
-        jnp.asarray(area, dtype),
-        jnp.asarray([sorted(set(kind), key=names.index).index(k) for k in kind], jnp.int32),
-        jnp.asarray(first, jnp.int32),
-        jnp.asarray(count, jnp.int32),
+        np.asarray(np.stack(radiance), dtype),
+        np.asarray(emitter, np.int32),
+        np.asarray(area, dtype),
+        np.asarray([sorted(set(kind), key=names.index).index(k) for k in kind], np.int32),
+        np.asarray(first, np.int32),
+        np.asarray(count, np.int32),
         cdf,
         cdf_first,
         tuple(names.index(k) for k in sorted(set(kind), key=names.index)),
@@ -307,7 +314,7 @@ def _spheres(parts, name, dtype, rule):
     numbers, bounds = sphere.leaf_numbers(balls), sphere.bounds(balls)
     leaves, tree, built = geometry_module.leaves_of(numbers, *bounds, dtype, rule)
     to_local = np.swapaxes(rotation, 1, 2)
-    arrays = (jnp.asarray(x, dtype) for x in (balls, to_local, sign))
+    arrays = (np.asarray(x, dtype) for x in (balls, to_local, sign))
     return Spheres(leaves, tree, *arrays), built
 
 
@@ -316,7 +323,7 @@ def _planars(parts, name, dtype, rule):
     disk = name == "disk"
     bounds = planar.bounds(frames, disk)
     leaves, tree, built = geometry_module.leaves_of(planar.leaf_numbers(frames), *bounds, dtype, rule)
-    return Planar(leaves, tree, jnp.asarray(frames, dtype), disk), built
+    return Planar(leaves, tree, np.asarray(frames, dtype), disk), built
 
 
 def _triangles(parts, name, dtype, rule):
@@ -326,10 +333,10 @@ def _triangles(parts, name, dtype, rule):
         if all(part[place] is None for part in parts):
             return None
         filled = [default(part[0]) if part[place] is None else part[place] for part in parts]
-        return jnp.asarray(np.concatenate(filled), dtype)
+        return np.asarray(np.concatenate(filled), dtype)
 
     normals = optional(1, triangle.face_normals)
     uv = optional(2, lambda v: np.broadcast_to(np.array([[0, 0], [1, 0], [0, 1]], float), (len(v), 3, 2)))
     bounds = triangle.bounds(vertices)
     leaves, tree, built = geometry_module.leaves_of(triangle.leaf_numbers(vertices), *bounds, dtype, rule)
-    return Triangles(leaves, tree, jnp.asarray(vertices, dtype), normals, uv), built
+    return Triangles(leaves, tree, np.asarray(vertices, dtype), normals, uv), built

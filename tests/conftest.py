@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import os
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -19,6 +20,8 @@ from pathjax.integrators import pixel
 from pathjax.io import mitsuba_xml
 from pathjax.render import _render_pixels
 from pathjax.scene import build
+
+os.environ["PATHJAX_CACHE"] = "0"  # tests leave the user's cache of kernels alone, and compile what they test
 
 ROOT = Path(__file__).resolve().parents[1]
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import pathjax as pj
+from pathjax.scene import build
 
 ZOO = """
 <bsdf type="diffuse" id="paint"><rgb name="reflectance" value="0.1, 0.2, 0.3"/></bsdf>
@@ -232,3 +233,10 @@ def test_derivative_passes_through_with_parameters(zoo):
         return sum(v.sum() for v in pj.parameters(pj.with_parameters(zoo, {"paint.reflectance": color})).values())
 
     np.testing.assert_array_equal(jax.grad(total)(jnp.full(3, 0.5)), [1, 1, 1])
+
+
+def test_float64_is_refused_where_jax_would_cut_it_down(zoo, x64):
+    with pytest.raises(pj.InputError, match="jax_enable_x64"):
+        build(zoo.about.description, jnp.float64)
+    with x64():
+        assert build(zoo.about.description, jnp.float64).camera.origin.dtype == jnp.float64

@@ -21,10 +21,11 @@ import pathjax
 from pathjax import film
 from pathjax.bench import embree_peer, mitsuba_peer
 from pathjax.camera import sample_ray
+from pathjax.compare import rel_mse
 from pathjax.core.warp import square_to_sphere
 from pathjax.errors import InputError
 from pathjax.io.files import write_text
-from pathjax.progressive import RELATIVE_FLOOR, ProgressiveRender
+from pathjax.progressive import ProgressiveRender
 from pathjax.query import _closest_hit
 from pathjax.shapes.triangle import Triangles
 
@@ -77,12 +78,6 @@ def _processor() -> str:
         return next(line.split(":")[1].strip() for line in lines if line.startswith("model name"))
     except (OSError, StopIteration):
         return platform.processor() or platform.machine()
-
-
-def rel_mse(image, reference) -> float:
-    """mean((I - R)^2 / (R^2 + 0.01)); nan if the image holds one."""
-    reference = np.asarray(reference, float)
-    return float(np.mean((np.asarray(image, float) - reference) ** 2 / (reference**2 + RELATIVE_FLOOR)))
 
 
 def measure(file, defines, spps, repeat, reference_spp, against, say) -> dict:

@@ -7,11 +7,10 @@ import math
 import numpy as np
 
 from pathjax.inverse.fitting import Fit
+from pathjax.picture import GAP, side_by_side, signed_colors
 
 # Residuals of this many standard deviations are shown in full colour.
 _FULL_SCALE = 3
-_LEAST_WIDTH = 256
-_GAP = 4
 
 
 def facts(fit: Fit) -> dict:
@@ -56,13 +55,8 @@ def picture(fit: Fit, targets) -> np.ndarray:
     """(H, W, 3) linear RGB: a row for each view, of target, fit, and residual: blue too dark, red too bright."""
     rows = []
     for target, image, residual in zip(targets, fit.images, fit.residuals, strict=True):
-        share = np.clip(residual.mean(-1, keepdims=True) * math.sqrt(3) / _FULL_SCALE, -1, 1)
-        red, blue = np.array([1, 0.05, 0.02]), np.array([0.02, 0.1, 1])
-        shown = 1 - np.abs(share) * (1 - np.where(share > 0, red, blue))
-        zoom = max(1, -(-_LEAST_WIDTH // target.shape[1]))
-        parts = [np.repeat(np.repeat(part, zoom, 0), zoom, 1) for part in (target, image, shown)]
-        gap = np.ones((parts[0].shape[0], _GAP, 3))
-        rows.append(np.concatenate([parts[0], gap, parts[1], gap, parts[2]], 1))
+        share = residual.mean(-1) * math.sqrt(3) / _FULL_SCALE
+        rows.append(side_by_side([target, image, signed_colors(share)]))
     width = max(row.shape[1] for row in rows)
-    padded = [np.pad(row, ((0, _GAP), (0, width - row.shape[1]), (0, 0)), constant_values=1) for row in rows]
-    return np.concatenate(padded)[:-_GAP].astype(np.float32)
+    padded = [np.pad(row, ((0, GAP), (0, width - row.shape[1]), (0, 0)), constant_values=1) for row in rows]
+    return np.concatenate(padded)[:-GAP].astype(np.float32)

@@ -3,19 +3,13 @@
 import json
 from pathlib import Path
 
-import numpy as np
 import pytest
 
-from pathjax.bench.bench import _line, _row, rel_mse
+from pathjax.bench.bench import _line, _row
 from pathjax.cli import main
 
 CORNELL = str(Path(__file__).resolve().parents[2] / "scenes" / "cornell_box.xml")
 QUICK = ["bench", CORNELL, "-D", "res=8", "--spp", "2,32", "--reference-spp", "512", "--repeat", "2"]
-
-
-def test_rel_mse_of_a_known_difference():
-    reference = np.full((2, 2, 3), 0.3)
-    assert rel_mse(reference + 0.1, reference) == pytest.approx(0.01 / 0.1)
 
 
 def test_bench_reports_speed_against_error(tmp_path, capsys):
