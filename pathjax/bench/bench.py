@@ -23,10 +23,11 @@ from pathjax.bench import embree_peer, mitsuba_peer
 from pathjax.camera import sample_ray
 from pathjax.core.warp import square_to_sphere
 from pathjax.errors import InputError
+from pathjax.estimate import RELATIVE_FLOOR
 from pathjax.io.files import write_text
-from pathjax.progressive import RELATIVE_FLOOR, ProgressiveRender
 from pathjax.query import _closest_hit
 from pathjax.shapes.triangle import Triangles
+from pathjax.until import render_until
 
 PEER_SAMPLERS = ("independent", "multijitter", "ldsampler")
 RAYS = 1 << 18
@@ -100,10 +101,7 @@ def measure(file, defines, spps, repeat, reference_spp, against, say) -> dict:
     compile_seconds = cold - (time.perf_counter() - started)
 
     say(f"{file}: reference, {reference_spp} spp")
-    reference = ProgressiveRender(scene, reference_spp, REFERENCE_SEED)
-    for _ in reference:
-        pass
-    reference = reference.image()
+    reference = render_until(scene, spp=reference_spp, seed=REFERENCE_SEED).image
 
     seconds = {spp: [] for spp in spps}
     errors = {spp: [] for spp in spps}

@@ -1,0 +1,105 @@
+"""How wrong an image is, from the variance between its replicates: of a pixel, and of the whole.
+
+Three degrees of freedom are few, so a pixel borrows from its neighbours. Where nothing has yet been seen of a rare
+light, by no sample of a pixel and its neighbours, no estimate can know of it: these numbers are then too small.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+# Added to the squared reference in relative errors, so that black pixels do not rule them; as in relMSE.
+RELATIVE_FLOOR = 0.01
+# Weight of a pixel's own variance; its eight neighbours share the rest.
+OWN_SHARE = 0.25
+# One-sided 95 % of a normal distribution.
+CONFIDENCE = 1.645
+# Least share of the samples that a pixel gets, of the mean.
+LEAST_SHARE = 0.25
+
+
+class ImageError(NamedTuple):
+    """sqrt(relMSE) of an image against the truth; nan where nothing is known."""
+
+    estimate: float
+    bound: float  # that the error exceeds in some 5 % of renders
+
+
+def standard_error(variance: np.ndarray) -> np.ndarray:
+    """(H, W, 3) of the image, from the variances (H, W, 3) of single pixels; nan where no neighbour knows one.
+
+    Too small where the variance of a pixel is many times its neighbours' and it was lucky: edges of caustics,
+    fireflies.
+    """
+    around = _around(variance, 1)
+    known = np.isfinite(around) & np.isfinite(variance)
+    return np.sqrt(np.where(known, OWN_SHARE * variance + (1 - OWN_SHARE) * around, variance))
+
+
+def contributions(image: np.ndarray, variance: np.ndarray) -> np.ndarray:
+    """(...,) share of each pixel in relMSE, from (..., 3); nan where not finite.
+
+    image^2 - variance estimates the squared truth without bias. Taking image^2 would halve the error of noisy images,
+    since what makes a pixel too bright makes its variance large.
+    """
+    with np.errstate(invalid="ignore", over="ignore"):
+        relative = variance / (np.maximum(image**2 - variance, 0) + RELATIVE_FLOOR)
+    relative = relative.mean(-1)
+    return np.where(np.isfinite(relative), relative, np.nan)
+
+
+def image_error(image: np.ndarray, variance: np.ndarray) -> ImageError:
+    """Of (..., 3). Pixels that are not finite are left out.
+
+    The bound takes pixels as draws from a population: where few of them make up most of the error, their number is
+    small and the bound high.
+    """
+    shares = contributions(image, variance).astype(float)
+    known = shares[np.isfinite(shares)]
+    if not known.size:
+        return ImageError(np.nan, np.nan)
+    total = known.sum()
+    uncertainty = np.sqrt((known**2).sum()) / total if total > 0 else 0.0
+    rel_mse = total / known.size
+    return ImageError(float(np.sqrt(rel_mse)), float(np.sqrt(rel_mse * (1 + CONFIDENCE * uncertainty))))
+
+
+def sample_weights(image: np.ndarray, variance: np.ndarray) -> np.ndarray:
+    """(H, W) float32 of mean 1: how samples are best spread over the pixels, from equally many in each.
+
+    In proportion to the relative standard deviation, in the 24 pixels around a pixel and never in itself: so its
+    number of samples does not depend on what they were (but through the mean of all weights, by 1/N), and its mean
+    stays unbiased.
+    """
+    with np.errstate(invalid="ignore", over="ignore"):
+        relative = (variance / (image**2 + RELATIVE_FLOOR)).mean(-1, keepdims=True)
+    weights = np.sqrt(_around(np.where(np.isfinite(relative), relative, np.nan), 2))[..., 0]
+    known = np.isfinite(weights)
+    if not known.any() or not weights[known].any():
+        return np.ones(weights.shape, np.float32)
+    average = weights[known].mean()
+    weights = np.maximum(np.where(known, weights, average), LEAST_SHARE * average)
+    return (weights / weights.mean()).astype(np.float32)
+
+
+def _around(x: np.ndarray, radius: int) -> np.ndarray:
+    """(H, W, C) mean over the square of pixels around each pixel, without itself; what is not finite is left out."""
+    known = np.isfinite(x)
+    values = np.where(known, x, 0)
+    total = _box(values, radius) - values
+    count = _box(known.astype(x.dtype), radius) - known
+    return np.where(count > 0, np.maximum(total, 0) / np.maximum(count, 1), np.nan).astype(x.dtype)
+
+
+def _box(x: np.ndarray, radius: int) -> np.ndarray:
+    """Sums over squares, cut off at the border."""
+    for axis in (0, 1):
+        total = x.copy()
+        line, out = np.moveaxis(x, axis, 0), np.moveaxis(total, axis, 0)
+        for shift in range(1, radius + 1):
+            out[shift:] += line[:-shift]
+            out[:-shift] += line[shift:]
+        x = total
+    return x
