@@ -12,6 +12,7 @@ import numpy as np
 from pathjax import film, replicates
 from pathjax.errors import InputError
 from pathjax.integrators import aov, path, pixel
+from pathjax.progressive import CHUNK_PIXELS
 from pathjax.runtime import native_map
 from pathjax.scene import Scene
 
@@ -31,19 +32,22 @@ def render_aovs(scene: Scene, names: Sequence[str], spp: int = MAX_SPP, seed: in
     """
     check_names(names, NAMES)
     path.check_sampling("mis", spp, seed)
-    count = np.full(film.pixel_count(scene.film), min(spp, MAX_SPP), np.int32)
-    shares = replicates.shares(count)
-    pixels = np.arange(len(count), dtype=np.int32)
-    kernel_scene, total = replace(scene, about=None), None
-    for replicate_seed, share in zip(replicates.seeds(seed), shares, strict=True):
-        if not share.any():
-            continue
-        means = _render_aovs(kernel_scene, pixels, *pixel.numbers(pixels, 0, share, replicate_seed))
-        weighted = [np.asarray(x, np.float32) * (share / count).astype(np.float32)[:, None] for x in means]
-        total = weighted if total is None else [a + b for a, b in zip(total, weighted, strict=True)]
+    spp = min(spp, MAX_SPP)
+    shares = replicates.shares(np.array([spp], np.int32))
+    count, seeds = film.pixel_count(scene.film), replicates.seeds(seed)
+    chunk = min(CHUNK_PIXELS, count)
+    images = [np.empty((count, width), np.float32) for width in (1, 3, 3)]
+    for first in range(0, count, chunk):
+        # The last call repeats the last pixel up to full length.
+        pixels = np.minimum(np.arange(first, first + chunk, dtype=np.int32), count - 1)
+        tiled = np.tile(pixels, replicates.COUNT)
+        numbers = pixel.numbers(tiled, 0, *(np.repeat(x, chunk) for x in (np.maximum(shares, 1), seeds)))
+        for image, means in zip(images, _render_aovs(replace(scene, about=None), tiled, *numbers), strict=True):
+            means = np.asarray(means, np.float32).reshape(replicates.COUNT, chunk, -1)
+            mean = (means * (shares / np.float32(spp))[..., None]).sum(0, dtype=np.float32)
+            image[first : first + chunk] = mean[: count - first]
     height, width = film.image_shape(scene.film)
-    images = dict(zip(NAMES, total, strict=True))
-    return {name: images[name].reshape(height, width, -1) for name in names}
+    return {name: dict(zip(NAMES, images, strict=True))[name].reshape(height, width, -1) for name in names}
 
 
 def check_names(names: Sequence[str], known: Sequence[str]) -> None:

@@ -1,5 +1,4 @@
-"""A render's state on disk: whoever kills the process finds the last whole one, and goes on from there to the same bits.
-"""
+"""A render's state on disk: a process that was killed left the last whole one, which leads on to the same bits."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Replicates: an image is the mean of COUNT independent randomisations of one sequence, whose spread tells its error.
 
-Sample i of a pixel is sample i // COUNT of replicate i % COUNT. Arrays are NumPy: means (COUNT, N, 3) of each replicate,
-count (N,) samples of all replicates together.
+Sample i of a pixel is sample i // COUNT of replicate i % COUNT. Arrays are NumPy: means (COUNT, N, 3) of each
+replicate, count (N,) samples of all replicates together.
 """
 
 from __future__ import annotations

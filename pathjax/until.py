@@ -17,7 +17,6 @@ from pathjax import estimate, film, progressive, replicates
 from pathjax.checkpoint import Checkpoint, identity
 from pathjax.errors import InputError
 from pathjax.integrators import path
-from pathjax.progressive import State
 from pathjax.scene import Scene
 
 # Samples of every pixel before their number may differ.
@@ -26,6 +25,7 @@ PILOT_SPP = 16
 # lacking, so as not to pass it by, but never less than LEAST_GROWTH.
 MOST_GROWTH, LEAST_GROWTH, CAUTION = 2.0, 1.05, 0.75
 MAX_SPP = 2**31 - 1
+UNKNOWN = estimate.ImageError(math.nan, math.nan)
 
 
 @dataclass(frozen=True)
@@ -71,40 +71,87 @@ def render_until(
     Raises:
         InputError: an argument is out of range, or nothing to stop at is given; a checkpoint of another render, a
             damaged one, or one that cannot be written (before rendering starts, where that can be known).
-        KeyboardInterrupt: interrupted before the first samples. Later, Ctrl-C and SIGTERM end the render and return
-            what is done (in the main thread; while the kernel compiles, they are heard afterwards).
+        KeyboardInterrupt: interrupted before the first samples. Later, Ctrl-C and SIGTERM end the render, which
+            returns what is done (in the main thread, where alone Python hears them).
     """
-    _check(target_error, time_limit, spp)
-    path.check_sampling(strategy, MAX_SPP if spp is None else spp, seed)
-    adaptive = target_error is not None or time_limit is not None
-    state = progressive.start(scene)
-    progressive.plan(state, min(PILOT_SPP, spp or MAX_SPP) if adaptive else spp)
-    store = None
-    if checkpoint is not None:
-        store = Checkpoint(checkpoint, identity(scene, seed, strategy, adaptive))
-        state = store.load(state)
-        store.save(state)
-    if not adaptive and spp > state.spp:
-        progressive.plan(state, spp)
-    limits = _Limits(target_error, time_limit, spp or MAX_SPP)
+    render = Render(scene, target_error, time_limit, spp, seed, strategy, checkpoint)
+    render.compile()
+    return render.run(progress)
 
-    with _Interrupts() as interrupts, _bar(progress) as show:
+
+class Render:
+    """What `render_until` does, in steps: check the arguments and take up the checkpoint, compile, run."""
+
+    def __init__(self, scene, target_error, time_limit, spp, seed, strategy, checkpoint):
+        _check(target_error, time_limit, spp)
+        path.check_sampling(strategy, MAX_SPP if spp is None else spp, seed)
+        self.scene, self.seed, self.strategy = scene, seed, strategy
+        self.target_error, self.time_limit, self.spp = target_error, time_limit, MAX_SPP if spp is None else spp
+        self.compile_seconds = 0.0
+        adaptive = target_error is not None or time_limit is not None
+        self.state, self.checkpoint = progressive.start(scene), None
+        progressive.plan(self.state, min(PILOT_SPP, self.spp))
+        if checkpoint is not None:
+            self.checkpoint = Checkpoint(checkpoint, identity(scene, seed, strategy, adaptive))
+            self.state = self.checkpoint.load(self.state)
+            self.checkpoint.save(self.state)
+        if not adaptive or self.state.spp > self.spp:
+            progressive.plan(self.state, self.spp)
+
+    def compile(self) -> None:
         started = time.perf_counter()
-        progressive.compile(scene, strategy)
-        compile_seconds = time.perf_counter() - started
-        reason = _run(scene, state, seed, strategy, limits, interrupts, store, show)
-    if store is not None:
-        store.save(state)
-    if not state.count.any():
-        raise KeyboardInterrupt
-    return _result(scene, state, compile_seconds, reason)
+        progressive.compile(self.scene, self.strategy)
+        self.compile_seconds += time.perf_counter() - started
 
+    def run(self, progress: bool = False) -> RenderResult:
+        with _Interrupts() as interrupts, _bar(progress) as show:
+            reason = self._run(interrupts, show)
+            if self.checkpoint is not None:
+                self.checkpoint.save(self.state)
+        if not self.state.count.any():
+            raise KeyboardInterrupt
+        return self._result(reason)
 
-@dataclass(frozen=True)
-class _Limits:
-    error: float | None
-    seconds: float | None
-    spp: int
+    def _run(self, interrupts, show) -> str:
+        """Extend the state until there is a reason to stop. What it becomes depends on itself alone, not on time."""
+        state, error = self.state, UNKNOWN
+        earlier, started = state.seconds, time.perf_counter()
+        while True:
+            calls = progressive.extend(self.scene, state, self.seed, self.strategy)
+            while True:
+                if interrupts.heard:
+                    return "interrupted"
+                if self.time_limit is not None and state.seconds >= self.time_limit:
+                    return "time limit"
+                if next(calls, state) is state:
+                    break
+                state.seconds = earlier + time.perf_counter() - started
+                if self.checkpoint is not None:
+                    self.checkpoint.save_if_due(state)
+                show(self, error)
+            image, variance = self._estimates()
+            error = estimate.image_error(image, variance)
+            if self.target_error is not None and error.bound <= self.target_error:
+                return "target error"
+            if state.spp >= self.spp:
+                return "spp"
+            if state.spp == PILOT_SPP:
+                state.weights = estimate.sample_weights(image, variance).ravel()
+            progressive.plan(state, min(_next_spp(state.spp, error, self.target_error), self.spp))
+
+    def _estimates(self) -> tuple[np.ndarray, np.ndarray]:
+        """Image and its variance, (H, W, 3) each."""
+        shape = (*film.image_shape(self.scene.film), 3)
+        return self.state.image().reshape(shape), self.state.variance().reshape(shape)
+
+    def _result(self, reason) -> RenderResult:
+        image, variance = self._estimates()
+        count = self.state.count.reshape(image.shape[:2])
+        # While some pixels know nothing of their error, neither does the image.
+        error = UNKNOWN if count.min() < 2 else estimate.image_error(image, variance)
+        standard_error = estimate.standard_error(variance)
+        seconds = self.compile_seconds, self.state.seconds
+        return RenderResult(image, standard_error, float(count.mean()), count, *seconds, *error, reason)
 
 
 def _check(target_error, time_limit, spp) -> None:
@@ -117,60 +164,14 @@ def _check(target_error, time_limit, spp) -> None:
         raise InputError(f"spp = {spp}; it must be an integer in [1, 2^31)")
 
 
-def _run(scene, state: State, seed, strategy, limits: _Limits, interrupts, store, show) -> str:
-    """Extend the state until there is a reason to stop. What a round does depends on the state alone, never on time."""
-    shape = (*film.image_shape(scene.film), 3)
-    earlier, started = state.seconds, time.perf_counter()
-    error = estimate.ImageError(math.nan, math.nan)
-    while True:
-        calls = progressive.extend(scene, state, seed, strategy)
-        while True:
-            if interrupts.heard:
-                return "interrupted"
-            if limits.seconds is not None and state.seconds >= limits.seconds:
-                return "time limit"
-            if next(calls, state) is state:
-                break
-            state.seconds = earlier + time.perf_counter() - started
-            if store is not None:
-                store.save_if_due(state)
-            show(state, limits, error)
-        image, variance = state.image().reshape(shape), state.variance().reshape(shape)
-        error = estimate.image_error(image, variance)
-        if limits.error is not None and error.bound <= limits.error:
-            return "target error"
-        if state.spp >= limits.spp:
-            return "spp"
-        if state.spp == PILOT_SPP:
-            state.weights = estimate.sample_weights(image, variance).ravel()
-        progressive.plan(state, _next_spp(state.spp, error, limits))
-
-
-def _next_spp(spp: int, error: estimate.ImageError, limits: _Limits) -> int:
+def _next_spp(spp: int, error: estimate.ImageError, target: float | None) -> int:
+    if spp < PILOT_SPP:
+        return PILOT_SPP
     growth = MOST_GROWTH
-    if limits.error is not None and math.isfinite(error.bound):
-        lacking = (error.bound / limits.error) ** 2
+    if target is not None and math.isfinite(error.bound):
+        lacking = (error.bound / target) ** 2
         growth = min(max(lacking**CAUTION, LEAST_GROWTH), MOST_GROWTH)
-    step = math.ceil(spp * (growth - 1) / replicates.COUNT) * replicates.COUNT
-    return min(spp + step, limits.spp)
-
-
-def _result(scene, state: State, compile_seconds, reason) -> RenderResult:
-    height, width = film.image_shape(scene.film)
-    image = state.image().reshape(height, width, 3)
-    variance = state.variance().reshape(height, width, 3)
-    # While some pixels know nothing of their error, neither does the image.
-    error = estimate.ImageError(math.nan, math.nan) if state.count.min() < 2 else estimate.image_error(image, variance)
-    return RenderResult(
-        image,
-        estimate.standard_error(variance),
-        float(state.count.mean()),
-        state.count.reshape(height, width),
-        compile_seconds,
-        state.seconds,
-        *error,
-        reason,
-    )
+    return spp + math.ceil(spp * (growth - 1) / replicates.COUNT) * replicates.COUNT
 
 
 class _Interrupts:
@@ -201,32 +202,31 @@ class _Interrupts:
 
 @contextmanager
 def _bar(wanted: bool) -> Iterator:
-    """A function (state, limits, error of the last round) that shows how far the render is."""
+    """A function (Render, error at the end of the last round) that shows how far it is."""
     if not wanted:
         yield lambda *_: None
         return
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-    columns = TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[status]}"), TimeRemainingColumn()
+    columns = TextColumn("rendering"), BarColumn(), TextColumn("{task.fields[status]}"), TimeRemainingColumn()
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task("compiling", total=1.0, status="")
+        task = bar.add_task("", total=1.0, status="")
 
-        def show(state: State, limits: _Limits, error: estimate.ImageError) -> None:
-            spp = state.count.mean()
+        def show(render: Render, error: estimate.ImageError) -> None:
+            spp = render.state.count.mean()
             status = f"{spp:.4g} spp"
             if math.isfinite(error.estimate):
                 status += f"  error {error.estimate:.2%}"
-            done = _share_done(state, spp, limits, error)
-            bar.update(task, completed=done, description="rendering", status=status)
+            bar.update(task, completed=_share_done(render, spp, error), status=status)
 
         yield show
 
 
-def _share_done(state: State, spp, limits: _Limits, error: estimate.ImageError) -> float:
-    shares = [spp / limits.spp]
-    if limits.seconds is not None:
-        shares.append(state.seconds / limits.seconds)
-    if limits.error is not None and error.bound > 0:
-        shares.append(spp / max(state.spp * (error.bound / limits.error) ** 2, 1))
+def _share_done(render: Render, spp: float, error: estimate.ImageError) -> float:
+    shares = [spp / render.spp]
+    if render.time_limit is not None:
+        shares.append(render.state.seconds / render.time_limit)
+    if render.target_error is not None and error.bound > 0:
+        shares.append(spp / max(render.state.spp * (error.bound / render.target_error) ** 2, 1))
     return min(max(shares), 1.0)
