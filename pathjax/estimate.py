@@ -1,7 +1,7 @@
 """How wrong an image is, from the variance between its replicates: of a pixel, and of the whole.
 
-Three degrees of freedom are few, so a pixel borrows from its neighbours. Where nothing has yet been seen of a rare
-light, by no sample of a pixel and its neighbours, no estimate can know of it: these numbers are then too small.
+Three degrees of freedom are few, so a pixel borrows from its neighbours. Of light that no sample of a pixel and its
+neighbours has met these numbers cannot know: they are then too small.
 """
 
 from __future__ import annotations
@@ -27,15 +27,19 @@ class ImageError(NamedTuple):
     bound: float  # that the error exceeds in some 5 % of renders
 
 
-def standard_error(variance: np.ndarray) -> np.ndarray:
-    """(H, W, 3) of the image, from the variances (H, W, 3) of single pixels; nan where no neighbour knows one.
+def standard_error(image: np.ndarray, variance: np.ndarray, count: np.ndarray) -> np.ndarray:
+    """(H, W, 3) of the image; nan where a pixel is not finite or has fewer than 2 samples.
 
-    Too small where the variance of a pixel is many times its neighbours' and it was lucky: edges of caustics,
-    fireflies.
+    Never less than image / (3 count): among the 9 count samples of the neighbourhood, which may all agree, the next
+    could have been twice as bright. Without this, what is reflected in glass by one path in a hundred had no error.
+    Too small where the variance of a pixel is many times its neighbours' and it was lucky, and where pixels are black.
+
+    Args:
+        variance: (H, W, 3) of each pixel of the image (H, W, 3); count: (H, W) its samples.
     """
     around = _around(variance, 1)
-    known = np.isfinite(around) & np.isfinite(variance)
-    return np.sqrt(np.where(known, OWN_SHARE * variance + (1 - OWN_SHARE) * around, variance))
+    pooled = np.where(np.isfinite(around), OWN_SHARE * variance + (1 - OWN_SHARE) * around, variance)
+    return np.sqrt(np.maximum(pooled, (image / (3 * np.maximum(count, 1)).astype(image.dtype)[..., None]) ** 2))
 
 
 def contributions(image: np.ndarray, variance: np.ndarray) -> np.ndarray:
@@ -54,7 +58,7 @@ def image_error(image: np.ndarray, variance: np.ndarray) -> ImageError:
     """Of (..., 3). Pixels that are not finite are left out.
 
     The bound takes pixels as draws from a population: where few of them make up most of the error, their number is
-    small and the bound high. Where single samples make up most of it (skewness beyond 6) the error exceeds it more often.
+    small and the bound high. Where single samples do (skewness beyond 6), the error exceeds it more often.
     """
     shares = contributions(image, variance).astype(float)
     known = shares[np.isfinite(shares)]

@@ -149,7 +149,7 @@ class Render:
         count = self.state.count.reshape(image.shape[:2])
         # While some pixels know nothing of their error, neither does the image.
         error = UNKNOWN if count.min() < 2 else estimate.image_error(image, variance)
-        standard_error = estimate.standard_error(variance)
+        standard_error = estimate.standard_error(image, variance, count)
         seconds = self.compile_seconds, self.state.seconds
         return RenderResult(image, standard_error, float(count.mean()), count, *seconds, *error, reason)
 

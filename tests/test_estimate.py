@@ -65,7 +65,7 @@ def test_standard_errors_are_calibrated(sigma):
     """A share of 1/4 of the own variance and 3/32 of each neighbour's makes 22.6 degrees of freedom, so z has the
     variance 22.6 / 20.6 = 1.10 (a little more at the border); 4 standard errors of the 12,288 z^2 are 0.06."""
     image, variance = normal_image(np.random.default_rng(0), sigma)
-    z = (image - 1) / estimate.standard_error(variance)
+    z = (image - 1) / estimate.standard_error(image, variance, np.full((64, 64), 64))
     assert 1.03 < (z**2).mean() < 1.17
 
 
@@ -74,14 +74,14 @@ def test_pooling_is_a_weighted_mean_of_the_square_around():
     weights = np.full((3, 3, 1), (1 - estimate.OWN_SHARE) / 8)
     weights[1, 1] = estimate.OWN_SHARE
     expected = ndimage.correlate(variance.astype(float), weights)
-    pooled = estimate.standard_error(variance) ** 2
+    pooled = estimate.standard_error(np.zeros_like(variance), variance, np.ones((7, 9))) ** 2
     np.testing.assert_allclose(pooled[1:-1, 1:-1], expected[1:-1, 1:-1], rtol=1e-5)
 
 
 def test_pixels_that_are_not_finite_do_not_spread():
     image, variance = normal_image(np.random.default_rng(2), 1.0)
     image[10, 10], variance[10, 10] = np.nan, np.nan
-    errors = estimate.standard_error(variance)
+    errors = estimate.standard_error(image, variance, np.full((64, 64), 64))
     assert np.isnan(errors[10, 10]).all() and np.isfinite(errors).mean() > 0.999
     assert np.isfinite(estimate.image_error(image, variance)).all()
     assert np.isfinite(estimate.sample_weights(image, variance)).all()
@@ -90,15 +90,22 @@ def test_pixels_that_are_not_finite_do_not_spread():
 @pytest.mark.parametrize("shape", [(1, 1, 3), (1, 5, 3), (2, 2, 3)])
 def test_images_smaller_than_the_neighbourhood(shape):
     variance = np.full(shape, 0.25, np.float32)
-    np.testing.assert_allclose(estimate.standard_error(variance), 0.5)
-    np.testing.assert_allclose(estimate.sample_weights(np.ones(shape, np.float32), variance), 1)
+    image = np.ones(shape, np.float32)
+    np.testing.assert_allclose(estimate.standard_error(image, variance, np.full(shape[:2], 64)), 0.5)
+    np.testing.assert_allclose(estimate.sample_weights(image, variance), 1)
+
+
+def test_agreement_of_few_samples_is_not_certainty():
+    image = np.full((5, 5, 3), 6.0, np.float32)
+    errors = estimate.standard_error(image, np.zeros_like(image), np.full((5, 5), 20))
+    np.testing.assert_allclose(errors, 6 / 60)
 
 
 # ---- error of the image ---------------------------------------------------------------------------------------------
 
 
 def test_image_error_is_the_root_of_rel_mse():
-    """Of 12,288 normal pixels: relative standard error sqrt(2/3 / 12288) / 2 = 0.4 %, four of them and the curvature."""
+    """Of 12,288 normal values: its relative standard error is sqrt(2/3 / 12288) / 2 = 0.4 %; four of them."""
     image, variance = normal_image(np.random.default_rng(3), 0.5)
     error = estimate.image_error(image, variance)
     assert error.estimate == pytest.approx(0.5 / 8 / np.sqrt(1.01), rel=0.02)

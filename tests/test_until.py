@@ -10,6 +10,7 @@ import pathjax as pj
 from pathjax import estimate, progressive, until
 from pathjax.bench.bench import rel_mse
 
+
 @pytest.fixture(scope="module")
 def cornell(shipped):
     return shipped("cornell_box", res=24)
@@ -206,7 +207,7 @@ def test_standard_errors_are_calibrated(shipped, name, adaptive):
     """The variance of z over pixels and 12 seeds is 0.8 to 1.25, by more than 4 of its standard errors over seeds (a
     false alarm of 1e-4 were it just at a bound; seeds are fixed, so the test fails always or never).
 
-    It holds from some 64 spp on: with fewer, pixels that saw nothing of a caustic have errors that are too small.
+    It holds from some 64 spp on: with fewer, pixels that saw no light at all have errors of 0.
     """
     scene = shipped(name, res=32)
     reference, _ = images_of(scene, 1024, range(1000, 1012), False)
