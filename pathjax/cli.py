@@ -162,10 +162,7 @@ def _render(options) -> int:
     if output.is_dir():
         raise InputError(f"{output}: is a folder; name a file")
 
-    from rich.console import Console
-
     from pathjax import aovs
-    from pathjax.until import Render
 
     aovs.check_names(options.aov, tuple(CHANNELS))
     if options.aov and output.suffix.lower() == ".png":
@@ -175,22 +172,9 @@ def _render(options) -> int:
     spp = options.spp
     if spp is None and options.error is None and options.time is None:
         spp = scene.about.description.spp
-    render = Render(scene, options.error, options.time, spp, options.seed, options.strategy, options.checkpoint)
-    first_hits = [name for name in options.aov if name in aovs.NAMES]
     loaded = time.perf_counter()
-    images = {}
-    try:
-        with Console(stderr=True).status("compiling"):
-            _interruptible(render.compile)
-            if first_hits:
-                images = _interruptible(lambda: aovs.render_aovs(scene, first_hits, spp or aovs.MAX_SPP, options.seed))
-    except KeyboardInterrupt:
-        # The compiler cannot be stopped, and aborts the process if the interpreter ends under it.
-        print("pathjax: interrupted; nothing was written", file=sys.stderr, flush=True)
-        os._exit(FAILED)
-    result = render.run(progress=True)
-    images["error"] = result.standard_error
-    _write(output, result, {name: images[name] for name in options.aov}, options)
+    result, images = _rendered(scene, spp, options)
+    _write(output, result, images, options)
     pixels_lost = int((result.image != result.image).any(-1).sum())
     if pixels_lost:
         print(f"pathjax: {pixels_lost} pixels met a sample that is not finite, and hold nan", file=sys.stderr)
@@ -218,6 +202,29 @@ def _render(options) -> int:
         }
         print(json.dumps(report))
     return FAILED if missed else DONE
+
+
+def _rendered(scene, spp: int | None, options):
+    """RenderResult, and the output variables by name."""
+    from rich.console import Console
+
+    from pathjax import aovs
+    from pathjax.until import Render
+
+    render = Render(scene, options.error, options.time, spp, options.seed, options.strategy, options.checkpoint)
+    first_hits, images = [name for name in options.aov if name in aovs.NAMES], {}
+    try:
+        with Console(stderr=True).status("compiling"):
+            _interruptible(render.compile)
+            if first_hits:
+                images = _interruptible(lambda: aovs.render_aovs(scene, first_hits, spp or aovs.MAX_SPP, options.seed))
+    except KeyboardInterrupt:
+        # The compiler cannot be stopped, and aborts the process if the interpreter ends under it.
+        print("pathjax: interrupted; nothing was written", file=sys.stderr, flush=True)
+        os._exit(FAILED)
+    result = render.run(progress=True)
+    images["error"] = result.standard_error
+    return result, {name: images[name] for name in options.aov}
 
 
 def _reached(result, output: Path, spp: int | None, options) -> str:

@@ -89,11 +89,12 @@ def sample_weights(image: np.ndarray, variance: np.ndarray) -> np.ndarray:
 
 
 def _around(x: np.ndarray, radius: int) -> np.ndarray:
-    """(H, W, C) mean over the square of pixels around each pixel, without itself; what is not finite is left out."""
-    known = np.isfinite(x)
+    """(H, W, C) mean over the square of pixels around each pixel, without itself or any that is not finite; else nan."""
+    known = np.isfinite(x).all(-1, keepdims=True)
     values = np.where(known, x, 0)
-    total = _box(values, radius) - values
     count = _box(known.astype(x.dtype), radius) - known
+    total = _box(values, radius)
+    total -= values
     return np.where(count > 0, np.maximum(total, 0) / np.maximum(count, 1), np.nan).astype(x.dtype)
 
 

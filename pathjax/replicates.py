@@ -41,7 +41,9 @@ def variance(means: np.ndarray, count: np.ndarray) -> np.ndarray:
     image, total = mean(means, count), np.zeros_like(means[0])
     with np.errstate(invalid="ignore"):
         for replicate, share in zip(means, shares(count), strict=True):
-            total += (replicate - image) ** 2 * share.astype(means.dtype)[:, None]
+            difference = replicate - image
+            difference *= difference
+            total += difference * share.astype(means.dtype)[:, None]
     freedom = np.minimum(count, COUNT) - 1
     known = freedom > 0
     scale = np.where(known, 1 / np.where(known, freedom * count.astype(float), 1), np.nan)
