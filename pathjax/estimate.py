@@ -89,7 +89,7 @@ def sample_weights(image: np.ndarray, variance: np.ndarray) -> np.ndarray:
 
 
 def _around(x: np.ndarray, radius: int) -> np.ndarray:
-    """(H, W, C) mean over the square of pixels around each pixel, without itself or any that is not finite; else nan."""
+    """(H, W, C) mean over the square around each pixel, without itself and what is not finite; nan if none is left."""
     known = np.isfinite(x).all(-1, keepdims=True)
     values = np.where(known, x, 0)
     count = _box(known.astype(x.dtype), radius) - known

@@ -28,13 +28,9 @@ class State:
     spp: int = 0  # mean samples of a pixel that the round was planned for
     seconds: float = 0.0  # spent rendering
 
-    def image(self) -> np.ndarray:
-        """(N, 3)."""
-        return replicates.mean(self.means, self.count)
-
-    def variance(self) -> np.ndarray:
-        """(N, 3) of the image."""
-        return replicates.variance(self.means, self.count)
+    def moments(self) -> tuple[np.ndarray, np.ndarray]:
+        """The image and its variance, (N, 3) each."""
+        return replicates.moments(self.means, self.count)
 
 
 def start(scene: Scene) -> State:

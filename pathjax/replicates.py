@@ -12,6 +12,8 @@ import numpy as np
 from pathjax.core import sampler
 
 COUNT = 4
+# Pixels that are summed up at a time, so that images need no second copy.
+_BLOCK = 1 << 16
 
 
 def seeds(seed: int) -> np.ndarray:
@@ -25,26 +27,20 @@ def shares(count: np.ndarray) -> np.ndarray:
     return (count + first_come[:, None]) // COUNT
 
 
-def mean(means: np.ndarray, count: np.ndarray) -> np.ndarray:
-    """(N, 3) image: mean over all samples; 0 where there is none."""
-    image = np.zeros_like(means[0])
-    for replicate, share in zip(means, shares(count), strict=True):
-        image += replicate * (share / np.maximum(count, 1)).astype(means.dtype)[:, None]
-    return image
+def moments(means: np.ndarray, count: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The image (N, 3), the mean over all samples, and an unbiased estimate of its variance (N, 3).
 
-
-def variance(means: np.ndarray, count: np.ndarray) -> np.ndarray:
-    """(N, 3) unbiased estimate of the image's variance, COUNT - 1 degrees of freedom; nan with fewer than 2 samples.
-
-    Replicates of unequal numbers of samples count as if variance fell with their number.
+    The variance has COUNT - 1 degrees of freedom, and is nan with fewer than 2 samples; replicates of unequal numbers
+    of samples count as if variance fell with their number. A pixel without samples is black.
     """
-    image, total = mean(means, count), np.zeros_like(means[0])
-    with np.errstate(invalid="ignore"):
-        for replicate, share in zip(means, shares(count), strict=True):
-            difference = replicate - image
-            difference *= difference
-            total += difference * share.astype(means.dtype)[:, None]
-    freedom = np.minimum(count, COUNT) - 1
-    known = freedom > 0
-    scale = np.where(known, 1 / np.where(known, freedom * count.astype(float), 1), np.nan)
-    return total * scale.astype(means.dtype)[:, None]
+    image, variance = np.empty_like(means[0]), np.empty_like(means[0])
+    for first in range(0, len(count), _BLOCK):
+        block = slice(first, first + _BLOCK)
+        replicates, n = means[:, block], count[block].astype(means.dtype)[:, None]
+        share = shares(count[block]).astype(means.dtype)[..., None]
+        image[block] = (replicates * share).sum(0) / np.maximum(n, 1)
+        freedom = np.minimum(n, COUNT) - 1
+        with np.errstate(invalid="ignore"):  # a pixel that is not finite
+            spread = ((replicates - image[block]) ** 2 * share).sum(0) / np.maximum(n, 1)
+        variance[block] = np.where(freedom > 0, spread / np.maximum(freedom, 1), np.nan)
+    return image, variance

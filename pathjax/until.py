@@ -142,7 +142,7 @@ class Render:
     def _estimates(self) -> tuple[np.ndarray, np.ndarray]:
         """Image and its variance, (H, W, 3) each."""
         shape = (*film.image_shape(self.scene.film), 3)
-        return self.state.image().reshape(shape), self.state.variance().reshape(shape)
+        return tuple(x.reshape(shape) for x in self.state.moments())
 
     def _result(self, reason) -> RenderResult:
         image, variance = self._estimates()
