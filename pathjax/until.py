@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import operator
 import signal
 import threading
 import time
@@ -71,8 +72,8 @@ def render_until(
     Raises:
         InputError: an argument is out of range, or nothing to stop at is given; a checkpoint of another render, a
             damaged one, or one that cannot be written (before rendering starts, where that can be known).
-        KeyboardInterrupt: interrupted before the first samples. Later, Ctrl-C and SIGTERM end the render, which
-            returns what is done (in the main thread, where alone Python hears them).
+        KeyboardInterrupt: by Ctrl-C while the kernel compiles. Later, Ctrl-C and SIGTERM end the render, which returns
+            what is done (in the main thread, where alone Python hears them).
     """
     render = Render(scene, target_error, time_limit, spp, seed, strategy, checkpoint)
     render.compile()
@@ -85,14 +86,15 @@ class Render:
     def __init__(self, scene, target_error, time_limit, spp, seed, strategy, checkpoint):
         _check(target_error, time_limit, spp)
         path.check_sampling(strategy, MAX_SPP if spp is None else spp, seed)
-        self.scene, self.seed, self.strategy = scene, seed, strategy
-        self.target_error, self.time_limit, self.spp = target_error, time_limit, MAX_SPP if spp is None else spp
+        self.scene, self.seed, self.strategy = scene, operator.index(seed), strategy
+        self.target_error, self.time_limit = target_error, time_limit
+        self.spp = MAX_SPP if spp is None else int(spp)
         self.compile_seconds = 0.0
         adaptive = target_error is not None or time_limit is not None
         self.state, self.checkpoint = progressive.start(scene), None
         progressive.plan(self.state, min(PILOT_SPP, self.spp))
         if checkpoint is not None:
-            self.checkpoint = Checkpoint(checkpoint, identity(scene, seed, strategy, adaptive))
+            self.checkpoint = Checkpoint(checkpoint, identity(scene, self.seed, strategy, adaptive))
             self.state = self.checkpoint.load(self.state)
             self.checkpoint.save(self.state)
         if not adaptive or self.state.spp > self.spp:
@@ -108,36 +110,39 @@ class Render:
             reason = self._run(interrupts, show)
             if self.checkpoint is not None:
                 self.checkpoint.save(self.state)
-        if not self.state.count.any():
-            raise KeyboardInterrupt
         return self._result(reason)
 
     def _run(self, interrupts, show) -> str:
         """Extend the state until there is a reason to stop. What it becomes depends on itself alone, not on time."""
         state, error = self.state, UNKNOWN
         earlier, started = state.seconds, time.perf_counter()
+        if self._out_of_time():
+            return "time limit"
         while True:
-            calls = progressive.extend(self.scene, state, self.seed, self.strategy)
-            while True:
-                if interrupts.heard:
-                    return "interrupted"
-                if self.time_limit is not None and state.seconds >= self.time_limit:
-                    return "time limit"
-                if next(calls, state) is state:
-                    break
+            for _ in progressive.extend(self.scene, state, self.seed, self.strategy):
                 state.seconds = earlier + time.perf_counter() - started
                 if self.checkpoint is not None:
                     self.checkpoint.save_if_due(state)
                 show(self, error)
+                if interrupts.heard:
+                    return "interrupted"
+                if self._out_of_time():
+                    return "time limit"
             image, variance = self._estimates()
             error = estimate.image_error(image, variance)
-            if self.target_error is not None and error.bound <= self.target_error:
+            if self._on_target(error):
                 return "target error"
             if state.spp >= self.spp:
                 return "spp"
             if state.spp == PILOT_SPP:
                 state.weights = estimate.sample_weights(image, variance).ravel()
             progressive.plan(state, min(_next_spp(state.spp, error, self.target_error), self.spp))
+
+    def _out_of_time(self) -> bool:
+        return self.time_limit is not None and self.state.seconds >= self.time_limit
+
+    def _on_target(self, error: estimate.ImageError) -> bool:
+        return self.target_error is not None and error.bound <= self.target_error
 
     def _estimates(self) -> tuple[np.ndarray, np.ndarray]:
         """Image and its variance, (H, W, 3) each."""
@@ -149,6 +154,8 @@ class Render:
         count = self.state.count.reshape(image.shape[:2])
         # While some pixels know nothing of their error, neither does the image.
         error = UNKNOWN if count.min() < 2 else estimate.image_error(image, variance)
+        if reason == "time limit" and self._on_target(error):
+            reason = "target error"
         standard_error = estimate.standard_error(image, variance, count)
         seconds = self.compile_seconds, self.state.seconds
         return RenderResult(image, standard_error, float(count.mean()), count, *seconds, *error, reason)
