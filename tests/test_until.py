@@ -190,7 +190,7 @@ def test_image_is_the_mean_of_the_replicates(cornell):
 
 # ---- statistics -----------------------------------------------------------------------------------------------------
 
-SCENES = ("cornell_box", "glass_and_mirror", "nine_spheres", "glass_ball", "mesh")
+SCENES = ("cornell_box", "furnace", "glass_and_mirror", "nine_spheres", "glass_ball", "mesh")
 
 
 def images_of(scene, spp, seeds, adaptive):
@@ -204,20 +204,19 @@ def images_of(scene, spp, seeds, adaptive):
 @pytest.mark.parametrize("adaptive", [False, True])
 @pytest.mark.parametrize("name", SCENES)
 def test_standard_errors_are_calibrated(shipped, name, adaptive):
-    """The variance of z over pixels and 12 seeds is 0.8 to 1.25, by more than 4 of its standard errors over seeds (a
-    false alarm of 1e-4 were it just at a bound; seeds are fixed, so the test fails always or never).
+    """The variance of z over pixels lies within 0.8 to 1.25, by 4 of its standard errors over 16 seeds: a claim that
+    holds for other seeds too but for a chance of 1e-4. Measured are 0.88 (furnace) to 1.08 (nine spheres).
 
     It holds from some 64 spp on: with fewer, pixels that saw no light at all have errors of 0.
     """
     scene = shipped(name, res=32)
     reference, _ = images_of(scene, 1024, range(1000, 1012), False)
-    images, errors = images_of(scene, 128, range(12), adaptive)
+    images, errors = images_of(scene, 64, range(16), adaptive)
     rounding = 1e-5 * reference.mean(0)
     variance = errors**2 + reference.var(0, ddof=1) / len(reference) + rounding**2 + 1e-14
     z2 = ((images - reference.mean(0)) ** 2 / variance).mean((1, 2, 3))
     chance = 4 * z2.std(ddof=1) / np.sqrt(len(z2))
-    assert 0.8 - chance < z2.mean() < 1.25 + chance
-    assert chance < 0.2
+    assert 0.8 + chance < z2.mean() < 1.25 - chance
 
 
 @pytest.mark.slow
