@@ -1,12 +1,14 @@
 """pathjax: a differentiable Monte Carlo path tracer in pure JAX."""
 
 from pathjax import runtime as _runtime  # noqa: F401  first: sets XLA up before a backend starts
+from pathjax.aovs import render_aovs
 from pathjax.errors import InputError
 from pathjax.gradient import Jacobian, jacobian
 from pathjax.named import parameters, with_parameters
 from pathjax.query import closest_hit
 from pathjax.render import render
 from pathjax.scene import Scene
+from pathjax.until import RenderResult, render_until
 
 __version__ = "0.1.0"
 __all__ = [
@@ -14,6 +16,7 @@ __all__ = [
     "GradientCheck",
     "InputError",
     "Jacobian",
+    "RenderResult",
     "Scene",
     "__version__",
     "check_gradient",
@@ -23,6 +26,8 @@ __all__ = [
     "load_scene",
     "parameters",
     "render",
+    "render_aovs",
+    "render_until",
     "with_parameters",
 ]
 

@@ -41,7 +41,15 @@ def _parser() -> argparse.ArgumentParser:
     render = commands.add_parser("render", help="render a scene to an image")
     _add_scene(render)
     render.add_argument("-o", "--output", required=True, metavar="OUT.{exr,png}")
-    render.add_argument("--spp", type=_positive, metavar="N", help="samples per pixel; default: the file's")
+    spp = "most samples per pixel; default: the file's, where neither --error nor --time is given"
+    render.add_argument("--spp", type=_positive, metavar="N", help=spp)
+    error = "stop when sqrt(relMSE) is as low: 0.02 is 2 %%"
+    render.add_argument("--error", type=_real, metavar="E", help=error)
+    render.add_argument("--time", type=_real, metavar="SECONDS", help="stop after so much rendering")
+    checkpoint = "save the state there, and go on from it when called again"
+    render.add_argument("--checkpoint", metavar="FILE.npz", help=checkpoint)
+    aov = "further channels of an EXR file, separated by commas"
+    render.add_argument("--aov", type=_names, default=[], metavar="{error,depth,normal,albedo}", help=aov)
     render.add_argument("--seed", type=_seed, default=0, metavar="K")
     render.add_argument("--strategy", default="mis", metavar="{mis,light,bsdf}", help="how light is sampled")
     render.add_argument("--json", action="store_true", help="print one JSON object on stdout")
@@ -124,6 +132,20 @@ def _positive(text: str) -> int:
     return int(text)
 
 
+def _real(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not (value > 0 and math.isfinite(value)):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a positive number")
+    return value
+
+
+def _names(text: str) -> list[str]:
+    return text.split(",")
+
+
 def _seed(text: str) -> int:
     if not text.isdecimal() or int(text) >= 2**31:
         raise argparse.ArgumentTypeError(f"{text!r} is not an integer in [0, 2^31)")
@@ -171,6 +193,10 @@ def _load(options):
 # ---- render -------------------------------------------------------------------------------------------------------
 
 
+# Output variables and their channels in an EXR file.
+CHANNELS = {"error": "RGB", "depth": "Z", "normal": "XYZ", "albedo": "RGB"}
+
+
 def _render(options) -> int:
     output = Path(options.output)
     if output.suffix.lower() not in (".exr", ".png"):
@@ -179,68 +205,88 @@ def _render(options) -> int:
         raise InputError(f"{output}: there is no folder {output.parent}; make it first")
     if output.is_dir():
         raise InputError(f"{output}: is a folder; name a file")
+
+    from pathjax import aovs
+
+    aovs.check_names(options.aov, tuple(CHANNELS))
+    if options.aov and output.suffix.lower() == ".png":
+        raise InputError(f"{output}: --aov needs an .exr file; a .png holds one image")
     started = time.perf_counter()
     scene = _load(options)
-
-    from pathjax.progressive import ProgressiveRender
-
-    spp = options.spp or scene.about.description.spp
-    progressive = ProgressiveRender(scene, spp, options.seed, options.strategy)
+    spp = options.spp
+    if spp is None and options.error is None and options.time is None:
+        spp = scene.about.description.spp
     loaded = time.perf_counter()
-    interrupted, first_call = _run_passes(progressive)
-    finished = time.perf_counter()
-    fewest, most = progressive.samples()
-    if most == 0:
-        raise KeyboardInterrupt
-    image = progressive.image()
-    _write(output, image, scene, options, most)
-    pixels_lost = int((image != image).any(-1).sum())
+    result, images = _rendered(scene, spp, options)
+    _write(output, result, images, options)
+    pixels_lost = int((result.image != result.image).any(-1).sum())
     if pixels_lost:
         print(f"pathjax: {pixels_lost} pixels met a sample that is not finite, and hold nan", file=sys.stderr)
-    if interrupted:
-        print(f"pathjax: interrupted; {output} holds {_range(fewest, most)} of {spp} spp", file=sys.stderr)
+    interrupted = result.reason == "interrupted"
+    missed = interrupted or (options.error is not None and result.reason != "target error")
+    if missed:
+        print(f"pathjax: {_reached(result, output, spp, options)}", file=sys.stderr)
     if options.json:
         report = {
             "output": str(output),
-            "width": image.shape[1],
-            "height": image.shape[0],
-            "spp": most,
+            "width": result.image.shape[1],
+            "height": result.image.shape[0],
+            "spp": result.spp,
+            "fewest_spp": int(result.samples.min()),
+            "most_spp": int(result.samples.max()),
             "seed": options.seed,
             "load_seconds": loaded - started,
-            "compile_seconds": first_call,
-            "run_seconds": finished - loaded - first_call,
-            "error": progressive.error() if fewest > 1 else None,
+            "compile_seconds": result.compile_seconds,
+            "run_seconds": result.run_seconds,
+            "error": _known(result.error),
+            "error_bound": _known(result.error_bound),
+            "reason": result.reason,
             "not_finite_pixels": pixels_lost,
             "interrupted": interrupted,
         }
         print(json.dumps(report))
-    return FAILED if interrupted else DONE
+    return FAILED if missed else DONE
 
 
-def _run_passes(progressive) -> tuple[bool, float]:
-    """Render with a progress bar; returns whether Ctrl-C ended it, and the seconds of the first call (compilation)."""
+def _rendered(scene, spp: int | None, options):
+    """RenderResult, and the output variables by name."""
     from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-    height, width = progressive.image().shape[:2]
-    columns = TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[status]}"), TimeRemainingColumn()
-    calls = iter(progressive)
-    started = time.perf_counter()
-    first_call = 0.0
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task("compiling", total=width * height * progressive.spp, status="")
-        try:
-            bar.advance(task, _interruptible(lambda: next(calls)))
-            first_call = time.perf_counter() - started
-            for paths in calls:
-                fewest, most = progressive.samples()
-                status = f"{_range(fewest, most)}/{progressive.spp} spp"
-                if fewest == most and most > 1:
-                    status += f"  error {progressive.error():.2%}"
-                bar.update(task, advance=paths, description="rendering", status=status)
-        except KeyboardInterrupt:
-            return True, first_call
-    return False, first_call
+    from pathjax import aovs
+    from pathjax.until import Render
+
+    render = Render(scene, options.error, options.time, spp, options.seed, options.strategy, options.checkpoint)
+    first_hits, images = [name for name in options.aov if name in aovs.NAMES], {}
+    try:
+        with Console(stderr=True).status("compiling"):
+            _interruptible(render.compile)
+            if first_hits:
+                images = _interruptible(lambda: aovs.render_aovs(scene, first_hits, spp or aovs.MAX_SPP, options.seed))
+    except KeyboardInterrupt:
+        # The compiler cannot be stopped, and aborts the process if the interpreter ends under it.
+        print("pathjax: interrupted; nothing was written", file=sys.stderr, flush=True)
+        os._exit(FAILED)
+    result = render.run(progress=True)
+    images["error"] = result.standard_error
+    return result, {name: images[name] for name in options.aov}
+
+
+def _reached(result, output: Path, spp: int | None, options) -> str:
+    """What there is, where it is not what was asked for."""
+    ended = {"interrupted": "interrupted", "time limit": "out of time", "spp": "out of samples"}[result.reason]
+    text = f"{ended}; {output} holds {result.spp:.4g}{f' of {spp}' if spp else ''} spp"
+    if options.error is not None:
+        bound = _known(result.error_bound)
+        reached = "unknown" if bound is None else f"at most {bound:.3g}"
+        text += f", and its error is {reached}, not yet {options.error:g}"
+    if options.checkpoint is not None and result.reason == "interrupted":
+        text += "; the same command goes on from there"
+    return text
+
+
+def _known(number: float) -> float | None:
+    """JSON has no nan."""
+    return number if math.isfinite(number) else None
 
 
 def _interruptible(call):
@@ -255,38 +301,32 @@ def _interruptible(call):
 
     thread = threading.Thread(target=work, daemon=True)
     thread.start()
-    try:
-        while thread.is_alive():
-            thread.join(0.1)
-    except KeyboardInterrupt:
-        # The compiler cannot be stopped, and aborts the process if the interpreter ends under it.
-        print("pathjax: interrupted; nothing was written", file=sys.stderr, flush=True)
-        os._exit(FAILED)
+    while thread.is_alive():
+        thread.join(0.1)
     succeeded, result = outcome[0]
     if not succeeded:
         raise result
     return result
 
 
-def _range(fewest: int, most: int) -> str:
-    return str(most) if fewest == most else f"{fewest}-{most}"
-
-
-def _write(output: Path, image, scene, options, spp: int) -> None:
+def _write(output: Path, result, images, options) -> None:
     from pathjax import __version__
     from pathjax.io import image as files
 
     if output.suffix.lower() == ".png":
-        files.write_png(output, image)
+        files.write_png(output, result.image)
         return
     header = {
         "pathjax.version": __version__,
         "pathjax.scene": str(options.scene),
         "pathjax.parameters": " ".join(f"{name}={value}" for name, value in options.defines + options.settings),
-        "pathjax.spp": spp,
+        "pathjax.spp": result.spp,
         "pathjax.seed": options.seed,
     }
-    files.write_exr(output, {name: image[..., i] for i, name in enumerate("RGB")}, header)
+    channels = {name: result.image[..., i] for i, name in enumerate("RGB")}
+    for name, image in images.items():
+        channels |= {f"{name}.{channel}": image[..., i] for i, channel in enumerate(CHANNELS[name])}
+    files.write_exr(output, channels, header)
 
 
 # ---- fit ----------------------------------------------------------------------------------------------------------

@@ -1,72 +1,97 @@
-"""A render in passes: something to look at soon, bounded memory, and nothing lost when it is stopped."""
+"""A render in passes: something to look at soon, bounded memory, and a state that can be left and taken up again."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 
-import jax.numpy as jnp
 import numpy as np
 
-from pathjax import film
-from pathjax.compare import RELATIVE_FLOOR
+from pathjax import film, replicates
 from pathjax.render import render_pixels
 from pathjax.scene import Scene
 
 # Paths in one call of the kernel: large enough that the call costs nothing, small enough that an interrupt is heard
 # at once. The schedule is fixed, not timed, so that the same command gives the same image.
-CHUNK_PIXELS = 1 << 14
-MAX_PASS_SPP = 16
+CHUNK_PIXELS = (1 << 14) // replicates.COUNT
+MAX_PASS_SPP = 16 * replicates.COUNT
 
 
-class ProgressiveRender:
-    """Running means of an image.
+@dataclass
+class State:
+    """Running means of the replicates, row by row over the image, and how far they are to go."""
 
-    The error is estimated from the spread between passes. Passes share one randomised Sobol' sequence and are
-    negatively correlated, so the estimate is on the high side; it is nan before the second pass.
+    means: np.ndarray  # (R, N, 3) float32
+    count: np.ndarray  # (N,) int32 samples so far, of all replicates together
+    goal: np.ndarray  # (N,) int32 samples at the end of this round
+    weights: np.ndarray  # (N,) float32 of mean 1, how samples are spread over the pixels
+    spp: int = 0  # mean samples of a pixel that the round was planned for
+    seconds: float = 0.0  # spent rendering
+
+    def moments(self) -> tuple[np.ndarray, np.ndarray]:
+        """The image and its variance, (N, 3) each."""
+        return replicates.moments(self.means, self.count)
+
+
+def start(scene: Scene) -> State:
+    count = film.pixel_count(scene.film)
+    none = np.zeros(count, np.int32)
+    return State(np.zeros((replicates.COUNT, count, 3), np.float32), none, none.copy(), np.ones(count, np.float32))
+
+
+def plan(state: State, spp: int) -> None:
+    """Begin a round that ends with `spp` samples a pixel, on average; what a pixel has already it keeps."""
+    goal = state.weights.astype(float) * spp
+    if (state.weights != 1).any():
+        goal = np.rint(goal / replicates.COUNT) * replicates.COUNT
+    state.goal = np.maximum(state.count, np.minimum(goal, np.iinfo(np.int32).max)).astype(np.int32)
+    state.spp = spp
+
+
+def extend(scene: Scene, state: State, seed: int, strategy: str) -> Iterator[None]:
+    """Render what is missing of the round; yields after every call of the kernel, when the state is whole.
+
+    The samples of a pixel are added in portions that depend on its own count alone, so that a state which was saved
+    between two calls leads to the same bits.
     """
+    seeds = replicates.seeds(seed)
+    chunk = _chunk(state)
+    while (missing := np.flatnonzero(state.count < state.goal)).size:
+        for first in range(0, missing.size, chunk):
+            pixels = missing[first : first + chunk]
+            before = state.count[pixels]
+            after = before + np.minimum(np.clip(before, replicates.COUNT, MAX_PASS_SPP), state.goal[pixels] - before)
+            first_sample = replicates.shares(before)
+            spp = replicates.shares(after) - first_sample
+            means = _call(scene, chunk, pixels, first_sample, spp, seeds, strategy)
+            share = (spp / np.maximum(first_sample + spp, 1)).astype(np.float32)[..., None]
+            with np.errstate(invalid="ignore"):  # a pixel that met a sample that is not finite
+                change = np.where(share > 0, (means - state.means[:, pixels]) * share, 0)
+            state.means[:, pixels] += change
+            state.count[pixels] = after
+            yield
 
-    def __init__(self, scene: Scene, spp: int, seed: int = 0, strategy: str = "mis"):
-        self.scene, self.spp, self.seed, self.strategy = scene, spp, seed, strategy
-        count = film.pixel_count(scene.film)
-        self._sum = np.zeros((count, 3))
-        self._sum_squares = np.zeros((count, 3), np.float32)  # of pass means, weighted by their samples
-        self._spp = np.zeros(count, np.int32)
-        self._passes = 0
-        # All chunks have one shape, so one kernel; a small image is one chunk.
-        self._chunk = min(CHUNK_PIXELS, count)
 
-    def __iter__(self) -> Iterator[int]:
-        """Render; yields after every call of the kernel the number of paths it traced."""
-        count, done = len(self._spp), 0
-        while done < self.spp:
-            spp = min(max(done, 1), MAX_PASS_SPP, self.spp - done)
-            for first in range(0, count, self._chunk):
-                last = min(first + self._chunk, count)
-                # The last chunk repeats its last pixel up to full length.
-                pixels = jnp.minimum(jnp.arange(first, first + self._chunk, dtype=jnp.int32), count - 1)
-                means = render_pixels(self.scene, pixels, done, spp, self.seed, self.strategy)
-                means = np.asarray(means)[: last - first]
-                self._sum[first:last] += means.astype(float) * spp
-                self._sum_squares[first:last] += means**2 * spp
-                self._spp[first:last] += spp
-                yield (last - first) * spp
-            done += spp
-            self._passes += 1
+def compile(scene: Scene, strategy: str = "mis") -> None:
+    """Have the kernel of `extend` compiled, by a call for no samples."""
+    state = start(scene)
+    none = np.zeros((replicates.COUNT, 1), np.int32)
+    _call(scene, _chunk(state), np.zeros(1, int), none, none, replicates.seeds(0), strategy)
 
-    def image(self) -> np.ndarray:
-        """(H, W, 3) float32 mean so far; 0 where nothing was rendered yet."""
-        mean = self._sum / np.maximum(self._spp, 1)[:, None]
-        return mean.astype(np.float32).reshape(*film.image_shape(self.scene.film), 3)
 
-    def samples(self) -> tuple[int, int]:
-        """Fewest and most samples of any pixel."""
-        return int(self._spp.min()), int(self._spp.max())
+def _chunk(state: State) -> int:
+    """All calls have one shape, so one kernel; a small image is one call."""
+    return min(CHUNK_PIXELS, len(state.count))
 
-    def error(self) -> float:
-        """Estimate of sqrt(relMSE)."""
-        if self._passes < 2:
-            return float("nan")
-        spp = self._spp[:, None]
-        mean = self._sum / spp
-        variance = np.maximum(self._sum_squares / spp - mean**2, 0) / (self._passes - 1)
-        return float(np.sqrt(np.nanmean(variance / (mean**2 + RELATIVE_FLOOR))))
+
+def _call(scene, chunk, pixels, first_sample, spp, seeds, strategy):
+    """(R, n, 3) means of n <= chunk pixels, all replicates in one call; nan where spp is 0."""
+    lacking = chunk - len(pixels)
+
+    def padded(x, **how):
+        return np.pad(x, ((0, 0), (0, lacking)), **how).ravel()
+
+    tiled = padded(np.tile(pixels.astype(np.int32), (replicates.COUNT, 1)), mode="edge")
+    numbers = padded(first_sample), padded(spp), np.repeat(seeds, chunk)
+    means = render_pixels(scene, tiled, *numbers, strategy)
+    return np.asarray(means, np.float32).reshape(replicates.COUNT, chunk, 3)[:, : len(pixels)]

@@ -73,15 +73,14 @@ def process(root):
 # ---- render ---------------------------------------------------------------------------------------------------------
 
 
-def test_render_writes_the_image_that_render_returns(run, tmp_path):
+def test_render_writes_the_image_of_render_until(run, tmp_path):
     status, out, _ = run("render", FURNACE, *SMALL, "-o", tmp_path / "a.exr", "--spp", 4, "--seed", 3)
     assert (status, out) == (0, "")
     channels, header = read_exr(tmp_path / "a.exr")
     assert set(channels) == {"R", "G", "B"}
     assert all(channel.dtype == np.float32 and channel.shape == (8, 8) for channel in channels.values())
     image = np.stack([channels[c] for c in "RGB"], -1)
-    # Passes of the same samples, summed in another order.
-    np.testing.assert_allclose(image, pj.render(pj.load_scene(FURNACE, res=8), 4, 3), rtol=1e-5)
+    np.testing.assert_array_equal(image, pj.render_until(pj.load_scene(FURNACE, res=8), spp=4, seed=3).image)
     assert header["pathjax.seed"] == 3
     assert header["pathjax.spp"] == 4
     assert header["pathjax.version"] == pj.__version__
@@ -120,7 +119,10 @@ def test_json_is_one_object_on_stdout(run, tmp_path):
     assert report["output"] == str(tmp_path / "a.exr")
     assert report["interrupted"] is False
     assert report["not_finite_pixels"] == 0
-    assert report["error"] >= 0
+    assert report["reason"] == "spp"
+    assert 0 <= report["error"] <= report["error_bound"]
+    assert report["fewest_spp"] == report["most_spp"] == 8
+    assert report["compile_seconds"] > 0 and report["run_seconds"] > 0
 
 
 def test_spp_defaults_to_the_files(run, tmp_path):
@@ -147,6 +149,53 @@ def test_an_existing_file_is_replaced_whole(run, tmp_path):
     (tmp_path / "a.exr").write_bytes(b"old")
     assert run("render", FURNACE, *SMALL, "-o", tmp_path / "a.exr", "--spp", 1)[0] == 0
     assert set(read_exr(tmp_path / "a.exr")[0]) == {"R", "G", "B"}
+
+
+# ---- errors, time and checkpoints -----------------------------------------------------------------------------------
+
+
+def test_error_is_reached(run, tmp_path):
+    _, out, _ = run("render", FURNACE, *SMALL, "-o", tmp_path / "a.exr", "--error", 0.05, "--json")
+    report = json.loads(out)
+    assert report["reason"] == "target error"
+    assert report["error"] < report["error_bound"] <= 0.05
+    assert report["spp"] != 64  # the file's
+
+
+@pytest.mark.parametrize(
+    "limit, reason, says", [(("--time", 0.2), "time limit", "out of time"), (("--spp", 20), "spp", "out of samples")]
+)
+def test_an_error_that_is_not_reached_is_a_failure(run, tmp_path, limit, reason, says):
+    arguments = ("render", FURNACE, *SMALL, "-o", tmp_path / "a.exr", *limit, "--json")
+    status, out, err = run(*arguments, "--error", 1e-5)
+    report = json.loads(out)
+    assert (status, report["reason"]) == (1, reason)
+    assert says in err and f"at most {report['error_bound']:.3g}, not yet 1e-05" in err
+    assert set(read_exr(tmp_path / "a.exr")[0]) == {"R", "G", "B"}
+    assert run(*arguments)[0] == 0
+
+
+def test_checkpoint_is_taken_up(run, tmp_path):
+    files = ("-o", tmp_path / "a.exr", "--checkpoint", tmp_path / "run.npz")
+    assert run("render", FURNACE, *SMALL, *files, "--spp", 8)[0] == 0
+    assert run("render", FURNACE, *SMALL, *files, "--spp", 16)[0] == 0
+    expected = pj.render_until(pj.load_scene(FURNACE, res=8), spp=16).image
+    np.testing.assert_array_equal(read_exr(tmp_path / "a.exr")[0]["R"], expected[..., 0])
+
+
+def test_output_variables_are_channels(run, tmp_path):
+    arguments = ("--aov", "normal,error,depth,albedo", "--spp", 4, "--seed", 2)
+    assert run("render", FURNACE, *SMALL, "-o", tmp_path / "a.exr", *arguments)[0] == 0
+    channels, _ = read_exr(tmp_path / "a.exr")
+    scene = pj.load_scene(FURNACE, res=8)
+    expected = pj.render_aovs(scene, ["depth", "normal", "albedo"], spp=4, seed=2)
+    result = pj.render_until(scene, spp=4, seed=2)
+    expected |= {"error": result.standard_error}
+    names = {"error": "RGB", "depth": "Z", "normal": "XYZ", "albedo": "RGB"}
+    assert set(channels) == {*"RGB", *(f"{name}.{c}" for name, letters in names.items() for c in letters)}
+    for name, letters in names.items():
+        image = np.stack([channels[f"{name}.{c}"] for c in letters], -1)
+        np.testing.assert_array_equal(image, expected[name])
 
 
 # ---- what is refused ------------------------------------------------------------------------------------------------
@@ -198,6 +247,27 @@ def test_spp_that_is_no_positive_integer(refused, tmp_path, spp):
 @pytest.mark.parametrize("seed", ["-1", "0.5", str(2**31)])
 def test_seed_that_is_no_31_bit_integer(refused, tmp_path, seed):
     refused("render", FURNACE, "-o", tmp_path / "a.exr", f"--seed={seed}", says=["--seed"])
+
+
+@pytest.mark.parametrize("option", ["--error", "--time"])
+@pytest.mark.parametrize("value", ["0", "-1", "nan", "inf", "much", ""])
+def test_limits_that_are_no_positive_number(refused, tmp_path, option, value):
+    refused("render", FURNACE, "-o", tmp_path / "a.exr", f"{option}={value}", says=[option])
+
+
+def test_output_variables_that_cannot_be(refused, tmp_path):
+    exr, png = ("-o", tmp_path / "a.exr"), ("-o", tmp_path / "a.png")
+    refused("render", FURNACE, *exr, "--aov", "depht", says=["depht", "error, depth, normal, albedo"])
+    refused("render", FURNACE, *exr, "--aov", "", says=["error, depth, normal, albedo"])
+    refused("render", FURNACE, *exr, "--aov", "depth,error,depth", says=["depth", "twice"])
+    refused("render", FURNACE, *png, "--aov", "depth", says=["a.png", ".exr"])
+
+
+def test_checkpoints_that_cannot_be(refused, run, tmp_path):
+    arguments = ("render", FURNACE, *SMALL, "-o", tmp_path / "a.exr", "--spp", 1, "--checkpoint")
+    refused(*arguments, tmp_path / "none" / "run.npz", says=["no folder"])
+    assert run(*arguments, tmp_path / "run.npz")[0] == 0
+    refused(*arguments, tmp_path / "run.npz", "--seed", 4, says=["run.npz was made with seed 0, this is seed 4"])
 
 
 def test_unknown_parameter_offers_names(refused, tmp_path):
@@ -388,14 +458,17 @@ def load(*arguments, plain=mesh.load, **keywords):
     tell("mesh loads")
     return plain(*arguments, **keywords)
 
-def calls(self, plain=progressive.ProgressiveRender.__iter__):
+def compile(*arguments, plain=progressive.compile):
     tell("kernel compiles")
-    for number, paths in enumerate(plain(self)):
+    plain(*arguments)
+
+def extend(*arguments, plain=progressive.extend):
+    for number, _ in enumerate(plain(*arguments)):
         if number == 20:
             tell("kernel ran")
-        yield paths
+        yield
 
-mesh.load, progressive.ProgressiveRender.__iter__ = load, calls
+mesh.load, progressive.compile, progressive.extend = load, compile, extend
 sys.exit(cli.main(sys.argv[1:]))
 """
 
@@ -447,7 +520,8 @@ def test_interrupt_keeps_what_is_done(interrupt, tmp_path):
     assert report["interrupted"] is True
     assert 0 < report["spp"] < 1_000_000
     channels, header = read_exr(output)
-    assert header["pathjax.spp"] == report["spp"]
+    assert report["fewest_spp"] < report["spp"] < report["most_spp"]
+    assert header["pathjax.spp"] == pytest.approx(report["spp"])
     assert channels["R"].shape == (256, 256)
     assert np.isfinite(channels["R"]).all() and (channels["R"] > 0).mean() > 0.5
     assert [path.name for path in tmp_path.iterdir()] == ["a.exr"]

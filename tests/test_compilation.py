@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import pathjax as pj
-from pathjax import query, runtime
+from pathjax import aovs, query, runtime
 from pathjax.film import pixel_count
 from pathjax.integrators import pixel
 from pathjax.render import _render_pixels
@@ -71,6 +71,13 @@ def test_closest_hit_is_one_native_kernel(shipped, name, devices):
     rays = jnp.ones((1000, 3)), jnp.ones((1000, 3))
     lowered = query._closest_hit.lower(shipped(name, res=16).geometry, *rays, devices=devices)
     assert_one_native_kernel(lowered.compile())
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_output_variables_are_one_native_kernel(shipped, name):
+    pixels = jnp.arange(256, dtype=jnp.int32)
+    scene = replace(shipped(name, res=16), about=None)
+    assert_one_native_kernel(aovs._render_aovs.lower(scene, pixels, *pixel.numbers(pixels, 0, 4, 1)).compile())
 
 
 @pytest.mark.slow
@@ -211,6 +218,16 @@ def test_scenes_of_one_structure_share_a_kernel_whatever_their_names(make_scene,
     pj.render(first, 2)
     before = compilations.count
     pj.render(second, 2)
+    assert compilations.count == before
+
+
+def test_renders_until_an_error_share_a_kernel(shipped, compilations):
+    """Of other targets, seeds and numbers of samples."""
+    scene = shipped("cornell_box", res=16)
+    pj.render_until(scene, 0.2)
+    before = compilations.count
+    for how in ({"target_error": 0.1}, {"spp": 3}, {"target_error": 0.2, "seed": 4}, {"time_limit": 0.1}):
+        pj.render_until(scene, **how)
     assert compilations.count == before
 
 

@@ -240,6 +240,16 @@ def test_chosen_pixels_are_those_of_the_whole_image(cornell):
     np.testing.assert_allclose(chosen, pj.render(cornell, 4, 5).reshape(-1, 3)[pixels], rtol=1e-5)
 
 
+def test_samples_and_seeds_that_differ_from_pixel_to_pixel(cornell):
+    """One call for all is as many calls of the same kernel."""
+    pixels = jnp.asarray([3, 203, 117, 117], jnp.int32)
+    first, spp, seed = np.array([0, 5, 7, 7]), np.array([4, 1, 16, 16]), np.array([2, 2, 9, 2**32 - 1], np.uint32)
+    together = render_pixels(cornell, pixels, first, spp, seed)
+    for i in range(len(pixels)):
+        alone = render_pixels(cornell, pixels, int(first[i]), int(spp[i]), seed[i])
+        np.testing.assert_array_equal(together[i], alone[i])
+
+
 def test_float64_agrees_with_float32_path_by_path(cornell, kernel_of, x64):
     """Both draw the same numbers, so all but the paths that rounding tips are the same."""
     single = np.asarray(pj.render(cornell, 4, seed=2))

@@ -1,0 +1,111 @@
+"""A render's state on disk: a process that was killed left the last whole one, which leads on to the same bits."""
+
+from __future__ import annotations
+
+import glob
+import hashlib
+import json
+import os
+import time
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from pathjax import film
+from pathjax.errors import InputError
+from pathjax.io.files import write_whole
+from pathjax.progressive import State
+from pathjax.scene import Scene
+
+# Saving costs at most one in this many seconds.
+COST = 50
+ARRAYS = ("means", "count", "goal", "weights")
+
+
+def identity(scene: Scene, seed: int, strategy: str, adaptive: bool) -> dict[str, str | int]:
+    """What a state may be continued with, and nothing else."""
+    from pathjax import __version__
+
+    height, width = film.image_shape(scene.film)
+    return {
+        "pathjax": __version__,
+        "image size": f"{width}x{height}",
+        "scene": fingerprint(scene),
+        "strategy": strategy,
+        "seed": seed,
+        "sampling": "adaptive" if adaptive else "uniform",
+    }
+
+
+def fingerprint(scene: Scene) -> str:
+    """Hash of a scene's structure and arrays; names and files do not count."""
+    leaves, structure = jax.tree.flatten(replace(scene, about=None))
+    digest = hashlib.sha256(str(structure).encode())
+    for leaf in map(np.asarray, leaves):
+        digest.update(f"{leaf.dtype}{leaf.shape}".encode())
+        digest.update(leaf.tobytes())
+    return digest.hexdigest()[:16]
+
+
+class Checkpoint:
+    """A file that holds the last saved state of one render."""
+
+    def __init__(self, path: str | Path, identity: Mapping[str, str | int]):
+        self.path, self.identity = Path(path), dict(identity)
+        self._saved, self._cost = 0.0, 0.0
+        # What a killed process left half written.
+        for part in self.path.parent.glob(f".{glob.escape(self.path.name)}.*.part"):
+            part.unlink(missing_ok=True)
+
+    def load(self, fresh: State) -> State:
+        """The saved state, or `fresh`, which has the same shapes, where there is no file.
+
+        Raises:
+            InputError: damaged, no checkpoint, or one of another render; the message says which.
+        """
+        if not self.path.exists():
+            return fresh
+        try:
+            with np.load(self.path, allow_pickle=False) as file:
+                facts = json.loads(str(file["facts"]))
+                identity, spp, seconds = facts["identity"], int(facts["spp"]), float(facts["seconds"])
+                arrays = {name: file[name] for name in ARRAYS}
+        except Exception as error:  # zipfile, zlib, NumPy and json raise what they like, as the file's bytes have it
+            raise self._refusal(f"is no checkpoint, or a damaged one ({error})") from None
+        for name, ours in self.identity.items():
+            theirs = identity.get(name)
+            if theirs != ours:
+                raise self._refusal(f"was made with {name} {theirs}, this is {name} {ours}")
+        for name, array in arrays.items():
+            wanted = getattr(fresh, name)
+            if (array.shape, array.dtype) != (wanted.shape, wanted.dtype):
+                raise self._refusal(f"is damaged: {name} is {array.dtype}{list(array.shape)}")
+        return State(**arrays, spp=spp, seconds=seconds)
+
+    def save(self, state: State) -> None:
+        """Raises:
+        InputError: it cannot be written; the last one that was is intact.
+        """
+        started = time.perf_counter()
+        facts = json.dumps({"identity": self.identity, "spp": state.spp, "seconds": state.seconds})
+
+        def write(beside: str) -> None:
+            with open(beside, "wb") as file:
+                np.savez(file, facts=np.array(facts), **{name: getattr(state, name) for name in ARRAYS})
+                file.flush()
+                os.fsync(file.fileno())
+
+        write_whole(self.path, write)
+        self._saved = time.perf_counter()
+        self._cost = self._saved - started
+
+    def save_if_due(self, state: State) -> None:
+        """Save, unless the last time was so lately that it would slow the render down."""
+        if time.perf_counter() - self._saved > COST * self._cost:
+            self.save(state)
+
+    def _refusal(self, what: str) -> InputError:
+        return InputError(f"{self.path} {what}; delete it, or name another checkpoint")

@@ -1,0 +1,110 @@
+"""How wrong an image is, from the variance between its replicates: of a pixel, and of the whole.
+
+Three degrees of freedom are few, so a pixel borrows from its neighbours. Of light that no sample of a pixel and its
+neighbours has met these numbers cannot know: they are then too small.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from pathjax.compare import RELATIVE_FLOOR
+
+# Weight of a pixel's own variance; its eight neighbours share the rest.
+OWN_SHARE = 0.25
+# One-sided 95 % of a normal distribution.
+CONFIDENCE = 1.645
+# Least share of the samples that a pixel gets, of the mean.
+LEAST_SHARE = 0.25
+
+
+class ImageError(NamedTuple):
+    """sqrt(relMSE) of an image against the truth; nan where nothing is known."""
+
+    estimate: float
+    bound: float  # that the error exceeds in some 5 % of renders
+
+
+def standard_error(image: np.ndarray, variance: np.ndarray, count: np.ndarray) -> np.ndarray:
+    """(H, W, 3) of the image; nan where a pixel is not finite or has fewer than 2 samples.
+
+    Never less than image / (3 count): among the 9 count samples of the neighbourhood, which may all agree, the next
+    could have been twice as bright. Without this, what is reflected in glass by one path in a hundred had no error.
+    Too small where the variance of a pixel is many times its neighbours' and it was lucky, and where pixels are black.
+
+    Args:
+        variance: (H, W, 3) of each pixel of the image (H, W, 3); count: (H, W) its samples.
+    """
+    around = _around(variance, 1)
+    pooled = np.where(np.isfinite(around), OWN_SHARE * variance + (1 - OWN_SHARE) * around, variance)
+    return np.sqrt(np.maximum(pooled, (image / (3 * np.maximum(count, 1)).astype(image.dtype)[..., None]) ** 2))
+
+
+def contributions(image: np.ndarray, variance: np.ndarray) -> np.ndarray:
+    """(...,) share of each pixel in relMSE, from (..., 3); nan where not finite.
+
+    image^2 - variance estimates the squared truth without bias. Taking image^2 would halve the error of noisy images,
+    since what makes a pixel too bright makes its variance large.
+    """
+    with np.errstate(invalid="ignore", over="ignore"):
+        relative = variance / (np.maximum(image**2 - variance, 0) + RELATIVE_FLOOR)
+    relative = relative.mean(-1)
+    return np.where(np.isfinite(relative), relative, np.nan)
+
+
+def image_error(image: np.ndarray, variance: np.ndarray) -> ImageError:
+    """Of (..., 3). Pixels that are not finite are left out.
+
+    The bound takes pixels as draws from a population: where few of them make up most of the error, their number is
+    small and the bound high. Where single samples do (skewness beyond 6), the error exceeds it more often.
+    """
+    shares = contributions(image, variance).astype(float)
+    known = shares[np.isfinite(shares)]
+    if not known.size:
+        return ImageError(np.nan, np.nan)
+    total = known.sum()
+    uncertainty = np.sqrt((known**2).sum()) / total if total > 0 else 0.0
+    rel_mse = total / known.size
+    return ImageError(float(np.sqrt(rel_mse)), float(np.sqrt(rel_mse * (1 + CONFIDENCE * uncertainty))))
+
+
+def sample_weights(image: np.ndarray, variance: np.ndarray) -> np.ndarray:
+    """(H, W) float32 of mean 1: how samples are best spread over the pixels, from equally many in each.
+
+    In proportion to the relative standard deviation, in the 24 pixels around a pixel and never in itself: so its
+    number of samples does not depend on what they were (but through the mean of all weights, by 1/N), and its mean
+    stays unbiased.
+    """
+    with np.errstate(invalid="ignore", over="ignore"):
+        relative = (variance / (image**2 + RELATIVE_FLOOR)).mean(-1, keepdims=True)
+    weights = np.sqrt(_around(np.where(np.isfinite(relative), relative, np.nan), 2))[..., 0]
+    known = np.isfinite(weights)
+    if not known.any() or not weights[known].any():
+        return np.ones(weights.shape, np.float32)
+    average = weights[known].mean()
+    weights = np.maximum(np.where(known, weights, average), LEAST_SHARE * average)
+    return (weights / weights.mean()).astype(np.float32)
+
+
+def _around(x: np.ndarray, radius: int) -> np.ndarray:
+    """(H, W, C) mean over the square around each pixel, without itself and what is not finite; nan if none is left."""
+    known = np.isfinite(x).all(-1, keepdims=True)
+    values = np.where(known, x, 0)
+    count = _box(known.astype(x.dtype), radius) - known
+    total = _box(values, radius)
+    total -= values
+    return np.where(count > 0, np.maximum(total, 0) / np.maximum(count, 1), np.nan).astype(x.dtype)
+
+
+def _box(x: np.ndarray, radius: int) -> np.ndarray:
+    """Sums over squares, cut off at the border."""
+    for axis in (0, 1):
+        total = x.copy()
+        line, out = np.moveaxis(x, axis, 0), np.moveaxis(total, axis, 0)
+        for shift in range(1, radius + 1):
+            out[shift:] += line[:-shift]
+            out[:-shift] += line[shift:]
+        x = total
+    return x

@@ -1,0 +1,79 @@
+"""What a camera ray meets first: the mean of its distance, normal and albedo over a pixel's samples."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from pathjax import bsdfs, film
+from pathjax.camera import sample_ray
+from pathjax.core import sampler
+from pathjax.core.math import dot, spawn_ray
+from pathjax.integrators import path
+from pathjax.shapes import geometry
+
+
+class FirstHit(NamedTuple):
+    """All 0 where nothing is met, as Mitsuba's `aov` has it."""
+
+    depth: jax.Array  # (1,) distance along the ray, from the near clip plane on
+    normal: jax.Array  # (3,) shading normal in world space, on the side that the shape's normals point to
+    albedo: jax.Array  # (3,) share of light that a reflector sends back; 1 for glass, 0 for a side that absorbs
+
+
+def mean(work, scene) -> FirstHit:
+    """Over a pixel's samples. work: the pixel () int32, and its `pixel.numbers`."""
+    pixel, first_sample, spp, seed = work
+    stream = sampler.pixel_stream(seed, pixel)
+
+    def add(i, total):
+        seen = sample(scene, pixel, stream, first_sample + i.astype(jnp.uint32))
+        return jax.tree.map(jnp.add, total, seen)
+
+    total = lax.fori_loop(0, spp.astype(jnp.int32), add, _nothing(scene))
+    return jax.tree.map(lambda x: x / spp.astype(x.dtype), total)
+
+
+def sample(scene, pixel, stream, number) -> FirstHit:
+    """One sample, at the film position that `pixel.sample` has."""
+    u_film, u_lens, numbers = path.sample_numbers(scene, stream, number)
+    position, weight = film.sample_position(scene.film, pixel, u_film)
+    ray = sample_ray(scene.camera, position, u_lens)
+    if not scene.geometry.tables:
+        return _nothing(scene)
+    ray, hit, passed = _first(scene, ray)
+
+    def seen():
+        surface = geometry.surface(scene.geometry, ray, hit)
+        _, wi, kind, row = path.shading(scene.materials, ray, hit, surface)
+        # The mean weight of a bsdf sample is the albedo, exact where all directions carry the same.
+        drawn = bsdfs.sample(scene.materials, kind, row, surface.uv, wi, numbers(jnp.int32(0)).bsdf)
+        albedo = jnp.where(bsdfs.is_glass(scene.materials, kind), 1, jnp.where(kind >= 0, drawn.weight, 0))
+        return FirstHit((passed + hit.t)[None], surface.shading_n, albedo)
+
+    found = lax.cond(hit.primitive >= 0, seen, lambda: _nothing(scene))
+    return jax.tree.map(lambda x: weight * x, found)
+
+
+def _first(scene, ray):
+    """The ray, its hit, and how far it came before; lights that are hidden from the camera let it through."""
+    shapes = scene.geometry
+    state = ray, geometry.closest_hit(shapes, ray), jnp.zeros_like(ray.t_max)
+    if not scene.hide_emitters:
+        return state
+
+    def go_on(state):
+        ray, hit, passed = state
+        surface = geometry.surface(shapes, ray, hit)
+        beyond = spawn_ray(surface, ray.d, hit.primitive)._replace(t_max=ray.t_max - hit.t)
+        return beyond, geometry.closest_hit(shapes, beyond), passed + dot(beyond.o - ray.o, ray.d)
+
+    return lax.while_loop(lambda state: geometry.emits(shapes, state[1]), go_on, state)
+
+
+def _nothing(scene) -> FirstHit:
+    zero = jnp.zeros((3,), scene.camera.origin.dtype)
+    return FirstHit(zero[:1], zero, zero)

@@ -1,0 +1,46 @@
+"""Replicates: an image is the mean of COUNT independent randomisations of one sequence, whose spread tells its error.
+
+Sample i of a pixel is sample i // COUNT of replicate i % COUNT. Arrays are NumPy: means (COUNT, N, 3) of each
+replicate, count (N,) samples of all replicates together.
+"""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+
+from pathjax.core import sampler
+
+COUNT = 4
+# Pixels that are summed up at a time, so that images need no second copy.
+_BLOCK = 1 << 16
+
+
+def seeds(seed: int) -> np.ndarray:
+    """(COUNT,) uint32 seeds of the replicates of a seed."""
+    return np.asarray(sampler.combine(jnp.arange(COUNT, dtype=jnp.uint32), jnp.uint32(seed)))
+
+
+def shares(count: np.ndarray) -> np.ndarray:
+    """(COUNT, N) int32: samples of each replicate among the first `count`."""
+    first_come = COUNT - 1 - np.arange(COUNT, dtype=np.int32)
+    return (count + first_come[:, None]) // COUNT
+
+
+def moments(means: np.ndarray, count: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The image (N, 3), the mean over all samples, and an unbiased estimate of its variance (N, 3).
+
+    The variance has COUNT - 1 degrees of freedom, and is nan with fewer than 2 samples; replicates of unequal numbers
+    of samples count as if variance fell with their number. A pixel without samples is black.
+    """
+    image, variance = np.empty_like(means[0]), np.empty_like(means[0])
+    for first in range(0, len(count), _BLOCK):
+        block = slice(first, first + _BLOCK)
+        replicates, n = means[:, block], count[block].astype(means.dtype)[:, None]
+        share = shares(count[block]).astype(means.dtype)[..., None]
+        image[block] = (replicates * share).sum(0) / np.maximum(n, 1)
+        freedom = np.minimum(n, COUNT) - 1
+        with np.errstate(invalid="ignore"):  # a pixel that is not finite
+            spread = ((replicates - image[block]) ** 2 * share).sum(0) / np.maximum(n, 1)
+        variance[block] = np.where(freedom > 0, spread / np.maximum(freedom, 1), np.nan)
+    return image, variance

@@ -1,0 +1,239 @@
+"""Render until an error is reached, a time is over or samples are spent; nothing is lost when it is stopped."""
+
+from __future__ import annotations
+
+import math
+import operator
+import signal
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from pathjax import estimate, film, progressive, replicates
+from pathjax.checkpoint import Checkpoint, identity
+from pathjax.errors import InputError
+from pathjax.integrators import path
+from pathjax.scene import Scene
+
+# Samples of every pixel before their number may differ.
+PILOT_SPP = 16
+# A round multiplies the samples by at most MOST_GROWTH. Near the target it takes this power of what is predicted to be
+# lacking, so as not to pass it by, but never less than LEAST_GROWTH.
+MOST_GROWTH, LEAST_GROWTH, CAUTION = 2.0, 1.05, 0.75
+MAX_SPP = 2**31 - 1
+UNKNOWN = estimate.ImageError(math.nan, math.nan)
+
+
+@dataclass(frozen=True)
+class RenderResult:
+    """An image and how wrong it is."""
+
+    image: np.ndarray  # (H, W, 3) float32
+    standard_error: np.ndarray  # (H, W, 3) float32 of the image; nan where a pixel has fewer than 2 samples
+    spp: float  # mean over the pixels
+    samples: np.ndarray  # (H, W) int32 of each pixel
+    compile_seconds: float  # of this call
+    run_seconds: float  # of all calls that shared the checkpoint
+    error: float  # estimate of sqrt(relMSE), relMSE = mean((I - R)^2 / (R^2 + 0.01)); nan before the second sample
+    error_bound: float  # that the error exceeds in some 5 % of renders; what is compared with the target
+    reason: str  # why it ended: "target error", "time limit", "spp", "interrupted"
+
+
+def render_until(
+    scene: Scene,
+    target_error: float | None = None,
+    time_limit: float | None = None,
+    spp: int | None = None,
+    seed: int = 0,
+    strategy: str = "mis",
+    checkpoint: str | Path | None = None,
+    progress: bool = False,
+) -> RenderResult:
+    """Render until the first of three limits is reached.
+
+    The image is the mean of independent replicates, so not that of `render` for the same seed. With `spp` alone all
+    pixels get as many samples; else, after a pilot, noisy neighbourhoods get more (`estimate.sample_weights`). Either
+    way the image is unbiased up to the scene's max_depth. The same arguments give the same image, bit for bit, unless a
+    time limit or an interrupt ended it.
+
+    Args:
+        target_error: of sqrt(relMSE). Reached when the upper bound of its estimate is below.
+        time_limit: seconds of rendering; compilation, which nothing can cut short, comes on top.
+        spp: most samples per pixel, on average.
+        checkpoint: a .npz file to save the state in, at intervals, when interrupted and at the end. Where it exists
+            the render goes on from there; killed at any moment and called again, it gives the image of an undisturbed
+            run.
+        progress: show a bar on stderr.
+    Raises:
+        InputError: an argument is out of range, or nothing to stop at is given; a checkpoint of another render, a
+            damaged one, or one that cannot be written (before rendering starts, where that can be known).
+        KeyboardInterrupt: by Ctrl-C while the kernel compiles. Later, Ctrl-C and SIGTERM end the render, which returns
+            what is done (in the main thread, where alone Python hears them).
+    """
+    render = Render(scene, target_error, time_limit, spp, seed, strategy, checkpoint)
+    render.compile()
+    return render.run(progress)
+
+
+class Render:
+    """What `render_until` does, in steps: check the arguments and take up the checkpoint, compile, run."""
+
+    def __init__(self, scene, target_error, time_limit, spp, seed, strategy, checkpoint):
+        _check(target_error, time_limit, spp)
+        path.check_sampling(strategy, MAX_SPP if spp is None else spp, seed)
+        self.scene, self.seed, self.strategy = scene, operator.index(seed), strategy
+        self.target_error, self.time_limit = target_error, time_limit
+        self.spp = MAX_SPP if spp is None else int(spp)
+        self.compile_seconds = 0.0
+        adaptive = target_error is not None or time_limit is not None
+        self.state, self.checkpoint = progressive.start(scene), None
+        progressive.plan(self.state, min(PILOT_SPP, self.spp))
+        if checkpoint is not None:
+            self.checkpoint = Checkpoint(checkpoint, identity(scene, self.seed, strategy, adaptive))
+            self.state = self.checkpoint.load(self.state)
+            self.checkpoint.save(self.state)
+        if not adaptive or self.state.spp > self.spp:
+            progressive.plan(self.state, self.spp)
+
+    def compile(self) -> None:
+        started = time.perf_counter()
+        progressive.compile(self.scene, self.strategy)
+        self.compile_seconds += time.perf_counter() - started
+
+    def run(self, progress: bool = False) -> RenderResult:
+        with _Interrupts() as interrupts, _bar(progress) as show:
+            reason = self._run(interrupts, show)
+            if self.checkpoint is not None:
+                self.checkpoint.save(self.state)
+        return self._result(reason)
+
+    def _run(self, interrupts, show) -> str:
+        """Extend the state until there is a reason to stop. What it becomes depends on itself alone, not on time."""
+        state, error = self.state, UNKNOWN
+        earlier, started = state.seconds, time.perf_counter()
+        if self._out_of_time():
+            return "time limit"
+        while True:
+            for _ in progressive.extend(self.scene, state, self.seed, self.strategy):
+                state.seconds = earlier + time.perf_counter() - started
+                if self.checkpoint is not None:
+                    self.checkpoint.save_if_due(state)
+                show(self, error)
+                if interrupts.heard:
+                    return "interrupted"
+                if self._out_of_time():
+                    return "time limit"
+            image, variance = self._estimates()
+            error = estimate.image_error(image, variance)
+            if self._on_target(error):
+                return "target error"
+            if state.spp >= self.spp:
+                return "spp"
+            if state.spp == PILOT_SPP:
+                state.weights = estimate.sample_weights(image, variance).ravel()
+            progressive.plan(state, min(_next_spp(state.spp, error, self.target_error), self.spp))
+
+    def _out_of_time(self) -> bool:
+        return self.time_limit is not None and self.state.seconds >= self.time_limit
+
+    def _on_target(self, error: estimate.ImageError) -> bool:
+        return self.target_error is not None and error.bound <= self.target_error
+
+    def _estimates(self) -> tuple[np.ndarray, np.ndarray]:
+        """Image and its variance, (H, W, 3) each."""
+        shape = (*film.image_shape(self.scene.film), 3)
+        return tuple(x.reshape(shape) for x in self.state.moments())
+
+    def _result(self, reason) -> RenderResult:
+        image, variance = self._estimates()
+        count = self.state.count.reshape(image.shape[:2])
+        # While some pixels know nothing of their error, neither does the image.
+        error = UNKNOWN if count.min() < 2 else estimate.image_error(image, variance)
+        if reason == "time limit" and self._on_target(error):
+            reason = "target error"
+        standard_error = estimate.standard_error(image, variance, count)
+        seconds = self.compile_seconds, self.state.seconds
+        return RenderResult(image, standard_error, float(count.mean()), count, *seconds, *error, reason)
+
+
+def _check(target_error, time_limit, spp) -> None:
+    if target_error is None and time_limit is None and spp is None:
+        raise InputError("nothing to stop at; give target_error, time_limit or spp")
+    for name, value in (("target_error", target_error), ("time_limit", time_limit)):
+        if value is not None and not (value > 0 and math.isfinite(value)):
+            raise InputError(f"{name} = {value}; it must be positive and finite")
+    if spp is not None and not (isinstance(spp, int | np.integer) and 1 <= spp <= MAX_SPP):
+        raise InputError(f"spp = {spp}; it must be an integer in [1, 2^31)")
+
+
+def _next_spp(spp: int, error: estimate.ImageError, target: float | None) -> int:
+    if spp < PILOT_SPP:
+        return PILOT_SPP
+    growth = MOST_GROWTH
+    if target is not None and math.isfinite(error.bound):
+        lacking = (error.bound / target) ** 2
+        growth = min(max(lacking**CAUTION, LEAST_GROWTH), MOST_GROWTH)
+    return spp + math.ceil(spp * (growth - 1) / replicates.COUNT) * replicates.COUNT
+
+
+class _Interrupts:
+    """Within it Ctrl-C and SIGTERM are only noted, so that no state is left half changed; a second one acts as ever."""
+
+    heard = False
+
+    def __enter__(self):
+        self._earlier = {}
+        if threading.current_thread() is threading.main_thread():
+            for number in (signal.SIGINT, signal.SIGTERM):
+                if signal.getsignal(number) != signal.SIG_IGN:
+                    self._earlier[number] = signal.signal(number, self._hear)
+        return self
+
+    def _hear(self, number, frame):
+        self.heard = True
+        self._restore()
+
+    def __exit__(self, *_):
+        self._restore()
+
+    def _restore(self):
+        while self._earlier:
+            number, handler = self._earlier.popitem()
+            signal.signal(number, signal.SIG_DFL if handler is None else handler)
+
+
+@contextmanager
+def _bar(wanted: bool) -> Iterator:
+    """A function (Render, error at the end of the last round) that shows how far it is."""
+    if not wanted:
+        yield lambda *_: None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = TextColumn("rendering"), BarColumn(), TextColumn("{task.fields[status]}"), TimeRemainingColumn()
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("", total=1.0, status="")
+
+        def show(render: Render, error: estimate.ImageError) -> None:
+            spp = render.state.count.mean()
+            status = f"{spp:.4g} spp"
+            if math.isfinite(error.estimate):
+                status += f"  error {error.estimate:.2%}"
+            bar.update(task, completed=_share_done(render, spp, error), status=status)
+
+        yield show
+
+
+def _share_done(render: Render, spp: float, error: estimate.ImageError) -> float:
+    shares = [spp / render.spp]
+    if render.time_limit is not None:
+        shares.append(render.state.seconds / render.time_limit)
+    if render.target_error is not None and error.bound > 0:
+        shares.append(spp / max(render.state.spp * (error.bound / render.target_error) ** 2, 1))
+    return min(max(shares), 1.0)

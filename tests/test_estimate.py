@@ -1,0 +1,174 @@
+"""The error of an image: replicates and what is estimated from them, on numbers whose truth is known."""
+
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from pathjax import estimate, replicates
+
+R = replicates.COUNT
+
+
+def normal_image(rng, sigma, count=64):
+    """Image and its variance (H, W, 3), and the truth 1: samples of standard deviation `sigma`."""
+    shape = np.broadcast_shapes(np.shape(sigma), (64, 64, 3))
+    counts = np.full(shape[0] * shape[1], count, np.int32)
+    spread = sigma / np.sqrt(replicates.shares(counts).reshape(R, *shape[:2], 1))
+    means = (1 + spread * rng.normal(size=(R, *shape))).astype(np.float32).reshape(R, -1, 3)
+    image, variance = replicates.moments(means, counts)
+    return image.reshape(shape), variance.reshape(shape)
+
+
+# ---- replicates -----------------------------------------------------------------------------------------------------
+
+
+def test_replicates_have_seeds_of_their_own():
+    seeds = [tuple(replicates.seeds(seed)) for seed in range(256)]
+    assert len({s for row in seeds for s in row}) == R * 256
+
+
+def test_samples_are_dealt_in_turn():
+    count = np.arange(20, dtype=np.int32)
+    expected = [[len(range(r, n, R)) for n in count] for r in range(R)]
+    np.testing.assert_array_equal(replicates.shares(count), expected)
+
+
+@pytest.mark.parametrize("count", [2, 3, 4, 5, 7, 64])
+def test_mean_and_variance_of_unequal_replicates(count):
+    """The mean weighs samples alike; the variance estimate is unbiased: a z-test of 70,000 pixels (4 sigma)."""
+    rng = np.random.default_rng(count)
+    counts = np.full(70_000, count, np.int32)  # more than one block
+    shares = replicates.shares(counts)[..., None]
+    means = rng.normal(size=(R, len(counts), 3)) * 2 / np.sqrt(np.maximum(shares, 1))
+    means = np.where(shares > 0, 1 + means, 0).astype(np.float32)
+    image, variance = replicates.moments(means, counts)
+    np.testing.assert_allclose(image, (means * shares).sum(0) / count, rtol=1e-4, atol=1e-6)
+    standard_error = variance.std() / np.sqrt(variance.size)
+    assert abs(variance.mean() - 4 / count) < 4 * standard_error
+
+
+def test_one_sample_tells_no_variance():
+    means = np.ones((R, 2, 3), np.float32)
+    _, variance = replicates.moments(means, np.array([1, 4], np.int32))
+    assert np.isnan(variance[0]).all() and not variance[1].any()
+
+
+def test_a_pixel_without_samples_is_black():
+    image, _ = replicates.moments(np.zeros((R, 1, 3), np.float32), np.zeros(1, np.int32))
+    assert not image.any()
+
+
+# ---- standard error of pixels ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("sigma", [1.0, np.linspace(0.2, 3, 64)[:, None, None]])
+def test_standard_errors_are_calibrated(sigma):
+    """A share of 1/4 of the own variance and 3/32 of each neighbour's makes 22.6 degrees of freedom, so z has the
+    variance 22.6 / 20.6 = 1.10 (a little more at the border); 4 standard errors of the 12,288 z^2 are 0.06."""
+    image, variance = normal_image(np.random.default_rng(0), sigma)
+    z = (image - 1) / estimate.standard_error(image, variance, np.full((64, 64), 64))
+    assert 1.03 < (z**2).mean() < 1.17
+
+
+def test_pooling_is_a_weighted_mean_of_the_square_around():
+    variance = np.random.default_rng(1).random((7, 9, 3)).astype(np.float32)
+    weights = np.full((3, 3, 1), (1 - estimate.OWN_SHARE) / 8)
+    weights[1, 1] = estimate.OWN_SHARE
+    expected = ndimage.correlate(variance.astype(float), weights)
+    pooled = estimate.standard_error(np.zeros_like(variance), variance, np.ones((7, 9))) ** 2
+    np.testing.assert_allclose(pooled[1:-1, 1:-1], expected[1:-1, 1:-1], rtol=1e-5)
+
+
+def test_pixels_that_are_not_finite_do_not_spread():
+    image, variance = normal_image(np.random.default_rng(2), 1.0)
+    image[10, 10], variance[10, 10] = np.nan, np.nan
+    errors = estimate.standard_error(image, variance, np.full((64, 64), 64))
+    assert np.isnan(errors[10, 10]).all() and np.isfinite(errors).mean() > 0.999
+    assert np.isfinite(estimate.image_error(image, variance)).all()
+    assert np.isfinite(estimate.sample_weights(image, variance)).all()
+
+
+@pytest.mark.parametrize("shape", [(1, 1, 3), (1, 5, 3), (2, 2, 3)])
+def test_images_smaller_than_the_neighbourhood(shape):
+    variance = np.full(shape, 0.25, np.float32)
+    image = np.ones(shape, np.float32)
+    np.testing.assert_allclose(estimate.standard_error(image, variance, np.full(shape[:2], 64)), 0.5)
+    np.testing.assert_allclose(estimate.sample_weights(image, variance), 1)
+
+
+def test_agreement_of_few_samples_is_not_certainty():
+    image = np.full((5, 5, 3), 6.0, np.float32)
+    errors = estimate.standard_error(image, np.zeros_like(image), np.full((5, 5), 20))
+    np.testing.assert_allclose(errors, 6 / 60)
+
+
+# ---- error of the image ---------------------------------------------------------------------------------------------
+
+
+def test_image_error_is_the_root_of_rel_mse():
+    """Of 12,288 normal values: its relative standard error is sqrt(2/3 / 12288) / 2 = 0.4 %; four of them."""
+    image, variance = normal_image(np.random.default_rng(3), 0.5)
+    error = estimate.image_error(image, variance)
+    assert error.estimate == pytest.approx(0.5 / 8 / np.sqrt(1.01), rel=0.02)
+    assert error.estimate < error.bound < 1.05 * error.estimate
+
+
+def test_few_pixels_that_rule_the_error_make_it_unsure():
+    image = np.ones((64, 64, 3), np.float32)
+    variance = np.full_like(image, 1e-6)
+    sure = estimate.image_error(image, variance)
+    variance[3, 5] = 0.5
+    unsure = estimate.image_error(image, variance)
+    assert sure.bound < 1.02 * sure.estimate
+    assert unsure.bound > 1.5 * unsure.estimate
+
+
+def test_bound_is_exceeded_in_few_renders():
+    """Of 400 images of lognormal samples of skewness 6, 5 % by intent; 36 are beyond chance (1e-4, binomial)."""
+    rng = np.random.default_rng(4)
+    s, scale, count = 1.0, 0.02, np.full(256, 16, np.int32)
+    truth = scale * np.sqrt(np.expm1(s**2) / 16 / 1.01)
+    exceeded = 0
+    for _ in range(400):
+        samples = 1 + scale * np.expm1(s * rng.normal(size=(R, 4, 256, 3)) - s**2 / 2)
+        means = samples.mean(1).astype(np.float32)
+        bound = estimate.image_error(*replicates.moments(means, count)).bound
+        exceeded += bound < truth
+    assert 0 < exceeded < 36
+
+
+def test_nothing_known_is_nan():
+    assert np.isnan(estimate.image_error(np.full((2, 2, 3), np.nan), np.full((2, 2, 3), np.nan))).all()
+
+
+def test_without_noise_the_error_is_0():
+    assert estimate.image_error(np.ones((4, 4, 3)), np.zeros((4, 4, 3))) == (0, 0)
+
+
+# ---- where samples go -----------------------------------------------------------------------------------------------
+
+
+def test_weights_never_look_at_the_pixel_itself():
+    image, variance = normal_image(np.random.default_rng(5), 1.0)
+    before = estimate.sample_weights(image, variance)
+    image[20, 30], variance[20, 30] = 7, 100
+    after = estimate.sample_weights(image, variance)
+    assert after[20, 30] / after[50, 50] == pytest.approx(before[20, 30] / before[50, 50], rel=1e-5)
+    assert after[20, 31] > 2 * before[20, 31]
+
+
+def test_weights_follow_the_relative_standard_deviation():
+    sigma = np.where(np.arange(64) < 32, 1.0, 2.0)[:, None, None]
+    weights = estimate.sample_weights(*normal_image(np.random.default_rng(6), sigma * 0.1))
+    assert weights.mean() == pytest.approx(1, abs=1e-6)
+    assert weights[40:].mean() / weights[:24].mean() == pytest.approx(2, rel=0.05)
+
+
+def test_weights_have_a_floor():
+    sigma = np.where(np.arange(64) < 32, 0.0, 1.0)[:, None, None]
+    weights = estimate.sample_weights(*normal_image(np.random.default_rng(7), sigma))
+    assert weights.min() > 0.2
+
+
+def test_weights_without_noise_are_even():
+    assert (estimate.sample_weights(np.ones((5, 5, 3)), np.zeros((5, 5, 3))) == 1).all()

@@ -1,0 +1,229 @@
+"""Renders that stop by themselves: what they claim, when they stop, and that they are unbiased."""
+
+import signal
+import threading
+
+import numpy as np
+import pytest
+
+import pathjax as pj
+from pathjax import estimate, progressive, until
+from pathjax.bench.bench import rel_mse
+
+
+@pytest.fixture(scope="module")
+def cornell(shipped):
+    return shipped("cornell_box", res=24)
+
+
+@pytest.fixture(scope="module")
+def truth(cornell):
+    return pj.render_until(cornell, spp=8192, seed=10**6).image
+
+
+# ---- reasons to stop ------------------------------------------------------------------------------------------------
+
+
+def test_an_error_asked_for_is_the_error_got(cornell, truth):
+    """Over 8 seeds; the estimate's own relative standard error is 2 % of one image, and the bound's margin 4 %."""
+    for target in (0.1, 0.05):
+        results = [pj.render_until(cornell, target, seed=seed) for seed in range(8)]
+        assert {r.reason for r in results} == {"target error"}
+        assert all(r.error < r.error_bound <= target for r in results)
+        got = np.sqrt(np.mean([rel_mse(r.image, truth) for r in results]))
+        assert 0.8 < got / target < 1.1
+
+
+def test_spp_alone_is_uniform_and_exact(cornell):
+    for spp in (1, 2, 5, 64, 70):
+        result = pj.render_until(cornell, spp=spp)
+        assert result.reason == "spp" and result.spp == spp
+        assert (result.samples == spp).all()
+        assert np.isnan(result.error) == (spp == 1)
+
+
+def test_spp_bounds_a_search_for_an_error(cornell):
+    result = pj.render_until(cornell, 1e-4, spp=40)
+    assert result.reason == "spp"
+    assert result.error_bound > 1e-4
+    assert result.spp == pytest.approx(40, rel=0.05)
+    assert result.samples.min() >= until.PILOT_SPP and result.samples.max() > 44
+    assert pj.render_until(cornell, 1e-4, spp=5).spp == 5
+
+
+def test_time_limit(cornell):
+    result = pj.render_until(cornell, time_limit=0.3)
+    assert result.reason == "time limit"
+    assert 0.3 <= result.run_seconds < 3
+    assert result.spp > 0
+
+
+def test_result_is_whole(cornell):
+    result = pj.render_until(cornell, 0.1)
+    assert result.image.shape == result.standard_error.shape == (24, 24, 3)
+    assert result.image.dtype == result.standard_error.dtype == np.float32
+    assert result.samples.shape == (24, 24) and result.spp == result.samples.mean()
+    assert result.run_seconds > 0 and result.compile_seconds >= 0
+    with pytest.raises(AttributeError):
+        result.error = 0
+
+
+def test_same_arguments_same_bits_and_another_seed_others(cornell):
+    first, second, other = (pj.render_until(cornell, 0.1, seed=seed).image for seed in (2, 2, 3))
+    np.testing.assert_array_equal(first, second)
+    assert (first != other).any(-1).mean() > 0.9
+
+
+def test_without_noise_the_pilot_is_enough(shipped):
+    result = pj.render_until(shipped("furnace", res=8, max_depth=4), 1e-4, strategy="bsdf")
+    assert (result.reason, result.spp) == ("target error", until.PILOT_SPP)
+    assert result.error < 1e-6
+
+
+def test_a_target_is_not_claimed_on_an_unsure_estimate(cornell, monkeypatch):
+    """The estimate alone would do."""
+    unsure = estimate.ImageError(0.01, 0.5)
+    monkeypatch.setattr(estimate, "image_error", lambda *_: unsure)
+    result = pj.render_until(cornell, 0.1, spp=64)
+    assert (result.reason, result.error, result.error_bound) == ("spp", *unsure)
+
+
+@pytest.mark.parametrize(
+    "wrong, says",
+    [
+        ({}, "nothing to stop at"),
+        *(({"target_error": x}, "target_error") for x in (0, 0.0, -0.1, np.nan, np.inf)),
+        *(({"time_limit": x}, "time_limit") for x in (0, -1, np.nan, np.inf)),
+        *(({"spp": x}, "spp") for x in (0, -1, 2**31, 1.5)),
+        ({"spp": 1, "seed": -1}, "seed"),
+        ({"spp": 1, "strategy": "luck"}, "luck"),
+    ],
+)
+def test_what_cannot_be_is_refused(cornell, wrong, says):
+    with pytest.raises(pj.InputError, match=says):
+        pj.render_until(cornell, **wrong)
+
+
+# ---- interrupts -----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def after_calls(monkeypatch):
+    """(number of calls of the kernel, what to do then)."""
+
+    def install(number, act, plain=progressive.extend):
+        count = iter(range(number))
+
+        def extend(*arguments):
+            for _ in plain(*arguments):
+                if next(count, None) is None:
+                    act()
+                yield
+
+        monkeypatch.setattr(progressive, "extend", extend)
+
+    return install
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_signals_end_a_render_with_what_is_done(cornell, after_calls, number):
+    earlier = signal.getsignal(number)
+    after_calls(3, lambda: signal.raise_signal(number))
+    result = pj.render_until(cornell, spp=10**6)
+    assert result.reason == "interrupted"
+    assert result.spp == 32  # portions of 4, 4, 8 and 16
+    assert signal.getsignal(number) == earlier
+
+
+def test_interrupt_before_the_first_samples(cornell, monkeypatch):
+    monkeypatch.setattr(progressive, "compile", lambda *_: signal.raise_signal(signal.SIGINT))
+    with pytest.raises(KeyboardInterrupt):
+        pj.render_until(cornell, spp=4)
+
+
+def test_render_in_another_thread(cornell):
+    results = []
+    thread = threading.Thread(target=lambda: results.append(pj.render_until(cornell, spp=4)))
+    thread.start()
+    thread.join()
+    np.testing.assert_array_equal(results[0].image, pj.render_until(cornell, spp=4).image)
+
+
+# ---- the state ------------------------------------------------------------------------------------------------------
+
+
+def test_a_state_left_after_any_call_leads_to_the_same_bits(cornell, monkeypatch):
+    """Chunks of 100 pixels, so that a pass is left in its middle."""
+    monkeypatch.setattr(progressive, "CHUNK_PIXELS", 100)
+
+    def rendered(leave_after):
+        state = progressive.start(cornell)
+        for spp in (6, 16, 90):
+            if spp == 90:
+                state.weights = np.linspace(0.5, 1.5, len(state.count), dtype=np.float32)
+            progressive.plan(state, spp)
+            left = leave_after
+            while (state.count < state.goal).any():
+                for _ in progressive.extend(cornell, state, 5, "mis"):
+                    left -= 1
+                    if left % leave_after == 0:
+                        break
+        return state
+
+    whole = rendered(10**9)
+    for leave_after in (1, 4):
+        parts = rendered(leave_after)
+        np.testing.assert_array_equal(whole.means, parts.means)
+        np.testing.assert_array_equal(whole.count, parts.count)
+
+
+def test_image_is_the_mean_of_the_replicates(cornell):
+    from pathjax import replicates
+    from pathjax.render import render_pixels
+
+    result = pj.render_until(cornell, spp=32, seed=4)
+    pixels = np.arange(24 * 24, dtype=np.int32)
+    images = [np.asarray(render_pixels(cornell, pixels, 0, 8, s)) for s in replicates.seeds(4)]
+    expected = np.mean(images, 0).reshape(24, 24, 3)
+    np.testing.assert_allclose(result.image, expected, rtol=1e-4, atol=1e-6)
+
+
+# ---- statistics -----------------------------------------------------------------------------------------------------
+
+SCENES = ("cornell_box", "furnace", "glass_and_mirror", "nine_spheres", "glass_ball", "mesh")
+
+
+def images_of(scene, spp, seeds, adaptive):
+    """Images and standard errors (S, H, W, 3)."""
+    limit = {"target_error": 1e-6} if adaptive else {}
+    results = [pj.render_until(scene, spp=spp, seed=seed, **limit) for seed in seeds]
+    return np.array([r.image for r in results], float), np.array([r.standard_error for r in results], float)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("adaptive", [False, True])
+@pytest.mark.parametrize("name", SCENES)
+def test_standard_errors_are_calibrated(shipped, name, adaptive):
+    """The variance of z over pixels lies within 0.8 to 1.25, by 4 of its standard errors over 16 seeds: a claim that
+    holds for other seeds too but for a chance of 1e-4. Measured are 0.88 (furnace) to 1.08 (nine spheres).
+
+    It holds from some 64 spp on: with fewer, pixels that saw no light at all have errors of 0.
+    """
+    scene = shipped(name, res=32)
+    reference, _ = images_of(scene, 1024, range(1000, 1012), False)
+    images, errors = images_of(scene, 64, range(16), adaptive)
+    rounding = 1e-5 * reference.mean(0)
+    variance = errors**2 + reference.var(0, ddof=1) / len(reference) + rounding**2 + 1e-14
+    z2 = ((images - reference.mean(0)) ** 2 / variance).mean((1, 2, 3))
+    chance = 4 * z2.std(ddof=1) / np.sqrt(len(z2))
+    assert 0.8 + chance < z2.mean() < 1.25 - chance
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SCENES)
+def test_adaptive_images_have_the_mean_of_uniform_ones(shipped, agree, estimate_type, name):
+    def estimated(adaptive, seeds):
+        images, _ = images_of(shipped(name, res=24), 64, seeds, adaptive)
+        return estimate_type(images.mean(0), images.var(0, ddof=1) / len(images), len(images))
+
+    agree(estimated(True, range(48)), estimated(False, range(1000, 1048)))
