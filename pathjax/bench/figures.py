@@ -18,25 +18,50 @@ class Reference(NamedTuple):
     """The mean of independent images."""
 
     image: np.ndarray  # (H, W, 3) float64
-    noise: float  # its own expected relMSE, from the spread of those images
+    variance: np.ndarray  # (H, W, 3) estimated from the spread of those images
     spp: int
+
+    @property
+    def noise(self) -> float:
+        """Its own expected relMSE."""
+        return float(np.mean(self.variance / self._scale))
+
+    @property
+    def _scale(self) -> np.ndarray:
+        return self.image**2 + RELATIVE_FLOOR
 
     def errors(self, images) -> list[float]:
         """relMSE of each image, expected to be too high by `noise`, up to higher orders of the reference's error."""
         return [rel_mse(image, self.image) for image in images]
 
+    def bias(self, images) -> dict:
+        """relMSE that is left of independent images when their noise is gone, and its standard error over pixels.
 
-def reference_of(images, spp_each: int) -> Reference:
-    """Reference from at least two independent images of `spp_each` samples; Welford's, one image in memory."""
+        Unbiased, so it may be negative; 0 where the images and the reference have the same mean. None of one image.
+        """
+        mean, variance, count = moments(images)
+        if count < 2:
+            return {"rel_mse": None, "standard_error": None}
+        squares = ((mean - self.image) ** 2 - variance - self.variance) / self._scale
+        pixels = squares.mean(-1).ravel()  # channels share their paths
+        return {"rel_mse": finite(float(pixels.mean())), "standard_error": finite(standard_error(pixels))}
+
+
+def moments(images) -> tuple[np.ndarray, np.ndarray, int]:
+    """Mean, estimated variance of that mean (0 of one image), and count of images; Welford's, one in memory."""
     count, mean, squares = 0, 0.0, 0.0
     for image in images:
         count += 1
         change = np.asarray(image, float) - mean
         mean = mean + change / count
         squares = squares + change * (image - mean)
-    variance_of_mean = squares / (count - 1) / count
-    noise = float(np.mean(variance_of_mean / (mean**2 + RELATIVE_FLOOR)))
-    return Reference(mean, noise, count * spp_each)
+    return mean, squares / max(count - 1, 1) / count, count
+
+
+def reference_of(images, spp_each: int) -> Reference:
+    """Reference from at least two independent images of `spp_each` samples."""
+    mean, variance, count = moments(images)
+    return Reference(mean, variance, count * spp_each)
 
 
 def row(asked_spp: int, spp: int, seconds, errors, noise: float, paths: int) -> dict:

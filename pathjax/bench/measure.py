@@ -46,7 +46,8 @@ class Subject(NamedTuple):
 
     def row(self, asked_spp, spp, seconds, images) -> dict:
         errors = self.reference.errors(images)
-        return figures.row(asked_spp, spp, seconds, errors, self.reference.noise, self.paths)
+        row = figures.row(asked_spp, spp, seconds, errors, self.reference.noise, self.paths)
+        return {**row, "bias": self.reference.bias(images)}
 
 
 def measure(file: str, defines: dict[str, str], plan: Plan) -> dict:

@@ -8,7 +8,9 @@ _ABOUT = """\
 relMSE = mean((I - R)^2 / (R^2 + 0.01)), the mean of {repeat} seeds and its standard error. R is a reference of
 pathjax's own with other seeds, the mean of independent images; its own relMSE, told by their spread, is subtracted.
 Efficiency = 1 / (relMSE x seconds). Seconds are medians over the seeds and hold no compilation{halves}.
-Slopes are those of log sqrt(relMSE): -0.5 in spp where samples are independent.
+Slopes are those of log sqrt(relMSE): -0.5 in spp where samples are independent. Bias is the relMSE between R and the
+mean over the seeds at the most spp, less the noise of both: 0, give or take its standard error, if both programs
+converge to the same image.
 """
 _HALVES = ";\nhalf of pathjax's renders were made before Mitsuba's and half after"
 _NOISY_REFERENCE = "\\* More than half of the error measured is the reference's: raise --reference-spp."
@@ -60,10 +62,14 @@ def _speed(scene: dict) -> list[str]:
     )
     if any(row["reference_too_noisy"] for _, _, row in rows):
         lines += [_NOISY_REFERENCE, ""]
-    slopes = {"pathjax": scene["slopes"]["pathjax"]}
-    slopes |= {f"Mitsuba {sampler}": found for sampler, found in scene["slopes"]["mitsuba"].items()}
-    cells = [[name, _slope(found["spp"]), _slope(found["seconds"])] for name, found in slopes.items()]
-    return lines + _table(["RMS error", "slope in spp", "slope in seconds"], cells)
+    groups = {"pathjax": (scene["slopes"]["pathjax"], scene["pathjax"])}
+    for sampler, found in scene["slopes"]["mitsuba"].items():
+        groups[f"Mitsuba {sampler}"] = found, [row for row in scene["mitsuba"] if row["sampler"] == sampler]
+    cells = [
+        [name, _slope(found["spp"]), _slope(found["seconds"]), _bias(rows[-1]["bias"])]
+        for name, (found, rows) in groups.items()
+    ]
+    return lines + _table(["RMS error", "slope in spp", "slope in seconds", "bias, relMSE"], cells)
 
 
 def _strategies(rows: list[dict]) -> list[str]:
@@ -141,6 +147,10 @@ def _relative(value: float | None, standard_error: float | None) -> str:
     """With its standard error in percent."""
     known = value and value > 0 and standard_error is not None
     return _number(value) + (f" ± {standard_error / value:.0%}" if known else "")
+
+
+def _bias(bias: dict) -> str:
+    return "" if bias["rel_mse"] is None else f"{bias['rel_mse']:.1e} ± {bias['standard_error']:.1e}"
 
 
 def _number(value: float | None) -> str:

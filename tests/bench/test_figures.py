@@ -60,3 +60,14 @@ def test_deviation():
     found = figures.deviation(np.float32([[[1, 2, 3]]]), [[[1, 2, 4]]])
     assert found["rel_mse"] == pytest.approx(1 / (16 + RELATIVE_FLOOR) / 3)
     assert found["largest_deviation"] == pytest.approx(1 / math.sqrt(16 + RELATIVE_FLOOR))
+
+
+def test_bias_is_what_noise_does_not_explain():
+    rng = np.random.default_rng(2)
+    truth, size = 0.5, (64, 64, 3)
+    reference = figures.reference_of((truth + 0.1 * rng.standard_normal(size) for _ in range(64)), spp_each=1)
+    scale = truth**2 + RELATIVE_FLOOR
+    for offset in (0, 0.02):
+        bias = reference.bias([truth + offset + 0.1 * rng.standard_normal(size) for _ in range(8)])
+        assert abs(bias["rel_mse"] - offset**2 / scale) < 4 * bias["standard_error"] < 1e-3
+    assert reference.bias([np.full(size, truth)]) == {"rel_mse": None, "standard_error": None}
