@@ -34,17 +34,25 @@ def run(options) -> int:
         _find_mitsuba(options.scenes[0], defines)
     plan = Plan(sorted(set(options.spp)), options.repeat, options.reference_spp, options.against, options.quick, _say)
     report = {"machine": machine(), "against": options.against, "repeat": options.repeat, "scenes": []}
-    for file in options.scenes:
-        scene = measure(file, defines, plan)
-        scene["plot"] = None
-        report["scenes"].append(scene)
-        for failure in scene["failures"]:
-            _say(f"pathjax: {file}: {failure}")
     if folder is not None:
         folder.mkdir(exist_ok=True)
-        _plot(report["scenes"], folder)
-        write_text(folder / "bench.json", json.dumps(report, indent=2))
-        write_text(folder / "bench.md", markdown(report))
+        if not plot.available():
+            _say("pathjax: no plots, for there is no matplotlib: pip install 'pathjax[bench]'")
+    try:
+        for name, file in _plot_names(options.scenes):
+            scene = measure(file, defines, plan)
+            for failure in scene["failures"]:
+                _say(f"pathjax: {file}: {failure}")
+            drawn = folder is not None and plot.available() and plot.write(scene, folder / name)
+            report["scenes"].append({**scene, "plot": name if drawn else None})
+            if folder is not None:
+                write_text(folder / "bench.json", json.dumps(report, indent=2))
+                write_text(folder / "bench.md", markdown(report))
+    except KeyboardInterrupt:
+        if folder is None or not report["scenes"]:
+            raise
+        _say(f"pathjax: interrupted; {folder} holds {len(report['scenes'])} of {len(options.scenes)} scenes")
+        return 1
     print(json.dumps(report) if options.json else markdown(report))
     return int(any(scene["failures"] for scene in report["scenes"]))
 
@@ -64,18 +72,11 @@ def _find_mitsuba(scene: str, defines: dict) -> None:
         pass  # of this scene; the report tells
 
 
-def _plot(scenes: list[dict], folder: Path) -> None:
-    """A plot of each scene, whose name its `plot` then holds."""
-    taken = set()
-    for number, scene in enumerate(scenes, 1):
-        stem = Path(scene["file"]).stem
-        name = f"{stem}-{number}.png" if f"{stem}.png" in taken else f"{stem}.png"
-        taken.add(name)
-        try:
-            scene["plot"] = name if plot.write(scene, folder / name) else None
-        except ImportError as error:
-            _say(f"pathjax: no plots: {error}; pip install 'pathjax[bench]'")
-            return
+def _plot_names(files: list[str]):
+    """(name of its plot, file) of every scene."""
+    stems = [Path(file).stem for file in files]
+    for number, (stem, file) in enumerate(zip(stems, files, strict=True), 1):
+        yield f"{stem}.png" if stems.count(stem) == 1 else f"{stem}-{number}.png", file
 
 
 def machine() -> dict:

@@ -76,6 +76,7 @@ def measure(file: str, defines: dict[str, str], plan: Plan) -> dict:
         row = subject.row(spp, spp, seconds + more_seconds, images + more_images)
         best = figures.best(peers, spp)
         row["best_peer"] = best and best["sampler"]
+        row["best_peer_spp"] = best and best["spp"]  # samplers round up
         row["efficiency_over_best_peer"] = best and row["efficiency"] and row["efficiency"] / best["efficiency"]
         rows.append(row)
     samplers = list(dict.fromkeys(row["sampler"] for row in peers))

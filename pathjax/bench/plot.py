@@ -17,12 +17,16 @@ _PEERS = {
 }
 
 
-def write(scene: dict, path: Path) -> bool:
-    """Plot a scene of the report; False, and no file, where nothing in it has noise.
+def available() -> bool:
+    try:
+        import matplotlib  # noqa: F401
+    except ImportError:
+        return False
+    return True
 
-    Raises:
-        ImportError: there is no matplotlib.
-    """
+
+def write(scene: dict, path: Path) -> bool:
+    """Plot a scene of the report; False, and no file, where nothing in it has noise."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
     from matplotlib.ticker import LogLocator, NullFormatter

@@ -5,7 +5,7 @@ from __future__ import annotations
 import statistics
 
 _ABOUT = """\
-relMSE = mean((I - R)^2 / (R^2 + 0.01)), the mean of {repeat} seeds and its standard error. R is a reference of
+relMSE = mean((I - R)^2 / (R^2 + 0.01)), the mean over seeds ({repeat}) and its standard error. R is a reference of
 pathjax's own with other seeds, the mean of independent images; its own relMSE, told by their spread, is subtracted.
 Efficiency = 1 / (relMSE x seconds). Seconds are medians over the seeds and hold no compilation{halves}.
 Slopes are those of log sqrt(relMSE): -0.5 in spp where samples are independent. Bias is the relMSE between R and the
@@ -134,13 +134,16 @@ def _run(row: dict) -> list[str]:
 
 def _efficiency(row: dict) -> str:
     if row["efficiency"] is not None:
-        return f"{row['efficiency']:.4g}"
+        return f"{row['efficiency']:.0f}" if row["efficiency"] > 100 else f"{row['efficiency']:.3g}"
     return "" if row["rel_mse"] is None or row["reference_too_noisy"] else "no noise"
 
 
 def _versus(row: dict) -> str:
     ratio = row["efficiency_over_best_peer"]
-    return "" if ratio is None else f"{ratio:.2f} x {row['best_peer']}"
+    if ratio is None:
+        return ""
+    taken = "" if row["best_peer_spp"] == row["spp"] else f" at {row['best_peer_spp']} spp"
+    return f"{ratio:.2f} x {row['best_peer']}{taken}"
 
 
 def _relative(value: float | None, standard_error: float | None) -> str:

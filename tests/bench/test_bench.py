@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 import pathjax
-from pathjax.bench import alone, mitsuba_peer
+from pathjax.bench import alone, bench, mitsuba_peer
 from pathjax.cli import main
 from pathjax.compare import rel_mse
 
@@ -118,7 +118,7 @@ def test_float64_has_a_process_of_its_own():
 
 
 def test_several_scenes_without_matplotlib(tmp_path, capsys, monkeypatch):
-    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
     run(FURNACE, FURNACE, *SMALL, "--quick", "-o", str(tmp_path / "report"), "--json")
     told = capsys.readouterr()
     report = json.loads(told.out)
@@ -139,6 +139,23 @@ def test_a_scene_without_noise(tmp_path, capsys, write_scene):
     assert [row["efficiency"] for row in facts["pathjax"]] == [None, None]
     assert facts["plot"] is None
     assert not list((tmp_path / "report").glob("*.png"))
+
+
+@needs_matplotlib
+def test_an_interrupt_keeps_the_scenes_that_are_done(tmp_path, capsys, monkeypatch):
+    done = bench.measure
+
+    def measure(file, defines, plan):
+        if file == CORNELL:
+            raise KeyboardInterrupt
+        return done(file, defines, plan)
+
+    monkeypatch.setattr(bench, "measure", measure)
+    run(FURNACE, FURNACE, CORNELL, *SMALL, "--quick", "-o", str(tmp_path), status=1)
+    assert f"{tmp_path} holds 2 of 3 scenes" in capsys.readouterr().err
+    scenes = json.loads((tmp_path / "bench.json").read_text())["scenes"]
+    assert [scene["plot"] for scene in scenes] == ["furnace-1.png", "furnace-2.png"]
+    assert all((tmp_path / scene["plot"]).exists() for scene in scenes)
 
 
 def test_a_folder_without_parent_is_refused(tmp_path, capsys):
@@ -181,7 +198,7 @@ def test_the_best_sampler_is_named_and_one_that_fails_is_told(tmp_path, capsys, 
     for row in facts["pathjax"]:
         peers = [peer for peer in facts["mitsuba"] if peer["asked_spp"] == row["spp"]]
         assert len(peers) == 4
-        assert row["best_peer"] == "multijitter"
+        assert row["best_peer"] == "multijitter" and row["best_peer_spp"] == row["spp"]
         best = next(peer for peer in peers if peer["sampler"] == "multijitter")
         assert row["efficiency_over_best_peer"] == pytest.approx(row["efficiency"] / best["efficiency"])
     assert facts["slopes"]["mitsuba"].keys() == {"independent", "multijitter", "orthogonal", "ldsampler"}
