@@ -35,9 +35,10 @@ class Reference(NamedTuple):
         return [rel_mse(image, self.image) for image in images]
 
     def bias(self, images) -> dict:
-        """relMSE that is left of independent images when their noise is gone, and its standard error over pixels.
+        """relMSE that the images have in common, noise of their mean and the reference's gone, and its standard error.
 
-        Unbiased, so it may be negative; 0 where the images and the reference have the same mean. None of one image.
+        An unbiased estimate, so it may be negative. Its mean is 0 where independent images have the reference's mean.
+        None of one image.
         """
         mean, variance, count = moments(images)
         if count < 2:

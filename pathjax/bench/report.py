@@ -8,9 +8,9 @@ _ABOUT = """\
 relMSE = mean((I - R)^2 / (R^2 + 0.01)), the mean over seeds ({repeat}) and its standard error. R is a reference of
 pathjax's own with other seeds, the mean of independent images; its own relMSE, told by their spread, is subtracted.
 Efficiency = 1 / (relMSE x seconds). Seconds are medians over the seeds and hold no compilation{halves}.
-Slopes are those of log sqrt(relMSE): -0.5 in spp where samples are independent. Bias is the relMSE between R and the
-mean over the seeds at the most spp, less the noise of both: 0, give or take its standard error, if both programs
-converge to the same image.
+Slopes are those of log sqrt(relMSE): -0.5 in spp where samples are independent. Bias is the relMSE that
+seeds have in common at the most spp, so that more of them would not remove it: 0, give or take its standard error, if
+both programs converge to the same image and the peer's seeds are independent.
 """
 _HALVES = ";\nhalf of pathjax's renders were made before Mitsuba's and half after"
 _NOISY_REFERENCE = "\\* More than half of the error measured is the reference's: raise --reference-spp."

@@ -212,7 +212,6 @@ def test_mitsubas_independent_sampler_has_the_error_of_independent_numbers(capsy
     run(CORNELL, *small, "--against", "mitsuba")
     (scene,) = json.loads(capsys.readouterr().out)["scenes"]
     assert {row["sampler"] for row in scene["mitsuba"]} == set(mitsuba_peer.SAMPLERS)
-    for row in scene["mitsuba"]:
-        assert abs(row["bias"]["rel_mse"]) < 4 * row["bias"]["standard_error"]
     row = next(row for row in scene["mitsuba"] if row["sampler"] == "independent")
+    assert abs(row["bias"]["rel_mse"]) < 4 * row["bias"]["standard_error"]
     assert row["rel_mse"] == pytest.approx(scene["sampler"]["rows"][0]["independent_rel_mse"], rel=0.2)
