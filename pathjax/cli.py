@@ -78,7 +78,8 @@ def _parser() -> argparse.ArgumentParser:
     bench.add_argument("--spp", type=_spp_list, default=[16, 64, 256], metavar="16,64,256")
     bench.add_argument("--reference-spp", type=_positive, default=16384, metavar="N", help="of the converged reference")
     bench.add_argument("--repeat", type=_positive, default=5, metavar="N", help="timed runs of each; medians are shown")
-    bench.add_argument("-o", "--output", metavar="DIR", help="also write bench.json and bench.md there")
+    bench.add_argument("-o", "--output", metavar="DIR", help="also write bench.md, bench.json and plots there")
+    bench.add_argument("--quick", action="store_true", help="speed against error alone")
     bench.add_argument("--json", action="store_true", help="print one JSON object on stdout")
     bench.set_defaults(run=_bench)
 

@@ -1,0 +1,82 @@
+"""Renders in a process of their own: peak memory that means something, and float64, which JAX has for a process.
+
+    python alone.py REQUEST.json
+
+with REQUEST.json {"scene": FILE, "parameters": {}, "dtype": "float32", "spp": 16, "seeds": [0], "output": FILE.npz}.
+The npz then holds `images` (seeds, H, W, 3), and stdout gets
+
+    {"seconds": [0.1, ...], "peak_memory_bytes": 200000000}
+
+the seconds without compilation; the memory resident at most, above that after `import jax`, compilation included, null
+where the system does not tell (all but Linux). Exit status: 0 done, 1 failed.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+
+class Failed(RuntimeError):
+    """The process ended without an answer."""
+
+
+def call(request: dict) -> tuple[dict, np.ndarray]:
+    """Run a request, which needs no output: (what stdout got, images)."""
+    with tempfile.TemporaryDirectory() as folder:
+        output, file = Path(folder, "images.npz"), Path(folder, "request.json")
+        file.write_text(json.dumps({**request, "output": str(output)}))
+        # The child shall find this pathjax, wherever it was started, and no module beside this file.
+        places = [str(Path(__file__).resolve().parents[2]), os.environ.get("PYTHONPATH")]
+        environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, places))}
+        command = [sys.executable, "-P", str(Path(__file__).resolve()), str(file)]
+        done = subprocess.run(command, capture_output=True, text=True, env=environment)
+        if done.returncode:
+            raise Failed((done.stderr.strip().splitlines() or [f"it ended with status {done.returncode}"])[-1])
+        with np.load(output) as arrays:
+            return json.loads(done.stdout), arrays["images"]
+
+
+def resident(name: str) -> int | None:
+    """Bytes of this process by /proc: VmRSS now, VmHWM at most so far."""
+    # getrusage's maximum would hold that of the process which started this one.
+    try:
+        lines = Path("/proc/self/status").read_text().splitlines()
+        return next(int(line.split()[1]) * 1024 for line in lines if line.startswith(name))
+    except (OSError, StopIteration):
+        return None
+
+
+def main(file: str) -> None:
+    request = json.loads(Path(file).read_text())
+    import jax
+
+    before = resident("VmRSS")
+    import pathjax
+    from pathjax import scene
+    from pathjax.io import mitsuba_xml
+
+    if request["dtype"] == "float64":
+        jax.config.update("jax_enable_x64", True)
+    built = scene.build(mitsuba_xml.load(request["scene"], **request["parameters"]), np.dtype(request["dtype"]))
+    jax.block_until_ready(pathjax.render(built, spp=1))
+    images, seconds = [], []
+    for seed in request["seeds"]:
+        started = time.perf_counter()
+        images.append(np.asarray(pathjax.render(built, spp=request["spp"], seed=seed)))
+        seconds.append(time.perf_counter() - started)
+    peak = resident("VmHWM")
+    np.savez(request["output"], images=np.stack(images))
+    memory = None if before is None or peak is None else peak - before
+    print(json.dumps({"seconds": seconds, "peak_memory_bytes": memory}))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])

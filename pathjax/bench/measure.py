@@ -1,0 +1,224 @@
+"""What `pathjax bench` measures of one scene.
+
+Half of the timed renders are made before the peer runs and half after, so that a machine that slows down slows both.
+All but the times is the same in every run.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+import pathjax
+from pathjax import film
+from pathjax.bench import alone, figures, mitsuba_peer, rays
+from pathjax.bench.figures import Reference
+from pathjax.integrators.path import STRATEGIES
+from pathjax.scene import Scene
+
+# Independent images whose mean is the reference, so that their spread tells its error.
+BATCHES = 16
+# Images of one sample a pixel, whose error is that of independent numbers.
+SINGLES = 64
+# No timed render has these seeds.
+REFERENCE_SEED, SINGLES_SEED = 1 << 20, 1 << 21
+
+
+class Plan(NamedTuple):
+    spps: list[int]  # ascending
+    repeat: int  # timed renders of each kind
+    reference_spp: int  # at least
+    against: str | None  # "mitsuba"
+    quick: bool  # speed against error alone
+    say: Callable[[str], None]
+
+
+class Subject(NamedTuple):
+    file: str
+    defines: dict[str, str]
+    scene: Scene
+    reference: Reference
+    paths: int  # of a render of one sample a pixel
+
+    def row(self, asked_spp, spp, seconds, images) -> dict:
+        errors = self.reference.errors(images)
+        row = figures.row(asked_spp, spp, seconds, errors, self.reference.noise, self.paths)
+        return {**row, "bias": self.reference.bias(images)}
+
+
+def measure(file: str, defines: dict[str, str], plan: Plan) -> dict:
+    """Everything about one scene, as JSON-ready values."""
+    say = plan.say
+    scene = pathjax.load_scene(file, **defines)
+    height, width = film.image_shape(scene.film)
+    say(f"{file}: compiling")
+    compile_seconds = _compile(scene)
+    say(f"{file}: reference, {plan.reference_spp} spp")
+    subject = Subject(file, defines, scene, _reference(scene, plan.reference_spp), height * width)
+    failures = []
+
+    say(f"{file}: pathjax")
+    kinds = {spp: (spp, "mis") for spp in plan.spps}
+    before = _timed(scene, kinds, range(plan.repeat // 2))
+    peers = []
+    if plan.against == "mitsuba":
+        for sampler in mitsuba_peer.SAMPLERS:
+            say(f"{file}: Mitsuba, {sampler}")
+            peers += _mitsuba(subject, sampler, plan, failures)
+    after = _timed(scene, kinds, range(plan.repeat // 2, plan.repeat))
+    rows = []
+    for spp in plan.spps:
+        (seconds, images), (more_seconds, more_images) = before[spp], after[spp]
+        row = subject.row(spp, spp, seconds + more_seconds, images + more_images)
+        best = figures.best(peers, spp)
+        row["best_peer"] = best and best["sampler"]
+        row["best_peer_spp"] = best and best["spp"]  # samplers round up
+        row["efficiency_over_best_peer"] = best and row["efficiency"] and row["efficiency"] / best["efficiency"]
+        rows.append(row)
+    samplers = list(dict.fromkeys(row["sampler"] for row in peers))
+    facts = {
+        "file": file,
+        "width": width,
+        "height": height,
+        "compile_seconds": compile_seconds,
+        "reference_spp": subject.reference.spp,
+        "reference_rel_mse": figures.finite(subject.reference.noise),
+        "pathjax": rows,
+        "mitsuba": peers,
+        "slopes": {
+            "pathjax": figures.slopes(rows),
+            "mitsuba": {name: figures.slopes([r for r in peers if r["sampler"] == name]) for name in samplers},
+        },
+        "failures": failures,
+    }
+    unmeasured = dict.fromkeys(("sampler", "strategies", "precision", "peak_memory_bytes", "closest_hits", "rays"))
+    return facts | (unmeasured if plan.quick else _more(subject, rows, plan, failures))
+
+
+def _more(subject: Subject, rows, plan: Plan, failures) -> dict:
+    """What `--quick` leaves out."""
+    say, file = plan.say, subject.file
+    say(f"{file}: independent numbers")
+    sampler = _sampler(subject, rows)
+    say(f"{file}: strategies")
+    strategies = _strategies(subject, plan)
+    say(f"{file}: float32 and float64")
+    precision, memory = _precision(subject, plan, failures)
+    say(f"{file}: closest hits")
+    closest_hits, beside_embree = rays.rates(subject.scene, plan.repeat)
+    return {
+        "sampler": sampler,
+        "strategies": strategies,
+        "precision": precision,
+        "peak_memory_bytes": memory,
+        "closest_hits": closest_hits,
+        "rays": beside_embree,
+    }
+
+
+def _compile(scene: Scene) -> float:
+    """Seconds of the first render beyond those of the second, whatever was compiled before."""
+    jax.clear_caches()
+    seconds = []
+    for _ in range(2):
+        started = time.perf_counter()
+        jax.block_until_ready(pathjax.render(scene, spp=1))
+        seconds.append(time.perf_counter() - started)
+    return seconds[0] - seconds[1]
+
+
+def _reference(scene: Scene, spp: int) -> Reference:
+    batches = max(2, min(BATCHES, spp))
+    each = -(-spp // batches)
+    images = (pathjax.render(scene, each, REFERENCE_SEED + k) for k in range(batches))
+    return figures.reference_of(images, each)
+
+
+def _timed(scene: Scene, kinds: dict, seeds) -> dict:
+    """(seconds, images) of every kind {name: (spp, strategy)}, one of each seed; kinds take turns."""
+    done = {name: ([], []) for name in kinds}
+    for seed in seeds:
+        for name, (spp, strategy) in kinds.items():
+            started = time.perf_counter()
+            image = np.asarray(pathjax.render(scene, spp, seed, strategy))
+            done[name][0].append(time.perf_counter() - started)
+            done[name][1].append(image)
+    return done
+
+
+def _mitsuba(subject: Subject, sampler: str, plan: Plan, failures) -> list[dict]:
+    """Rows of one of Mitsuba's samplers; none, and a word among the failures, where it cannot render the scene."""
+    seeds = list(range(1, plan.repeat + 1))
+    runs = [{"sampler": sampler, "spp": spp, "seeds": seeds} for spp in plan.spps]
+    try:
+        report, arrays = mitsuba_peer.call({"scene": subject.file, "parameters": subject.defines, "runs": runs})
+    except (mitsuba_peer.PeerMissing, mitsuba_peer.RequestError, mitsuba_peer.PeerFailed) as error:
+        failures.append(f"Mitsuba, {sampler}: {error}")
+        return []
+    rows = []
+    for k, (asked, done) in enumerate(zip(runs, report["runs"], strict=True)):
+        images = arrays[f"images_{k}"][..., :3]
+        row = subject.row(asked["spp"], done["spp"], done["seconds"], images)
+        rows.append({"sampler": sampler, "program": report["program"], **row})
+    return rows
+
+
+def _sampler(subject: Subject, rows) -> dict:
+    """pathjax's numbers beside independent ones, whose error at N samples is that of single samples over N.
+
+    One sample alone is drawn from independent uniform numbers, whatever correlates it with the next.
+    """
+    scene, reference = subject.scene, subject.reference
+    images = (pathjax.render(scene, 1, SINGLES_SEED + k) for k in range(SINGLES))
+    errors = reference.errors(images)
+    single = float(np.mean(errors)) - reference.noise
+    compared = []
+    for row in rows:
+        independent = single / row["spp"]
+        ratio = independent / row["rel_mse"] if row["efficiency"] else None
+        compared.append(
+            {
+                "spp": row["spp"],
+                "rel_mse": row["rel_mse"],
+                "independent_rel_mse": figures.finite(independent),
+                "ratio": ratio and figures.finite(ratio),
+            }
+        )
+    return {
+        "single_rel_mse": figures.finite(single),
+        "single_rel_mse_standard_error": figures.finite(figures.standard_error(errors)),
+        "rows": compared,
+    }
+
+
+def _middle(spps: list[int]) -> int:
+    return spps[len(spps) // 2]
+
+
+def _strategies(subject: Subject, plan: Plan) -> list[dict]:
+    spp = _middle(plan.spps)
+    for strategy in STRATEGIES:
+        jax.block_until_ready(pathjax.render(subject.scene, 1, strategy=strategy))
+    done = _timed(subject.scene, {strategy: (spp, strategy) for strategy in STRATEGIES}, range(plan.repeat))
+    return [{"strategy": strategy, **subject.row(spp, spp, *done[strategy])} for strategy in STRATEGIES]
+
+
+def _precision(subject: Subject, plan: Plan, failures) -> tuple[dict | None, int | None]:
+    """Same seeds in float32 and float64, and the peak memory of the former; None where that process failed."""
+    spp, seeds = _middle(plan.spps), list(range(plan.repeat))
+    request = {"scene": subject.file, "parameters": subject.defines, "spp": spp, "seeds": seeds}
+    done = {}
+    for dtype in ("float32", "float64"):
+        try:
+            done[dtype] = alone.call({**request, "dtype": dtype})
+        except alone.Failed as error:
+            failures.append(f"{dtype}: {error}")
+    memory = done["float32"][0]["peak_memory_bytes"] if "float32" in done else None
+    if len(done) < 2:
+        return None, memory
+    rows = {dtype: subject.row(spp, spp, report["seconds"], images) for dtype, (report, images) in done.items()}
+    return {**rows, **figures.deviation(done["float32"][1], done["float64"][1])}, memory

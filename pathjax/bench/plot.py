@@ -1,0 +1,82 @@
+"""Error against time of one scene, as a PNG. Needs matplotlib, of the `bench` extra."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+from pathjax.io.files import write_whole
+
+_OURS = {"color": "black", "marker": "o", "linewidth": 2.2, "markersize": 7, "zorder": 3}
+_PEERS = {
+    "independent": {"color": "#d55e00", "marker": "s"},
+    "stratified": {"color": "#0072b2", "marker": "^"},
+    "multijitter": {"color": "#009e73", "marker": "D"},
+    "orthogonal": {"color": "#cc79a7", "marker": "v"},
+    "ldsampler": {"color": "#e69f00", "marker": "P"},
+}
+
+
+def available() -> bool:
+    try:
+        import matplotlib  # noqa: F401
+    except ImportError:
+        return False
+    return True
+
+
+def write(scene: dict, path: Path) -> bool:
+    """Plot a scene of the report; False, and no file, where nothing in it has noise."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+    from matplotlib.ticker import LogLocator, NullFormatter
+
+    lines = {"pathjax": (_points(scene["pathjax"]), scene["slopes"]["pathjax"], _OURS)}
+    for sampler, slopes in scene["slopes"]["mitsuba"].items():
+        rows = [row for row in scene["mitsuba"] if row["sampler"] == sampler]
+        lines[f"Mitsuba {sampler}"] = _points(rows), slopes, _PEERS[sampler]
+    lines = {name: line for name, line in lines.items() if line[0]}
+    if not lines:
+        return False
+
+    figure = Figure(figsize=(7.2, 5), dpi=150, layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.add_subplot(xscale="log", yscale="log")
+    for name, (points, slopes, look) in lines.items():
+        slope = "" if slopes["seconds"] is None else f", slope {slopes['seconds']:.2f}"
+        axes.plot(*zip(*points, strict=True), label=name + slope, **look)
+    axes.margins(0.1)
+    _guide(axes)
+    axes.set_xlabel("time of a render [s], without compilation")
+    axes.set_ylabel("RMS relative error, sqrt(relMSE)")
+    axes.set_title(f"{scene['file']}, {scene['width']} x {scene['height']}", fontsize=10)
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axis.set_major_formatter("{x:g}")
+        axis.set_minor_formatter(NullFormatter())
+    axes.grid(True, color="#eeeeee", linewidth=0.6)
+    axes.set_axisbelow(True)
+    axes.legend(fontsize=8.5, loc="upper right")
+    write_whole(path, lambda beside: figure.savefig(beside, format="png"))
+    return True
+
+
+def _points(rows) -> list[tuple[float, float]]:
+    return sorted((row["run_seconds"], math.sqrt(row["rel_mse"])) for row in rows if row["efficiency"])
+
+
+def _guide(axes) -> None:
+    """Lines of equal efficiency, powers of ten, within the axes as they are."""
+    (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()
+    axes.set(xlim=(left, right), ylim=(low, high))
+    first = math.ceil(math.log10(1 / (high**2 * right)))
+    last = math.floor(math.log10(1 / (low**2 * left)))
+    for power in range(first, last + 1):
+        efficiency = 10.0**power
+        y = [(efficiency * x) ** -0.5 for x in (left, right)]
+        axes.plot([left, right], y, color="#bbbbbb", linewidth=0.8, linestyle="--", zorder=1)
+        label = {"text": f" efficiency {efficiency:g} ", "fontsize": 7, "color": "gray", "zorder": 1}
+        if y[1] > low:
+            axes.annotate(xy=(right, y[1]), ha="right", va="top", **label)
+        else:
+            axes.annotate(xy=(1 / (efficiency * low**2), low), ha="left", va="bottom", **label)
