@@ -112,7 +112,10 @@ def _while_parts(eqn, values):
 
 def _scan_parts(eqn, values):
     """Values of a scan: constants, what is carried, what is taken row by row."""
-    n, m = eqn.params["num_consts"], eqn.params["num_carry"]
+    if "num_consts" in eqn.params:
+        n, m = eqn.params["num_consts"], eqn.params["num_carry"]
+    else:  # jax 0.12
+        n, m, _ = (len(tree.vals) for tree in eqn.params["ft_in"].unpack())
     return values[:n], values[n : n + m], values[n + m :]
 
 

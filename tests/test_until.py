@@ -8,7 +8,7 @@ import pytest
 
 import pathjax as pj
 from pathjax import estimate, progressive, until
-from pathjax.bench.bench import rel_mse
+from pathjax.compare import rel_mse
 
 
 @pytest.fixture(scope="module")

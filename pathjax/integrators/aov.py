@@ -8,11 +8,11 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from pathjax import bsdfs, film
-from pathjax.camera import sample_ray
+from pathjax import bsdfs
 from pathjax.core import sampler
 from pathjax.core.math import dot, spawn_ray
 from pathjax.integrators import path
+from pathjax.integrators.pixel import camera_path
 from pathjax.shapes import geometry
 
 
@@ -38,19 +38,18 @@ def mean(work, scene) -> FirstHit:
 
 
 def sample(scene, pixel, stream, number) -> FirstHit:
-    """One sample, at the film position that `pixel.sample` has."""
-    u_film, u_lens, numbers = path.sample_numbers(scene, stream, number)
-    position, weight = film.sample_position(scene.film, pixel, u_film)
-    ray = sample_ray(scene.camera, position, u_lens)
+    """One sample, at the film position of `pixel.camera_path`."""
+    start, weight = camera_path(scene, pixel, stream, number)
     if not scene.geometry.tables:
         return _nothing(scene)
-    ray, hit, passed = _first(scene, ray)
+    ray, hit, passed = _first(scene, start.ray)
 
     def seen():
         surface = geometry.surface(scene.geometry, ray, hit)
         _, wi, kind, row = path.shading(scene.materials, ray, hit, surface)
+        u = path.bounce_numbers(scene, stream, number, start.depth)
         # The mean weight of a bsdf sample is the albedo, exact where all directions carry the same.
-        drawn = bsdfs.sample(scene.materials, kind, row, surface.uv, wi, numbers(jnp.int32(0)).bsdf)
+        drawn = bsdfs.sample(scene.materials, kind, row, surface.uv, wi, u.bsdf)
         albedo = jnp.where(bsdfs.is_glass(scene.materials, kind), 1, jnp.where(kind >= 0, drawn.weight, 0))
         return FirstHit((passed + hit.t)[None], surface.shading_n, albedo)
 
