@@ -395,30 +395,37 @@ def _dynamic_slice(lanes, inputs, params, shape):
     starts = [start.item() if _differs(start) else start for start in starts]
     picked = []
     for axis, (start, size) in enumerate(zip(starts, shape, strict=True)):
-        if size == table.shape[axis]:
+        extent = table.shape[axis]
+        if size == extent:
             continue
         if jnp.ndim(start) or _differs(table):
-            if size != 1:
-                return None
             picked.append(axis)
+            if size > 1:  # of one entry, the gather clamps the number
+                starts[axis] = jnp.clip(start, 0, extent - size)
         else:
             table = lax.dynamic_slice_in_dim(table, start, size, axis, allow_negative_indices=False)
     if _differs(table):
         for axis in picked:
-            entries = np.split(table, table.shape[axis], axis)
-            table = entries[0]
-            for k, entry in enumerate(entries[1:], 1):
-                table = lanes.select(starts[axis] >= k, table, entry)
+            size, extent = shape[axis], table.shape[axis]
+            windows = [np.take(table, range(k, k + size), axis) for k in range(extent - size + 1)]
+            table = windows[0]
+            for k, window in enumerate(windows[1:], 1):
+                table = lanes.select(starts[axis] >= k, table, window)
         return table
     if not picked:
         return table
-    index = starts[picked[0]].astype(jnp.int32)
-    for axis in picked[1:]:
-        index = index * table.shape[axis] + starts[axis].astype(jnp.int32)
-    extent = math.prod(table.shape[axis] for axis in picked)
-    columns = jnp.moveaxis(table, picked, range(len(picked))).reshape(extent, -1)
-    # One column at a time: gathered from a reshaped table, every index would be divided and multiplied again.
-    return _objects(shape, [_entries(columns[:, k], index) for k in range(columns.shape[1])])
+    extents = [table.shape[axis] for axis in picked]
+    columns = jnp.moveaxis(table, picked, range(len(picked))).reshape(math.prod(extents), -1)
+    blocks = []
+    for offsets in np.ndindex(*(shape[axis] for axis in picked)):
+        index = 0
+        for axis, extent, offset in zip(picked, extents, offsets, strict=True):
+            index = index * extent + (starts[axis].astype(jnp.int32) + offset)
+        # One column at a time: gathered from a reshaped table, every index would be divided and multiplied again.
+        blocks.append([_entries(columns[:, k], index) for k in range(columns.shape[1])])
+    rest = [size for axis, size in enumerate(shape) if axis not in picked]
+    block = _objects([*(shape[axis] for axis in picked), *rest], [item for items in blocks for item in items])
+    return np.moveaxis(block, range(len(picked)), picked)
 
 
 def _entries(column, index):

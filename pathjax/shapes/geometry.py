@@ -156,9 +156,9 @@ def _visit(geometry: Geometry, ray: Ray, leaf_test, t, primitive):
             prepared = lax.optimization_barrier(module.prepare(o, d))
 
             def leaf(number, t, primitive):
-                block = at(table.leaves, number)
-                primitives = rows_of(block) + first  # of empty lanes: nonsense, but these are never hit
-                distances = module.intersect(block, table, prepared, primitives == exclude)
+                rows = rows_of(at(table.leaves, number))
+                primitives = rows + first  # of empty lanes: nonsense, but these are never hit
+                distances = module.intersect(table, number, prepared, primitives == exclude)
                 return leaf_test(distances, primitives, t, primitive)
 
             if table.tree is not None:

@@ -53,13 +53,14 @@ def prepare(o, d):
     return o, d
 
 
-def intersect(leaf, table: Planar, prepared, on_it):
+def intersect(table: Planar, leaf, prepared, on_it):
     """Distances to the W of a leaf: (W,), NaN or inf where missed, possibly negative where behind.
 
     on_it: (W,) bool, the ray starts on this primitive, which is flat and not hit again.
     The border is inclusive by the rounding error of the coordinate, so faces that share an edge leave no gap.
     """
     o, d = prepared
+    leaf = at(table.leaves, leaf)
     c, n, dual_a, dual_b, error = leaf[0:3], leaf[3:6], leaf[6:9], leaf[9:12], leaf[12:14]
     from_c = [o[axis] - c[axis] for axis in range(3)]
     t = -dot(n, from_c) / dot(n, d)

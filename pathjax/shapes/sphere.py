@@ -48,7 +48,7 @@ def prepare(o, d):
     return o, d
 
 
-def intersect(leaf, table: Spheres, prepared, on_it):
+def intersect(table: Spheres, leaf, prepared, on_it):
     """Distances to the W spheres of a leaf: (W,), NaN where missed, negative where behind.
 
     Args:
@@ -58,6 +58,7 @@ def intersect(leaf, table: Spheres, prepared, on_it):
     "Precision improvements for ray/sphere intersection").
     """
     o, d = prepared
+    leaf = at(table.leaves, leaf)
     radius = leaf[3]
     f = [o[axis] - leaf[axis] for axis in range(3)]
     b = -dot(f, d)

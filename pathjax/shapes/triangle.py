@@ -51,7 +51,7 @@ def prepare(o, d):
     return jnp.stack([x, y, z]), jnp.stack([at(o, x), at(o, y), at(o, z), *shear])
 
 
-def intersect(leaf, table: Triangles, prepared, on_it):
+def intersect(table: Triangles, leaf, prepared, on_it):
     """Distances to the W triangles of a leaf: (W,), NaN or inf where missed, possibly negative where behind.
 
     on_it: (W,) bool, the ray starts on this triangle, which is flat and not hit again.
@@ -59,10 +59,11 @@ def intersect(leaf, table: Triangles, prepared, on_it):
     leaves the plain functions of two triangles that share an edge with different signs.)
     """
     axes, ray = prepared
-    by_axis = leaf[:9].reshape(3, 3, -1)
+    _, _, width = table.leaves.shape
 
     def coordinates(axis):
-        return at(by_axis, axis)
+        start = [jnp.asarray(i, jnp.uint32) for i in (leaf, 3 * axis, 0)]
+        return lax.dynamic_slice(table.leaves, start, (1, 3, width), allow_negative_indices=False)[0]
 
     z = coordinates(axes[2]) - ray[2]
     x = coordinates(axes[0]) - ray[0] - ray[3] * z
