@@ -33,12 +33,25 @@ def pack(built, dtype) -> Tree:
     return Tree(jnp.asarray(nodes), built.depth)
 
 
-def traverse(tree: Tree, leaf, o, d, t, primitive):
+def prepare(o, d):
+    """Constants of a ray from o (3,) in the unit direction d (3,): (9,) reciprocal of d and slabs, () int32 octant."""
+    eps = np.finfo(d.dtype).eps
+    # A component of zero becomes one that moves the ray less than rounding does over any distance in range.
+    tiny = np.asarray(1e-18, d.dtype)
+    inv = 1 / jnp.where(jnp.abs(d) < tiny, jnp.copysign(tiny, d), d)
+    negative = (d < 0).astype(jnp.int32)
+    # Slabs are widened by what o, o / d and the product round (Ize 2013): a few ulps of the coordinates.
+    start, slack = o * inv, jnp.abs(o * inv) * (4 * eps)
+    octant = negative[0] + 2 * negative[1] + 4 * negative[2]
+    return jnp.concatenate([inv, start + slack, start - slack]), octant
+
+
+def traverse(tree: Tree, leaf, prepared, t, primitive):
     """Visit the leaves that the ray o + s d, 0 <= s <= t, may hit, near ones first.
 
     Args:
         leaf: (number of the leaf, t, primitive) -> (t, primitive) after testing it; a negative t ends the search.
-        o, d: (3,) origin and unit direction.
+        prepared: of `prepare`.
         t: () the farthest distance of interest; shrinks as hits are found.
         primitive: () int32, carried along.
     Returns:
@@ -50,21 +63,14 @@ def traverse(tree: Tree, leaf, o, d, t, primitive):
     buffer that the loop carries costs instructions in each of its trips; for the same reason the constants of the ray
     travel in one array.
     """
-    eps = np.finfo(d.dtype).eps
+    ray, octant = prepared
+    eps = np.finfo(ray.dtype).eps
     lane = jnp.arange(WIDTH, dtype=jnp.int32)
-    # A component of zero becomes one that moves the ray less than rounding does over any distance in range.
-    tiny = np.asarray(1e-18, d.dtype)
-    inv = 1 / jnp.where(jnp.abs(d) < tiny, jnp.copysign(tiny, d), d)
-    negative = (d < 0).astype(jnp.int32)
-    octant = negative[0] + 2 * negative[1] + 4 * negative[2]
     weights = jnp.left_shift(jnp.int32(1), lane ^ octant)
-    # Slabs are widened by what o, o / d and the product round (Ize 2013): a few ulps of the coordinates.
-    start, slack = o * inv, jnp.abs(o * inv) * (4 * eps)
-    ray = jnp.concatenate([inv, start + slack, start - slack])
     ray, octant, weights = lax.optimization_barrier((ray, octant, weights))
 
     def hit_children(node, t):
-        box = lax.bitcast_convert_type(at(tree.nodes, node), d.dtype)  # the last row is not used
+        box = lax.bitcast_convert_type(at(tree.nodes, node), ray.dtype)  # the last row is not used
         low = [box[axis] * ray[axis] for axis in range(3)]
         high = [box[3 + axis] * ray[axis] for axis in range(3)]
         near = [smaller(low[axis], high[axis]) - ray[3 + axis] for axis in range(3)]

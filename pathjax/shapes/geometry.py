@@ -6,6 +6,7 @@ Hits are found on detached rays; `surface` then computes the point again from th
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -150,23 +151,27 @@ def switch_by_range(number, first: list[int], branches):
 def _visit(geometry: Geometry, ray: Ray, leaf_test, t, primitive):
     """Give every leaf that the ray may meet to `leaf_test(distances (W,), primitives (W,), t, primitive)`."""
     for table, first in zip(geometry.tables, firsts(geometry), strict=True):
+        module = _MODULES[type(table)]
 
-        def search(o, d, exclude, t, primitive, table=table, first=first):
-            module = _MODULES[type(table)]
-            prepared = lax.optimization_barrier(module.prepare(o, d))
+        def leaf(number, t, primitive, prepared, exclude, table=table, first=first, module=module):
+            rows = rows_of(at(table.leaves, number))
+            primitives = rows + first  # of empty lanes: nonsense, but these are never hit
+            distances = module.intersect(table, number, prepared, primitives == exclude)
+            return leaf_test(distances, primitives, t, primitive)
 
-            def leaf(number, t, primitive):
-                rows = rows_of(at(table.leaves, number))
-                primitives = rows + first  # of empty lanes: nonsense, but these are never hit
-                distances = module.intersect(table, number, prepared, primitives == exclude)
-                return leaf_test(distances, primitives, t, primitive)
+        # A search goes its own way for each ray; what it starts from does not.
+        @one_by_one
+        def search(ray, prepared, exclude, t, primitive, table=table, leaf=leaf):
+            of_ray = partial(leaf, prepared=lax.optimization_barrier(prepared), exclude=exclude)
+            return bvh.traverse(table.tree, of_ray, ray, t, primitive)
 
-            if table.tree is not None:
-                return bvh.traverse(table.tree, leaf, o, d, t, primitive)
-            return lax.fori_loop(0, len(table.leaves), lambda number, state: leaf(number, *state), (t, primitive))
-
-        search = search if table.tree is None else one_by_one(search)
-        t, primitive = search(ray.o, ray.d, ray.exclude, t, primitive)
+        prepared = lax.optimization_barrier(module.prepare(ray.o, ray.d))
+        if table.tree is not None:
+            t, primitive = search(bvh.prepare(ray.o, ray.d), prepared, ray.exclude, t, primitive)
+        else:
+            of_ray = partial(leaf, prepared=prepared, exclude=ray.exclude)
+            count = len(table.leaves)
+            t, primitive = lax.fori_loop(0, count, lambda i, state, of_ray=of_ray: of_ray(i, *state), (t, primitive))
     return t, primitive
 
 
