@@ -176,15 +176,11 @@ def _visit(geometry: Geometry, ray: Ray, leaf_test, t, primitive):
 
 
 def _least(x):
-    """Minimum of (W,) integers, W a multiple of 8. (XLA reduces one by one; halves fold into each other.)"""
-    registers = x.reshape(-1, LEAF_WIDTH)
-    least = registers[0]
-    for register in registers[1:]:
-        least = smaller(register, least)
-    while len(least) > 1:
-        half = len(least) // 2
-        least = smaller(least[:half], least[half:])
-    return least[0]
+    """Minimum of (W,) integers, W a power of 2. (XLA reduces one by one; halves fold into each other.)"""
+    while len(x) > 1:
+        half = len(x) // 2
+        x = smaller(x[:half], x[half:])
+    return x[0]
 
 
 def _bits(x):

@@ -1,5 +1,7 @@
 """Frames are orthonormal everywhere; what may divide by zero is finite there, derivatives too."""
 
+from contextlib import nullcontext
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -95,3 +97,20 @@ def test_spawned_ray_excludes_its_primitive_and_has_no_end():
     ray = math.spawn_ray(Surface(n, n, jnp.float32(0.1), n, jnp.zeros(2)), -n, jnp.int32(7))
     assert ray.exclude == 7 and ray.t_max == np.inf
     np.testing.assert_allclose(ray.o, [0, 0, 0.9], rtol=1e-6)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_angles_are_right_to_rounding(dtype, x64):
+    eps = np.finfo(dtype).eps
+    with x64() if dtype == np.float64 else nullcontext():
+        u = np.concatenate([np.linspace(0, 1, 10_001), [0, 1 - 2**-24, 1]]).astype(dtype)
+        cos, sin = math.cos_sin_turns(jnp.asarray(u))
+        # u - k / 4 is exact, and the series ends below rounding.
+        np.testing.assert_allclose(cos, np.cos(2 * np.pi * u.astype(np.longdouble)), atol=2 * eps)
+        np.testing.assert_allclose(sin, np.sin(2 * np.pi * u.astype(np.longdouble)), atol=2 * eps)
+        turns = np.linspace(-np.pi, np.pi, 10_001)[1:-1]
+        for length in (1e-20, 1, 1e20):
+            y, x = (length * np.sin(turns)).astype(dtype), (length * np.cos(turns)).astype(dtype)
+            np.testing.assert_allclose(math.safe_atan2(y, x), np.arctan2(y.astype(float), x), rtol=4 * eps, atol=eps)
+        axes = np.array([[0, 1], [1, 0], [0, -1], [-1, 0]], dtype)
+        np.testing.assert_allclose(math.safe_atan2(*axes.T), [0, np.pi / 2, np.pi, -np.pi / 2], rtol=eps)
