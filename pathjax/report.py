@@ -10,7 +10,7 @@ from pathjax.scene import UNBOUNDED, Scene
 from pathjax.shapes import geometry
 from pathjax.shapes.planar import Planar
 
-_SAMPLER = "Owen-scrambled Sobol' pairs for the first bounces, hashing after"
+_SAMPLER = "Owen-scrambled Sobol' pairs, hashing for roulette"
 
 
 def facts(scene: Scene) -> dict:

@@ -1,8 +1,7 @@
 """Random numbers as a function: (seed, pixel, sample, dimension) -> [0, 1), float32 multiples of 2^-24.
 
-The first dimensions of a path come from a two-dimensional Sobol' sequence, padded: each pair of dimensions has its own
-hashed Owen scramble and its own order of the points (Burley 2020, JCGT 9(4); hash constants by Vegdahl). The lanes of a
-vector register hold the pairs, so that eight pairs cost little more than one. Later dimensions are hashed.
+Directions and points come from a two-dimensional Sobol' sequence, padded: each pair of dimensions has its own hashed
+Owen scramble and its own order of the points (Burley 2020, JCGT 9(4); hash constants by Vegdahl). Choices are hashed.
 Every pixel and every seed is an independent randomisation; within one, the numbers are a (0, 2)-net in every pair.
 """
 
@@ -10,8 +9,6 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 from jax import lax
-
-_LANES = 8
 
 
 def _u32(x):
@@ -80,7 +77,7 @@ def pixel_stream(seed, pixel):
 
 
 def path_key(stream, sample):
-    """() uint32: what `hashed` hashes for one sample. Apart from `sobol_pairs`, which hashes otherwise."""
+    """() uint32: what `hashed` hashes for one sample. Apart from `sobol_pair`, which hashes otherwise."""
     return combine(stream ^ jnp.uint32(0x5BF03635), _u32(sample))
 
 

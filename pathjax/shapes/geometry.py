@@ -151,28 +151,30 @@ def switch_by_range(number, first: list[int], branches):
 def _visit(geometry: Geometry, ray: Ray, leaf_test, t, primitive):
     """Give every leaf that the ray may meet to `leaf_test(distances (W,), primitives (W,), t, primitive)`."""
     for table, first in zip(geometry.tables, firsts(geometry), strict=True):
-        module = _MODULES[type(table)]
-
-        def leaf(number, t, primitive, prepared, exclude, table=table, first=first, module=module):
-            rows = rows_of(at(table.leaves, number))
-            primitives = rows + first  # of empty lanes: nonsense, but these are never hit
-            distances = module.intersect(table, number, prepared, primitives == exclude)
-            return leaf_test(distances, primitives, t, primitive)
-
-        # A search goes its own way for each ray; what it starts from does not.
-        @one_by_one
-        def search(ray, prepared, exclude, t, primitive, table=table, leaf=leaf):
-            of_ray = partial(leaf, prepared=lax.optimization_barrier(prepared), exclude=exclude)
-            return bvh.traverse(table.tree, of_ray, ray, t, primitive)
-
-        prepared = lax.optimization_barrier(module.prepare(ray.o, ray.d))
-        if table.tree is not None:
-            t, primitive = search(bvh.prepare(ray.o, ray.d), prepared, ray.exclude, t, primitive)
-        else:
-            of_ray = partial(leaf, prepared=prepared, exclude=ray.exclude)
-            count = len(table.leaves)
-            t, primitive = lax.fori_loop(0, count, lambda i, state, of_ray=of_ray: of_ray(i, *state), (t, primitive))
+        t, primitive = _visit_table(table, first, ray, leaf_test, t, primitive)
     return t, primitive
+
+
+def _visit_table(table, first, ray, leaf_test, t, primitive):
+    module = _MODULES[type(table)]
+
+    def leaf(prepared, exclude, number, t, primitive):
+        rows = rows_of(at(table.leaves, number))
+        primitives = rows + first  # of empty lanes: nonsense, but these are never hit
+        distances = module.intersect(table, number, prepared, primitives == exclude)
+        return leaf_test(distances, primitives, t, primitive)
+
+    # A search goes its own way for each ray; what it starts from is made for all of them.
+    @one_by_one
+    def search(slabs, prepared, exclude, t, primitive):
+        of_ray = partial(leaf, lax.optimization_barrier(prepared), exclude)
+        return bvh.traverse(table.tree, of_ray, slabs, t, primitive)
+
+    prepared = lax.optimization_barrier(module.prepare(ray.o, ray.d))
+    if table.tree is not None:
+        return search(bvh.prepare(ray.o, ray.d), prepared, ray.exclude, t, primitive)
+    of_ray = partial(leaf, prepared, ray.exclude)
+    return lax.fori_loop(0, len(table.leaves), lambda number, state: of_ray(number, *state), (t, primitive))
 
 
 def _least(x):
