@@ -41,6 +41,8 @@ RICHARDSON_EVERY = 16
 STEP_PIXELS = 0.35
 # Bounds of the step, relative to the IOR: float32 resolves the lower; beyond the upper a difference is no derivative.
 MIN_STEP, MAX_STEP = 2e-4, 0.03
+# Dielectrics of one kernel: the four shifts of each are bits of an int32.
+MOST_GLASS = 7
 
 
 @jax.tree_util.register_dataclass
@@ -124,7 +126,6 @@ def pixel_jacobians(
     colors = [name for name, p in wanted.items() if attached or not is_glass(p)]
     rows = sorted({p.index[0] for p in wanted.values() if is_glass(p)})
     glass = () if attached else tuple(rows)
-    static = Wanted(tuple((wanted[name].path, wanted[name].index) for name in colors), glass)
     scene = replace(scene, about=None)
     if rows:
         scene = _differentiated_once(scene)
@@ -132,7 +133,16 @@ def pixel_jacobians(
         scene = _choosing_by(scene, rows)
     steps = _steps(scene, glass, step)
     numbers = pixel.numbers(pixels, first_sample, spp, seed)
-    image, by_color, by_ior, bias = _jacobians(scene, pixels, *numbers, steps, wanted=static, strategy=strategy, **how)
+    places = tuple((wanted[name].path, wanted[name].index) for name in colors)
+
+    def of(places, first):
+        static = Wanted(places, glass[first : first + MOST_GLASS])
+        some = steps[first : first + MOST_GLASS]
+        return _jacobians(scene, pixels, *numbers, some, wanted=static, strategy=strategy, **how)
+
+    image, by_color, *by_glass = of(places, 0)
+    more = [of((), first)[2:] for first in range(MOST_GLASS, len(glass), MOST_GLASS)]
+    by_ior, bias = (jnp.concatenate(parts, axis=1) for parts in zip(by_glass, *more, strict=True))
 
     derivatives, biases, used = {}, {}, {}
     for name, parameter in wanted.items():

@@ -886,3 +886,13 @@ def test_colours_of_every_scene_against_differences(shipped, derivatives, agree,
         other = slope._replace(mean=difference.mean(0), variance=difference.var(0, ddof=1) / count)
         # Rounding of images over twice the step, and the third order.
         agree(slope, other, rounding=2e-3)
+
+
+def test_more_dielectrics_than_one_kernel_takes(shipped, monkeypatch):
+    scene, names = shipped("glass_and_mirror", res=8), ["glass.int_ior", "block-glass.int_ior"]
+    _, together = pj.jacobian(scene, names, spp=2)
+    monkeypatch.setattr(gradient, "MOST_GLASS", 1)
+    _, apart = pj.jacobian(scene, names, spp=2)
+    for name in names:
+        np.testing.assert_allclose(apart[name], together[name], atol=1e-5)
+        np.testing.assert_allclose(apart.bias[name], together.bias[name], atol=1e-5)

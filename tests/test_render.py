@@ -1,5 +1,6 @@
 """Images of whole scenes against closed forms, and against each other where only the way to them differs."""
 
+from dataclasses import replace
 from functools import partial
 
 import jax
@@ -315,3 +316,7 @@ def test_arguments_out_of_range_are_refused(root, wrong):
     scene = pj.load_scene(root / "scenes" / "cornell_box.xml", res=4)
     with pytest.raises(pj.InputError, match=next(iter(wrong))):
         pj.render(scene, **wrong)
+
+
+def test_depth_0_is_black(cornell):
+    assert not np.any(pj.render(replace(cornell, max_depth=jnp.int32(0)), spp=1))

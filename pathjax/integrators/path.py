@@ -69,7 +69,8 @@ def start(scene, ray: Ray, watch_glass: bool = False) -> Path:
     one, zero3 = jnp.ones_like(ray.t_max), jnp.zeros_like(ray.o)
     passive = one if bsdfs.any_glass(scene.materials) else None
     glass = jnp.int32(0) if watch_glass else None
-    return Path(ray, zero3, zero3 + 1, one * jnp.inf, passive, jnp.int32(0), scene.max_depth > 0, glass)
+    throughput = zero3 + (scene.max_depth > 0)
+    return Path(ray, zero3, throughput, one * jnp.inf, passive, jnp.int32(0), scene.max_depth > 0, glass)
 
 
 def extend(scene, choice: Choice | None, path: Path, u: Bounce, strategy: str, derivative: bool = False) -> Path:
