@@ -273,8 +273,7 @@ def _mean_and_differences(work, scene, choice, steps, rows, strategy, derivative
     rows = jnp.asarray(rows, jnp.int32)
     shifts = jnp.arange(4 * len(rows), dtype=jnp.int32)  # dielectric 4 k, 4 k + 1, ...
 
-    def begin(number):
-        return pixel.camera_path(scene, pixel_number, stream, number, watch_glass=True)
+    begin = partial(pixel.camera_path, scene, pixel_number, stream, watch_glass=True)
 
     def shifted(shift):
         """The scene at a shift, choosing its branches by the IORs that it has; as it is where shift < 0."""
@@ -290,10 +289,12 @@ def _mean_and_differences(work, scene, choice, steps, rows, strategy, derivative
 
     def step(state):
         number, shift, todo, now, weight, plus, sums = state
+        now, weight = lax.cond(now.alive, lambda: (now, weight), lambda: begin(number))
+        now, weight = lax.optimization_barrier((now, weight))
         u = path.bounce_numbers(scene, stream, number, now.depth)
         now = path.extend(shifted(shift), choice, now, u, strategy, derivative)
 
-        def renew():
+        def end():
             place, k = jnp.maximum(shift, 0) // 4, shift % 4
             value, place, k, again = lax.optimization_barrier((weight * now.L, place, k, twice(number)))
             # The sample itself, or the second of a pair, whose first was kept.
@@ -312,16 +313,15 @@ def _mean_and_differences(work, scene, choice, steps, rows, strategy, derivative
             left = jnp.where(shift < 0, bits, todo)
             next_shift = jnp.where(left == 0, -1, lax.population_count(~left & (left - 1)))
             next_number = number + (left == 0).astype(number.dtype)
-            # What many results share is computed once.
-            todo_next = lax.optimization_barrier((next_number, next_shift, left & (left - 1)))
-            return *todo_next, *begin(todo_next[0]), value, (mean, by_ior, bias)
+            return next_number, next_shift, left & (left - 1), now, weight, value, (mean, by_ior, bias)
 
-        return lax.cond(now.alive, lambda: (number, shift, todo, now, weight, plus, sums), renew)
+        return lax.cond(now.alive, lambda: (number, shift, todo, now, weight, plus, sums), end)
 
     zero = jnp.zeros((3,), scene.camera.origin.dtype)
     zeros = jnp.zeros((len(rows), 3), zero.dtype)
     base = jnp.int32(-1)
-    start = first_sample, base, jnp.int32(0), *begin(first_sample), zero, tuple((z, z) for z in (zero, zeros, zeros))
+    nothing = pixel.no_path(scene, watch_glass=True)
+    start = first_sample, base, jnp.int32(0), *nothing, zero, tuple((z, z) for z in (zero, zeros, zeros))
     *_, sums = lax.while_loop(lambda state: state[0] != first_sample + spp, step, start)
     mean, by_ior, bias = (total / spp.astype(zero.dtype) for total, _ in sums)
     return mean, (by_ior, bias)

@@ -206,16 +206,7 @@ def _loop(f, xs, shared):
 
 
 def _lanes(f, xs, shared, width):
-    count = jax.tree.leaves(xs)[0].shape[0]
-    groups = -(-count // width)
-
-    def grouped(x):
-        x = jnp.concatenate([x, jnp.broadcast_to(x[:1], (groups * width - count, *x.shape[1:]))])
-        return x.reshape(groups, width, *x.shape[1:])
-
-    one_group = lanes(f, width)
-    ys = lax.map(lambda x: one_group(x, *shared), jax.tree.map(grouped, xs))
-    return jax.tree.map(lambda y: y.reshape(groups * width, *y.shape[2:])[:count], ys)
+    return lanes(f, width)(xs, *shared)
 
 
 def _vmap_chunks(f, xs, shared, chunk):

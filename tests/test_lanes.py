@@ -183,3 +183,54 @@ def test_numbers_of_lanes_that_are_done_do_no_harm():
         return k
 
     agrees(f, np.array([0, 1, 2, 3, 50], np.int32))
+
+
+# ---- more items than lanes -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("count", [1, WIDTH - 1, WIDTH, 4 * WIDTH + 3])
+def test_a_lane_that_leaves_the_own_loop_of_an_item_takes_the_next(count):
+    """Items of 0 to 40 trips, with work before and after the loop, and results that all share or that are empty."""
+
+    def f(n, start, table):
+        row = lax.dynamic_index_in_dim(table, n % 4, keepdims=False)[0] + start
+
+        def step(state):
+            k, x, path = state
+            return k + 1, x * 0.9 + row, path.at[k % 3].add(x[0])
+
+        k, x, path = lax.while_loop(lambda s: s[0] < n, step, (jnp.int32(0), row, jnp.zeros(3)))
+        return k, {"x": x - start, "path": path, "table": table[0], "none": jnp.zeros((0, 3))}
+
+    rng = np.random.default_rng(count)
+    trips = rng.integers(0, 40, count).astype(np.int32) * rng.integers(0, 2, count).astype(np.int32)
+    agrees(f, trips, rng.normal(size=(count, 3)).astype(np.float32))
+
+
+def test_the_last_of_two_loops_is_the_own_one():
+    def f(n, table):
+        first = lax.while_loop(lambda s: s[0] < n, lambda s: (s[0] + 1, s[1] + s[0]), (jnp.int32(0), jnp.int32(0)))
+        return lax.while_loop(lambda s: s[0] < first[1], lambda s: (s[0] + 2, s[1] + n), (jnp.int32(0), jnp.int32(1)))
+
+    agrees(f, np.random.default_rng(1).integers(0, 9, 23).astype(np.int32))
+
+
+def test_items_are_worked_on_without_waiting_for_the_slowest():
+    """Trips of the loop over all items: as many as the longest item takes, not the longest of each group."""
+    trips = np.ones(64 * WIDTH, np.int32)
+    trips[::WIDTH] = 100  # one in every group
+    seen = []
+
+    def count(_):
+        seen.append(1)
+        return np.int32(0)
+
+    def f(n, table):
+        def step(k):
+            return k + 1 + one_by_one(lambda: jax.pure_callback(count, jax.ShapeDtypeStruct((), jnp.int32), k))()
+
+        return lax.while_loop(lambda k: k < n, step, jnp.int32(0))
+
+    np.testing.assert_array_equal(lanes(f, WIDTH)(jnp.asarray(trips), jnp.asarray(TABLE)), trips)
+    ideal = trips.sum()  # the calls, one for each lane and trip, of lanes that never wait
+    assert ideal <= len(seen) < 1.2 * ideal + 100 * WIDTH

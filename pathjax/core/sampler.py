@@ -1,14 +1,34 @@
 """Random numbers as a function: (seed, pixel, sample, dimension) -> [0, 1), float32 multiples of 2^-24.
 
-Directions and points come from a two-dimensional Sobol' sequence, padded: each pair of dimensions has its own hashed
-Owen scramble and its own order of the points (Burley 2020, JCGT 9(4); hash constants by Vegdahl). Choices are hashed.
-Every pixel and every seed is an independent randomisation; within one, the numbers are a (0, 2)-net in every pair.
+The points of a pixel's paths are a rank-1 lattice in many dimensions at once, ordered by the radical inverse so that any
+first 2^m of them are a lattice too, and moved as a whole by a random shift (Dick, Kuo and Sloan 2013, Acta Numerica 22).
+Every number is then uniform and the estimate unbiased; what a path decides at several vertices is stratified jointly,
+which padded pairs of a Sobol' sequence are not, for two multiplications. Roulette is hashed. Every pixel and every seed
+is an independent randomisation.
 """
 
 from __future__ import annotations
 
 import jax.numpy as jnp
-from jax import lax
+import numpy as np
+
+from pathjax.core.math import at
+
+# Generating vector of an extensible lattice sequence that is good in all two-dimensional projections up to 2^20 points,
+# "order 2" (Cools, Kuo and Nuyens 2006, SIAM J. Sci. Comput. 28(6); in Nuyens' Magic Point Shop exod2_base2_m20_CKN).
+# Rows are the four dimensions of a vertex. Deeper vertices use the rows again, under other shifts: still unbiased.
+_GENERATORS = np.array(
+    [
+        [1, 182667, 469891, 498753], [110745, 446247, 250185, 118627], [245333, 283199, 408519, 391023],
+        [246327, 126539, 399185, 461527], [300343, 69681, 516695, 436179], [106383, 238523, 413283, 70841],
+        [47719, 300129, 113029, 123925], [410745, 211325, 17489, 511893], [40767, 186077, 519471, 255369],
+        [101819, 243573, 66189, 152143], [503455, 113217, 132603, 463967], [297717, 157383, 224015, 502917],
+        [36237, 94049, 170665, 79397], [123963, 223451, 323871, 303633], [98567, 318855, 494245, 477137],
+        [177975, 64483, 26695, 88779],
+    ],
+    np.uint32,
+)  # fmt: skip
+DIMENSIONS = 4
 
 
 def _u32(x):
@@ -39,36 +59,17 @@ def reverse_bits(x):
     return (x >> 16) | (x << 16)
 
 
-def _owen_reversed(x, seed):
-    """Owen scramble of numbers whose bits are stored lowest first (Laine and Karras 2011, Vegdahl's constants)."""
-    x = x ^ (x * jnp.uint32(0x3D20ADEA))
-    x = x + seed
-    x = x * ((seed >> 16) | jnp.uint32(1))
-    x = x ^ (x * jnp.uint32(0x05526C56))
-    return x ^ (x * jnp.uint32(0x53A22864))
-
-
-def _pascal(x):
-    """Generator matrix of the second Sobol' dimension, binomials mod 2, bits lowest first on both sides."""
-    for shift, mask in ((1, 0x55555555), (2, 0x33333333), (4, 0x0F0F0F0F), (8, 0x00FF00FF), (16, 0x0000FFFF)):
-        x = x ^ ((x >> shift) & jnp.uint32(mask))
-    return x
-
-
-def sobol_pair(stream, sample, pair):
-    """Two dimensions of one sample: (2,) float32.
+def lattice_point(stream, sample, vertex):
+    """(4,) float32, dimensions of one vertex of one path.
 
     Args:
         stream: () uint32, of `pixel_stream`.
         sample: () uint32 number of the sample.
-        pair: () int32 which two.
+        vertex: () integer; which four dimensions.
     """
-    seed = combine(pair, stream)
-    index = reverse_bits(_owen_reversed(reverse_bits(_u32(sample)), seed))
-    seed, index = lax.optimization_barrier((seed, index))
-    x = reverse_bits(_owen_reversed(index, hash_u32(seed + jnp.uint32(1))))
-    y = reverse_bits(_owen_reversed(_pascal(index), hash_u32(seed + jnp.uint32(2))))
-    return jnp.stack([to_unit(x), to_unit(y)])
+    vertex = _u32(vertex)
+    generators = at(jnp.asarray(_GENERATORS), vertex % len(_GENERATORS))
+    return to_unit(reverse_bits(_u32(sample)) * generators + _hashes(stream, vertex * DIMENSIONS, DIMENSIONS))
 
 
 def pixel_stream(seed, pixel):
@@ -77,10 +78,14 @@ def pixel_stream(seed, pixel):
 
 
 def path_key(stream, sample):
-    """() uint32: what `hashed` hashes for one sample. Apart from `sobol_pair`, which hashes otherwise."""
+    """() uint32: what `hashed` hashes for one sample."""
     return combine(stream ^ jnp.uint32(0x5BF03635), _u32(sample))
 
 
 def hashed(key, dimension, count: int):
     """(count,) float32 independent numbers for dimensions dimension, ..., dimension + count - 1 of a path."""
-    return to_unit(hash_u32(key + (_u32(dimension) + jnp.arange(count, dtype=jnp.uint32)) * jnp.uint32(0x9E3779B9)))
+    return to_unit(_hashes(key, dimension, count))
+
+
+def _hashes(key, dimension, count):
+    return hash_u32(key + (_u32(dimension) + jnp.arange(count, dtype=jnp.uint32)) * jnp.uint32(0x9E3779B9))

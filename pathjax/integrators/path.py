@@ -17,8 +17,6 @@ from pathjax.errors import InputError
 from pathjax.shapes import geometry
 
 STRATEGIES = ("mis", "light", "bsdf")
-# Bounces whose numbers come from Sobol' pairs; a path's first decisions carry most of its variance.
-SOBOL_BOUNCES = 3
 # Roulette never spares a path for certain, so that every path ends even between perfect mirrors; and never ends one for
 # certain, so that what is black keeps its derivative.
 MIN_SURVIVAL, MAX_SURVIVAL = 0.05, 0.95
@@ -216,7 +214,7 @@ def mis_weight(pdf, other_pdf):
     return jnp.where(jnp.isinf(pdf), 1, 1 / (1 + ratio * ratio))
 
 
-# Dimensions of the sampler: pairs 0 and 1 for film and lens, then two of each vertex.
+# The camera is vertex 0 of the sampler, so what a path meets at depth d is vertex d + 1.
 
 
 def camera_numbers(scene, stream, sample):
@@ -225,13 +223,13 @@ def camera_numbers(scene, stream, sample):
     Args:
         stream: () uint32 of `sampler.pixel_stream`; sample: () uint32 number of the sample.
     """
-    dtype = scene.camera.origin.dtype
-    return tuple(sampler.sobol_pair(stream, sample, pair).astype(dtype) for pair in (0, 1))
+    u = sampler.lattice_point(stream, sample, 0).astype(scene.camera.origin.dtype)
+    return u[:2], u[2:]
 
 
 def bounce_numbers(scene, stream, sample, depth) -> Bounce:
     """Random numbers of the vertex number depth."""
     dtype = scene.camera.origin.dtype
-    light, bsdf = (sampler.sobol_pair(stream, sample, 2 + 2 * depth + k).astype(dtype) for k in (0, 1))
+    u = sampler.lattice_point(stream, sample, depth + 1).astype(dtype)
     rest = sampler.hashed(sampler.path_key(stream, sample), 2 * depth, 2).astype(dtype)
-    return Bounce(light, bsdf, rest[0], rest[1])
+    return Bounce(u[:2], u[2:], rest[0], rest[1])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
 from jax import lax
 
@@ -29,6 +30,12 @@ def camera_path(scene, pixel, stream, number, **how):
     return lax.optimization_barrier((path.start(scene, ray, **how), weight))
 
 
+def no_path(scene, **how):
+    """What stands where a `camera_path` is to be put."""
+    nothing = jax.eval_shape(lambda x: camera_path(scene, jnp.int32(0), x, x, **how), jnp.uint32(0))
+    return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), nothing)
+
+
 def mean(work, scene, choice, strategy, derivative=False):
     """(3,) mean of a pixel's samples. work: the pixel () int32, and its `numbers`; derivative: of `path.extend`."""
     pixel, first_sample, spp, seed = work
@@ -37,17 +44,17 @@ def mean(work, scene, choice, strategy, derivative=False):
     # One loop over the vertices of all samples, so that no lane waits for the longest path of another.
     def step(state):
         number, now, weight, sums = state
+        now, weight = lax.cond(
+            now.alive, lambda: (now, weight), lambda: camera_path(scene, pixel, stream, number)
+        )
+        now, weight = lax.optimization_barrier((now, weight))
         u = path.bounce_numbers(scene, stream, number, now.depth)
         now = path.extend(scene, choice, now, u, strategy, derivative)
-
-        def renew():
-            value = lax.optimization_barrier(weight * now.L)
-            return number + 1, *camera_path(scene, pixel, stream, number + 1), add_compensated(sums, value)
-
-        return lax.cond(now.alive, lambda: (number, now, weight, sums), renew)
+        sums = lax.cond(now.alive, lambda: sums, lambda: add_compensated(sums, weight * now.L))
+        return number + jnp.where(now.alive, 0, 1).astype(number.dtype), now, weight, sums
 
     zero = jnp.zeros((3,), scene.camera.origin.dtype)
-    start = first_sample, *camera_path(scene, pixel, stream, first_sample), (zero, zero)
+    start = first_sample, *no_path(scene), (zero, zero)
     *_, (total, _) = lax.while_loop(lambda state: state[0] != first_sample + spp, step, start)
     return total / spp.astype(total.dtype)
 

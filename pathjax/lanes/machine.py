@@ -1,0 +1,210 @@
+"""Runs a program of one item on the values of many lanes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.extend import core
+
+from pathjax.lanes.flow import callee, eqn_flow, read_by, scan_parts, variables, while_parts
+from pathjax.lanes.rules import RULES
+from pathjax.lanes.values import components, differs, fits, join, objects, split
+
+
+def one_by_one(f: Callable) -> Callable:
+    """f, which `lanes` runs for one lane after another."""
+
+    def one_by_one(*args):
+        return f(*args)
+
+    return jax.jit(one_by_one)
+
+
+class Lanes:
+    """Runs programs on values of `width` lanes."""
+
+    def __init__(self, width: int, always):
+        self.width, self.always = width, always
+
+    def run(self, program: core.ClosedJaxpr, inputs) -> list:
+        jaxpr = program.jaxpr
+        values = self.environment(program, inputs)
+        self.run_equations(jaxpr.eqns, values, read_by(jaxpr.eqns) | variables(jaxpr.outvars))
+        return [self.read(values, v) for v in jaxpr.outvars]
+
+    @staticmethod
+    def environment(program: core.ClosedJaxpr, inputs) -> dict:
+        """Values by variable, before a program's first equation."""
+        jaxpr = program.jaxpr
+        return dict(zip([*jaxpr.constvars, *jaxpr.invars], [*program.consts, *inputs], strict=True))
+
+    @staticmethod
+    def read(values: dict, atom):
+        return atom.val if isinstance(atom, core.Literal) else values[atom]
+
+    def run_equations(self, eqns, values: dict, used: set | None = None) -> None:
+        """Add the results of equations to the values. used: results that are read; None: all."""
+        for eqn in eqns:
+            wanted = [used is None or v in used for v in eqn.outvars]
+            outputs = self.apply(eqn, [self.read(values, v) for v in eqn.invars], wanted)
+            values |= zip(eqn.outvars, outputs, strict=True)
+
+    def apply(self, eqn, inputs, used) -> list:
+        name = eqn.primitive.name
+        match name:
+            case "while":
+                return self.while_loop(eqn, inputs, used)
+            case "scan":
+                return self.scan(eqn, inputs)
+            case "cond":
+                return self.cond(eqn, inputs)
+            case "optimization_barrier":
+                return self.once(inputs)
+        called = callee(eqn)
+        if called is not None:
+            if eqn.params.get("name") == one_by_one.__name__:
+                return self.one_by_one(called, inputs)
+            return self.run(called, inputs)
+        if not any(map(differs, inputs)):
+            outputs = eqn.primitive.bind(*inputs, **eqn.params)
+            return list(outputs) if eqn.primitive.multiple_results else [outputs]
+        shape = eqn.outvars[0].aval.shape
+        if name in RULES:
+            result = RULES[name](self, inputs, eqn.params, shape)
+            if result is not None:
+                return [result]
+        elif len(eqn.outvars) == 1 and all(fits(v.aval.shape, shape) for v in eqn.invars):
+            return [self.each(partial(eqn.primitive.bind, **eqn.params), inputs, shape)]
+        return self.by_vmap(eqn, inputs)
+
+    # ---- arithmetic -------------------------------------------------------------------------------------------------
+
+    def number(self, op, *operands):
+        """op of numbers, each (W,) or () where shared."""
+        if any(map(jnp.ndim, operands)):
+            operands = [x if jnp.ndim(x) else jnp.broadcast_to(x, (self.width,)) for x in operands]
+        return op(*operands)
+
+    def each(self, op, inputs, shape):
+        """op of each component; inputs have the shape or are single numbers."""
+        columns = [np.broadcast_to(components(x), shape).flat for x in inputs]
+        return objects(shape, [self.number(op, *operands) for operands in zip(*columns, strict=True)])
+
+    def select(self, which, *cases):
+        """By the number `which`, components of one of the cases; what is the same in all stays as it is."""
+        columns = zip(*(components(case).flat for case in cases), strict=True)
+        items = [
+            x[0] if all(other is x[0] for other in x) else self.number(lax.select_n, which, *x) for x in columns
+        ]
+        return objects(np.shape(cases[0]), items)
+
+    def once(self, values):
+        """The values, of which every consumer reads one result: outcomes of a branch that is always taken."""
+        items = [item for value in values for item in (value.flat if differs(value) else [value])]
+        results = iter(lax.cond(self.always, lambda *x: x, lambda *x: tuple(map(jnp.zeros_like, x)), *items))
+        return [
+            objects(value.shape, [next(results) for _ in value.flat]) if differs(value) else next(results)
+            for value in values
+        ]
+
+    def by_vmap(self, eqn, inputs):
+        """Any primitive: right, and slow."""
+        joined = [join(x, self.width) if differs(x) else x for x in inputs]
+        axes = [0 if differs(x) else None for x in inputs]
+        outputs = jax.vmap(partial(eqn.primitive.bind, **eqn.params), in_axes=axes)(*joined)
+        return [split(y) for y in (outputs if eqn.primitive.multiple_results else [outputs])]
+
+    def one_by_one(self, program, inputs):
+        def of_lane(mine):
+            mine = iter(mine)
+            return core.jaxpr_as_fun(program)(*[next(mine) if differs(x) else x for x in inputs])
+
+        return [split(y) for y in lax.map(of_lane, [join(x, self.width) for x in inputs if differs(x)])]
+
+    # ---- control flow -----------------------------------------------------------------------------------------------
+
+    def pack(self, values, differing):
+        """Values as pytrees of arrays, for a loop of XLA's to carry."""
+        return [
+            [jnp.broadcast_to(item, (self.width,)) for item in components(value).flat] if differs else value
+            for value, differs in zip(values, differing, strict=True)
+        ]
+
+    @staticmethod
+    def unpack(packed, differing, shapes):
+        return [
+            objects(shape, items) if differs else items
+            for items, differs, shape in zip(packed, differing, shapes, strict=True)
+        ]
+
+    def while_loop(self, eqn, inputs, used):
+        test_consts, body_consts, init = while_parts(eqn, inputs)
+        test, body = eqn.params["cond_jaxpr"], eqn.params["body_jaxpr"]
+        differing = eqn_flow(eqn, list(map(differs, inputs)))
+        shapes = [v.aval.shape for v in eqn.outvars]
+        # A lane that is done stays as it is in what is read later; the rest of it may go on.
+        tested = read_by(test.jaxpr.eqns)
+        kept = [u or v in tested for u, v in zip(used, test.jaxpr.invars[len(test_consts) :], strict=True)]
+
+        def goes_on(packed):
+            (result,) = self.run(test, [*test_consts, *self.unpack(packed, differing, shapes)])
+            return result.item() if differs(result) else result
+
+        def advance(packed):
+            carry = self.unpack(packed, differing, shapes)
+            new = self.run(body, [*body_consts, *carry])
+            on = goes_on(packed)
+            if jnp.ndim(on):
+                on = self.once([objects((), [on])])[0].item()
+                pairs = zip(carry, new, kept, strict=True)
+                new = [self.select(on, old, value) if keep else value for old, value, keep in pairs]
+            return self.pack(new, differing)
+
+        packed = lax.while_loop(lambda packed: jnp.any(goes_on(packed)), advance, self.pack(init, differing))
+        return self.unpack(packed, differing, shapes)
+
+    def scan(self, eqn, inputs):
+        consts, init, xs = scan_parts(eqn, inputs)
+        n = len(init)
+        differing = eqn_flow(eqn, list(map(differs, inputs)))
+        carried, rows = differing[:n], differing[n:]
+        shapes = [v.aval.shape for v in eqn.outvars]
+        row_shapes = [shape[1:] for shape in shapes[n:]]
+        x_differs = list(map(differs, xs))
+        x_shapes = [np.shape(x)[1:] for x in xs]
+
+        def step(packed, packed_x):
+            carry = self.unpack(packed, carried, shapes[:n])
+            x = self.unpack(packed_x, x_differs, x_shapes)
+            results = self.run(eqn.params["jaxpr"], [*consts, *carry, *x])
+            return self.pack(results[:n], carried), self.pack(results[n:], rows)
+
+        def by_row(x):
+            """Components (rows, ...) -> arrays (rows, W), one for each component of a row."""
+            columns = x.reshape(len(x), -1).T
+            return [jnp.stack([jnp.broadcast_to(item, (self.width,)) for item in column]) for column in columns]
+
+        packed_xs = [by_row(x) if d else x for x, d in zip(xs, x_differs, strict=True)]
+        last, ys = lax.scan(step, self.pack(init, carried), packed_xs, eqn.params["length"], eqn.params["reverse"])
+        ys = [
+            np.stack([objects(shape, [item[k] for item in y]) for k in range(eqn.params["length"])]) if d else y
+            for y, d, shape in zip(ys, rows, row_shapes, strict=True)
+        ]
+        return self.unpack(last, carried, shapes[:n]) + ys
+
+    def cond(self, eqn, inputs):
+        which, *operands = inputs
+        branches = eqn.params["branches"]
+        if differs(which):
+            which = self.once([which])[0].item()
+            which = which != 0 if len(branches) == 2 else jnp.clip(which, 0, len(branches) - 1)
+            results = [self.run(branch, operands) for branch in branches]
+            return [self.select(which, *cases) for cases in zip(*results, strict=True)]
+        differing = eqn_flow(eqn, list(map(differs, inputs)))
+        calls = [lambda branch=branch: self.pack(self.run(branch, operands), differing) for branch in branches]
+        return self.unpack(lax.switch(which, calls), differing, [v.aval.shape for v in eqn.outvars])
