@@ -26,7 +26,8 @@ SCENES = Path(__file__).resolve().parents[1] / "scenes"
 GAMMA = 2.2
 ZOOM, SMOOTH = 2, 2  # of the panels; and how much larger lines are drawn, so that they come out smooth
 COLORS = "#ffffff", "#ff5a4d", "#ffc400", "#39d353", "#2fb8ff", "#c77dff"  # of the levels, the root's first
-# The mesh stands on a floor, its bounds scaled to a sphere of radius 1.
+# The mesh stands on a floor, its bounds scaled to a sphere of radius 1. Flat: smooth normals of coarse meshes turn away
+# from the camera at their outlines, which are then black.
 SCENE = """<scene version="3.0.0">
   <integrator type="path"><integer name="max_depth" value="8"/></integrator>
   <sensor type="thinlens"><float name="fov" value="30"/>
@@ -37,7 +38,7 @@ SCENE = """<scene version="3.0.0">
   <bsdf type="diffuse" id="paint"><rgb name="reflectance" value="0.7, 0.18, 0.12"/></bsdf>
   <bsdf type="twosided" id="body"><ref id="paint"/></bsdf>
   <bsdf type="diffuse" id="ground"><rgb name="reflectance" value="0.6, 0.6, 0.58"/></bsdf>
-  <shape type="$kind"><string name="filename" value="$mesh"/>
+  <shape type="$kind"><string name="filename" value="$mesh"/><boolean name="face_normals" value="true"/>
     <transform name="to_world"><translate value="$shift"/><scale value="$scale"/></transform><ref id="body"/></shape>
   <shape type="rectangle"><transform name="to_world"><scale value="40"/><rotate x="1" angle="-90"/></transform>
     <ref id="ground"/></shape>
@@ -70,8 +71,8 @@ def camera_rays(scene, res):
 
 def figures_of(scene, rule, rays):
     """A line of the table."""
-    tree, (triangles,) = scene.about.trees["triangle"], scene.geometry.tables[-1:]
-    found = walk(tree, triangles.vertices, *rays)
+    tree = scene.about.trees["triangle"]
+    found = walk(tree, scene.geometry.tables[-1].vertices, *rays)
     counts = (np.mean(count) for count in (found.nodes, found.boxes, found.leaves, found.triangles))
     cells = " ".join(f"{count:9.2f}" for count in counts)
     return f"{rule:8}{len(tree.child):7}{len(tree.leaf_first):8}{tree.depth:7}{tree.sah_cost:10.2f} {cells}"
@@ -141,11 +142,11 @@ def main():
     dimmed = Image.blend(picture, Image.new("RGB", picture.size), 0.5)
     panels = [labelled(box, "box of triangles"), labelled(picture.copy(), options.mesh.stem)]
     panels.append(labelled(draw_boxes(dimmed, scene.camera, levels), "all levels"))
-    for level, boxes in enumerate(levels):
-        drawn = draw_boxes(dimmed, scene.camera, [boxes], level)
-        panels.append(labelled(drawn, f"level {level}: {len(boxes)} box{'es' if len(boxes) > 1 else ''}"))
+    for level, boxes in enumerate(levels[1:], 1):
+        panels.append(labelled(draw_boxes(dimmed, scene.camera, [boxes], level), f"level {level}: {len(boxes)} boxes"))
     columns = 3
-    whole = Image.new("RGB", (columns * picture.width, -(-len(panels) // columns) * picture.height))
+    size = columns * picture.width, -(-len(panels) // columns) * picture.height
+    whole = Image.new("RGB", size, "white")
     for k, panel in enumerate(panels):
         whole.paste(panel, (k % columns * picture.width, k // columns * picture.height))
     whole.save(options.output)

@@ -16,6 +16,7 @@ SMALL = {
     "three_views": ["--res", "24", "--target-spp", "128", "--spp", "16"],
     "identifiability": ["--res", "16", "--target-spp", "256", "--spp", "32"],
     "own_loss": ["--res", "16", "--spp", "8", "--steps", "5"],
+    "original_results": ["--res", "32", "--spp", "8"],
 }
 QUICK = ("cornell_albedos", "own_loss")
 
