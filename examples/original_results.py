@@ -71,7 +71,7 @@ def camera_rays(scene, res):
 
 def figures_of(scene, rule, rays):
     """A line of the table."""
-    tree = scene.about.trees["triangle"]
+    tree = scene.about.trees["triangle"]  # triangles are the last of the tables
     found = walk(tree, scene.geometry.tables[-1].vertices, *rays)
     counts = (np.mean(count) for count in (found.nodes, found.boxes, found.leaves, found.triangles))
     cells = " ".join(f"{count:9.2f}" for count in counts)
@@ -131,6 +131,8 @@ def main():
     description = describe(options.mesh, options.output, options.res)
     scenes = {rule: build(description, split_rule=rule) for rule in RULES}
     scene = scenes["sah"]
+    if "triangle" not in scene.about.trees:
+        parser.error(f"{options.mesh} has too few triangles for a hierarchy; give a mesh of 33 or more")
     rays = camera_rays(scene, options.res)
     print(f"{options.mesh.name}: {len(scene.geometry.tables[-1].vertices)} triangles; per ray of the camera:")
     print("rule      nodes  leaves  depth  SAH cost     nodes     boxes    leaves triangles")
