@@ -22,6 +22,7 @@ from pathjax.film import Film
 from pathjax.named import About, Parameter
 from pathjax.shapes import geometry as geometry_module
 from pathjax.shapes import planar, sphere, triangle
+from pathjax.shapes.bvh_build import RULES
 from pathjax.shapes.geometry import Geometry
 from pathjax.shapes.planar import Planar
 from pathjax.shapes.sphere import Spheres
@@ -52,10 +53,13 @@ def build(description: desc.Description, dtype=jnp.float32, split_rule: str = "s
 
     Args:
         dtype: of all reals; float64 needs `jax_enable_x64`.
-        split_rule: of the hierarchy: "sah", "equal" or "middle".
+        split_rule: of the hierarchies, for experiments: "sah" (least expected cost), "equal" (equal counts) or "middle"
+            (of the centroids' bounds). Hits and images are the same; only their cost differs.
     Raises:
-        InputError: float64 without `jax_enable_x64`.
+        InputError: float64 without `jax_enable_x64`; an unknown split_rule.
     """
+    if split_rule not in RULES:
+        raise InputError(f"scene.build: split_rule {split_rule!r} is unknown; use one of {', '.join(RULES)}")
     if jax.dtypes.canonicalize_dtype(dtype) != np.dtype(dtype):
         raise InputError('scene.build: float64 is off in JAX; call jax.config.update("jax_enable_x64", True) first')
     parameters: dict[str, Parameter] = {}

@@ -16,6 +16,8 @@ SMALL = {
     "three_views": ["--res", "24", "--target-spp", "128", "--spp", "16"],
     "identifiability": ["--res", "16", "--target-spp", "256", "--spp", "32"],
     "own_loss": ["--res", "16", "--spp", "8", "--steps", "5"],
+    "choices": ["--res", "16", "--spp", "4,16", "--seeds", "2", "--reference-spp", "256"],
+    "original_results": ["--res", "32", "--spp", "8"],
 }
 QUICK = ("cornell_albedos", "own_loss")
 
@@ -26,6 +28,8 @@ def test_every_example_is_run_here():
 
 @pytest.mark.parametrize("name", [pytest.param(n, marks=() if n in QUICK else pytest.mark.slow) for n in SMALL])
 def test_example_runs_and_writes_its_picture(name, tmp_path):
+    if name == "choices":
+        pytest.importorskip("matplotlib")
     command = [sys.executable, ROOT / "examples" / f"{name}.py", *SMALL[name], "-o", tmp_path / "out.png"]
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, env=environment)

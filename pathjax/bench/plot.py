@@ -1,10 +1,11 @@
-"""Error against time of one scene, as a PNG. Needs matplotlib, of the `bench` extra."""
+"""Error against time, as a PNG. Needs matplotlib, of the `bench` extra."""
 
 from __future__ import annotations
 
 import math
 from pathlib import Path
 
+from pathjax.bench import figures
 from pathjax.io.files import write_whole
 
 _OURS = {"color": "black", "marker": "o", "linewidth": 2.2, "markersize": 7, "zorder": 3}
@@ -27,29 +28,46 @@ def available() -> bool:
 
 def write(scene: dict, path: Path) -> bool:
     """Plot a scene of the report; False, and no file, where nothing in it has noise."""
+    lines = {"pathjax": (scene["pathjax"], _OURS)}
+    for sampler in scene["slopes"]["mitsuba"]:
+        lines[f"Mitsuba {sampler}"] = [row for row in scene["mitsuba"] if row["sampler"] == sampler], _PEERS[sampler]
+    if not any(_points(rows) for rows, _ in lines.values()):
+        return False
+    write_panels([(f"{scene['file']}, {scene['width']} x {scene['height']}", lines)], path)
+    return True
+
+
+def write_panels(panels: list[tuple[str, dict]], path: Path, columns: int = 1) -> None:
+    """Plots of error against time beside each other.
+
+    Args:
+        panels: (title, name -> (rows of `figures.row`, look: keywords of matplotlib's `plot`)) of each.
+    """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
+
+    rows = -(-len(panels) // columns)
+    figure = Figure(figsize=(7.2 * columns, 5 * rows), dpi=150, layout="constrained")
+    FigureCanvasAgg(figure)
+    for number, (title, lines) in enumerate(panels, 1):
+        _draw(figure.add_subplot(rows, columns, number, xscale="log", yscale="log"), title, lines)
+    write_whole(path, lambda beside: figure.savefig(beside, format="png"))
+
+
+def _draw(axes, title: str, lines: dict) -> None:
     from matplotlib.ticker import LogLocator, NullFormatter
 
-    lines = {"pathjax": (_points(scene["pathjax"]), scene["slopes"]["pathjax"], _OURS)}
-    for sampler, slopes in scene["slopes"]["mitsuba"].items():
-        rows = [row for row in scene["mitsuba"] if row["sampler"] == sampler]
-        lines[f"Mitsuba {sampler}"] = _points(rows), slopes, _PEERS[sampler]
-    lines = {name: line for name, line in lines.items() if line[0]}
-    if not lines:
-        return False
-
-    figure = Figure(figsize=(7.2, 5), dpi=150, layout="constrained")
-    FigureCanvasAgg(figure)
-    axes = figure.add_subplot(xscale="log", yscale="log")
-    for name, (points, slopes, look) in lines.items():
-        slope = "" if slopes["seconds"] is None else f", slope {slopes['seconds']:.2f}"
-        axes.plot(*zip(*points, strict=True), label=name + slope, **look)
+    for name, (rows, look) in lines.items():
+        if not _points(rows):
+            continue
+        slope = figures.slopes(rows)["seconds"]
+        label = name if slope is None else f"{name}, slope {slope:.2f}"
+        axes.plot(*zip(*_points(rows), strict=True), label=label, **look)
     axes.margins(0.1)
     _guide(axes)
     axes.set_xlabel("time of a render [s], without compilation")
     axes.set_ylabel("RMS relative error, sqrt(relMSE)")
-    axes.set_title(f"{scene['file']}, {scene['width']} x {scene['height']}", fontsize=10)
+    axes.set_title(title, fontsize=10)
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
         axis.set_major_formatter("{x:g}")
@@ -57,8 +75,6 @@ def write(scene: dict, path: Path) -> bool:
     axes.grid(True, color="#eeeeee", linewidth=0.6)
     axes.set_axisbelow(True)
     axes.legend(fontsize=8.5, loc="upper right")
-    write_whole(path, lambda beside: figure.savefig(beside, format="png"))
-    return True
 
 
 def _points(rows) -> list[tuple[float, float]]:

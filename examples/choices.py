@@ -1,0 +1,144 @@
+"""Choices of the classic path tracers, compared: error against time, a table and a plot for each question.
+
+    python examples/choices.py [QUESTION...]
+
+Which strategy, roulette from which depth, which split rule of the hierarchy, which filter? Choices are rendered with
+the same seeds, in turns; relMSE is measured against a converged reference. Writes choices.png. A further choice is one
+line here: its label, its scene, and what `pathjax.render` is to do otherwise.
+"""
+
+import argparse
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+import pathjax as pj
+from pathjax.bench import figures, plot
+from pathjax.integrators.path import STRATEGIES
+from pathjax.io import mitsuba_xml
+from pathjax.scene import UNBOUNDED, Scene, build
+from pathjax.shapes.bvh_build import RULES
+
+SCENES = Path(__file__).resolve().parents[1] / "scenes"
+BATCHES = 16  # independent images that make up a reference
+REFERENCE_SEED = 1 << 20  # of the first; no timed render has it
+LOOKS = [
+    {"color": color, "marker": marker}
+    for color, marker in zip(("black", "#d55e00", "#0072b2", "#009e73", "#cc79a7", "#e69f00"), "os^DvP", strict=True)
+]
+
+
+class Choice(NamedTuple):
+    label: str
+    scene: Scene
+    how: dict = {}  # keywords of `render`
+    truth: int = 0  # the choice, by its place, whose converged image is the reference
+
+
+def description(name, res, **parameters):
+    return mitsuba_xml.load(SCENES / f"{name}.xml", res=res, **parameters)
+
+
+def strategy(res):
+    """Sample lights, bsdfs, or both (Cornell box)?"""
+    scene = build(description("cornell_box", res))
+    return [Choice(name, scene, {"strategy": name}) for name in STRATEGIES]
+
+
+def roulette(res):
+    """From which depth should roulette end paths (Cornell box, max_depth 32)?"""
+    scene = build(description("cornell_box", res, max_depth=32))
+    depths = {"none": UNBOUNDED, "from depth 2": 2, "from depth 5": 5, "from depth 10": 10}
+    return [Choice(label, replace(scene, rr_depth=np.int32(depth))) for label, depth in depths.items()]
+
+
+def split_rule(res):
+    """How should the hierarchy be split (knot of 20,800 triangles)?"""
+    scene = description("mesh", res)
+    return [Choice(rule, build(scene, split_rule=rule)) for rule in RULES]
+
+
+def reconstruction(res):
+    """A box or a tent filter, each against its own truth (Cornell box)?"""
+    scene = description("cornell_box", res)
+    tent = replace(scene, film=replace(scene.film, filter="tent", filter_radius=1.0))
+    return [Choice("box", build(scene)), Choice("tent", build(tent), truth=1)]
+
+
+QUESTIONS = {question.__name__: question for question in (strategy, roulette, split_rule, reconstruction)}
+
+
+def measure(choices, spps, seeds, reference_spp):
+    """For each choice its rows, one for each spp, with its bias beside."""
+    each = -(-reference_spp // BATCHES)
+    references = {}
+    for truth in sorted({choice.truth for choice in choices}):
+        _, scene, how, _ = choices[truth]
+        images = (pj.render(scene, each, REFERENCE_SEED + k, **how) for k in range(BATCHES))
+        references[truth] = figures.reference_of(images, each)
+    for choice in choices:
+        jax.block_until_ready(pj.render(choice.scene, 1, **choice.how))  # compiles
+    rows = [[] for _ in choices]
+    for spp in spps:
+        done = [([], []) for _ in choices]
+        for seed in range(seeds):
+            for choice, (seconds, images) in zip(choices, done, strict=True):
+                started = time.perf_counter()
+                images.append(np.asarray(pj.render(choice.scene, spp, seed, **choice.how)))
+                seconds.append(time.perf_counter() - started)
+        for choice, (seconds, images), into in zip(choices, done, rows, strict=True):
+            reference = references[choice.truth]
+            paths = images[0].shape[0] * images[0].shape[1]
+            row = figures.row(spp, spp, seconds, reference.errors(images), reference.noise, paths)
+            into.append(row | {"bias": reference.bias(images)})
+    return rows
+
+
+def table(choices, rows):
+    """As Markdown; efficiency 1 / (relMSE x s), and the bias as a relMSE that more samples would not remove."""
+    lines = ["| | spp | s | relMSE | efficiency | of the first | bias, relMSE |", "|---|---|---|---|---|---|---|"]
+    for choice, of_choice in zip(choices, rows, strict=True):
+        for row, first in zip(of_choice, rows[0], strict=True):
+            efficiency, against = row["efficiency"], first["efficiency"]
+            share = f"{efficiency / against:.2f}" if efficiency and against else ""
+            bias = row["bias"]
+            error = f"{row['rel_mse']:.2e} ± {row['rel_mse_standard_error'] / row['rel_mse']:.0%}"
+            cells = [choice.label, row["spp"], f"{row['run_seconds']:.3f}", error, f"{efficiency or np.nan:.0f}", share]
+            cells.append(f"{bias['rel_mse']:.1e} ± {bias['standard_error']:.1e}")
+            lines.append(f"| {' | '.join(map(str, cells))} |")
+    return "\n".join(lines)
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("questions", nargs="*", metavar="QUESTION", help=f"of {', '.join(QUESTIONS)}; all by default")
+    parser.add_argument("--res", type=int, default=96)
+    parser.add_argument("--spp", type=lambda text: [int(x) for x in text.split(",")], default=[16, 64, 256])
+    parser.add_argument("--seeds", type=int, default=4, help="renders of each choice and spp; 2 or more")
+    parser.add_argument("--reference-spp", type=int, default=4096)
+    parser.add_argument("-o", "--output", type=Path, default=Path("choices.png"))
+    options = parser.parse_args()
+    if unknown := set(options.questions) - QUESTIONS.keys():
+        parser.error(f"{', '.join(sorted(unknown))}: unknown; ask {', '.join(QUESTIONS)}")
+    if options.seeds < 2:
+        parser.error(f"--seeds {options.seeds}: errors have standard errors from two seeds on")
+    if not plot.available():
+        parser.error("plots need matplotlib: pip install 'pathjax[bench]'")
+
+    panels = []
+    for name in options.questions or QUESTIONS:
+        question, started = QUESTIONS[name], time.perf_counter()
+        choices = question(options.res)
+        rows = measure(choices, options.spp, options.seeds, options.reference_spp)
+        print(f"\n{name}: {question.__doc__}\n\n{table(choices, rows)}\n\n{time.perf_counter() - started:.0f} s in all")
+        lines = {c.label: (r, LOOKS[k % len(LOOKS)]) for k, (c, r) in enumerate(zip(choices, rows, strict=True))}
+        panels.append((f"{name}: {question.__doc__}", lines))
+    plot.write_panels(panels, options.output, columns=min(2, len(panels)))
+
+
+if __name__ == "__main__":
+    main()
