@@ -1,0 +1,12 @@
+"""Light transport as linear algebra: the operator T of a diffuse scene cut into patches, and (I - T)^-1 Le.
+
+op = transport.operator(scene, patches=2000)
+solution = op.solve()                                       # L = Le + T L on the patches
+image = transport.image(scene, op.radiosity(solution.L))    # through the camera, without noise
+"""
+
+from pathjax.transport.image import Radiosity, image, radiance
+from pathjax.transport.operator import Operator, Solution, operator
+from pathjax.transport.patches import Patches
+
+__all__ = ["Operator", "Patches", "Radiosity", "Solution", "image", "operator", "radiance"]
