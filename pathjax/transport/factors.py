@@ -32,7 +32,7 @@ from pathjax.transport.patches import Patches, point
 
 # Points along each side of a patch, and of one whose distance is less than _NEAR times the sum of the two radii: there
 # the share bends more than a cubic can. The difference between the two directions tells what is left.
-_FEW, _MANY, _NEAR = 2, 8, 3
+_FEW, _MANY, _NEAR = 2, 6, 3
 # Pairs taken at once: their numbers stay in the second cache.
 _BLOCK = 1 << 15
 # More primitives than that are not asked one by one which pairs they might hide: all pairs are.
@@ -156,7 +156,8 @@ def _shares(corners, normals, primitive):
         for x, w in zip(nodes[:, :, i], weights[:, i], strict=True):
             total += w[:, None] * _share(x[..., None], normals[:, i, None], corners[:, :, None], normals[:, None])
         shares[i] = np.where(primitive[i, None] != primitive, total, 0)
-    for i, j in _near(corners, shares):
+    pairs = np.argwhere(_near(corners) & ((shares > 0) | (shares.T > 0)))
+    for i, j in (part.T for part in np.split(pairs, range(_BLOCK, len(pairs), _BLOCK))):
         nodes, weights = _points(corners[:, :, i], _MANY)
         shares[i, j] = sum(
             w * _share(x, normals[:, i], corners[:, :, j], normals[:, j]) for x, w in zip(nodes, weights, strict=True)
@@ -164,17 +165,12 @@ def _shares(corners, normals, primitive):
     return shares
 
 
-def _near(corners, shares):
-    """Blocks of pairs that see each other, and are close for their size."""
+def _near(corners):
+    """(U, U) bool: close for their size."""
     center = corners.mean(0)
     radius = np.linalg.norm(corners - center, axis=1).max(0)
-    rows = max(_BLOCK // len(radius), 1)
-    for first in range(0, len(radius), rows):
-        i = slice(first, first + rows)
-        distance = np.linalg.norm(center[:, i, None] - center[:, None], axis=0)
-        close = (distance < _NEAR * (radius[i, None] + radius)) & ((shares[i] > 0) | (shares[:, i].T > 0))
-        rows_close, columns = np.nonzero(close)
-        yield rows_close + first, columns
+    squared = sum((x[:, None] - x) ** 2 for x in center)
+    return squared < (_NEAR * (radius[:, None] + radius)) ** 2
 
 
 def _share(x, n, corners, facing):

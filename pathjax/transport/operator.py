@@ -25,7 +25,6 @@ from jax import lax
 
 from pathjax.bsdfs import DiffuseTable
 from pathjax.errors import InputError
-from pathjax.integrators.path import check_sampling
 from pathjax.scene import Scene
 from pathjax.transport import factors as dense_factors
 from pathjax.transport import rays as ray_casting
@@ -221,7 +220,9 @@ def operator(
     One-sided surfaces are black from behind, as in the renderer. Not for jitted functions, as shapes are not traced;
     `Operator.with_scene` changes the colours within them.
     """
-    check_sampling("mis", rays, seed)
+    for name, value, least in (("rays", rays, 1), ("seed", seed, 0)):
+        if not least <= value < 2**31:
+            raise InputError(f"{name} = {value}; it must lie in [{least}, 2^31)")
     cells = cut(scene, patches, faceted)
     if method is None:
         method = "dense" if cells.count <= _DENSE_PATCHES and dense_factors.can(scene) else "rays"

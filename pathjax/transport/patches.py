@@ -74,7 +74,7 @@ def cut(scene: Scene, count: int, faceted: bool = False) -> Patches:
     place = np.stack([local // grid[primitive, 1], local % grid[primitive, 1]], -1)
     # Strip a of a triangle cut k times holds 2 (k - a) - 1 cells, those before it a (2 k - a).
     k = grid[primitive, 0]
-    strip = k - np.ceil(np.sqrt(k * k - local)).astype(int)
+    strip = k - np.ceil(np.sqrt(np.maximum(k * k - local, 0))).astype(int)
     place = np.where(triangular[primitive, None], np.stack([strip, local - strip * (2 * k - strip)], -1), place)
 
     row = rows[shape[primitive]].T  # (2, C)
