@@ -6,7 +6,7 @@ image = transport.image(scene, op.radiosity(solution.L))    # through the camera
 """
 
 from pathjax.transport.image import Radiosity, image, radiance
-from pathjax.transport.operator import Operator, Solution, operator
+from pathjax.transport.operator import METHODS, Operator, Solution, operator
 from pathjax.transport.patches import Patches
 
-__all__ = ["Operator", "Patches", "Radiosity", "Solution", "image", "operator", "radiance"]
+__all__ = ["METHODS", "Operator", "Patches", "Radiosity", "Solution", "image", "operator", "radiance"]

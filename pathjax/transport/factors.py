@@ -36,7 +36,7 @@ _FEW, _MANY, _NEAR = 2, 6, 3
 # Pairs taken at once: their numbers stay in the second cache.
 _BLOCK = 1 << 15
 # More primitives than that are not asked one by one which pairs they might hide: all pairs are.
-_MOST_BLOCKERS = 64
+MOST_BLOCKERS = 64
 
 
 def can(scene: Scene) -> bool:
@@ -238,7 +238,7 @@ def _maybe_hidden(bases, triangular, planes, corners, normals, slack):
         bases, triangular, planes: of `_planes`; corners, normals: of `_polygons`.
     """
     count = corners.shape[2]
-    if len(bases) > _MOST_BLOCKERS:
+    if len(bases) > MOST_BLOCKERS:
         return np.ones((count, count), bool)
     low, high = corners.min(0), corners.max(0)
     maybe = np.zeros((count, count), bool)

@@ -24,6 +24,7 @@ import numpy as np
 from jax import lax
 
 from pathjax.bsdfs import DiffuseTable
+from pathjax.core.math import safe_divide
 from pathjax.errors import InputError
 from pathjax.scene import Scene
 from pathjax.transport import factors as dense_factors
@@ -31,12 +32,13 @@ from pathjax.transport import rays as ray_casting
 from pathjax.transport.image import Radiosity, radiosity
 from pathjax.transport.patches import Patches, cut
 
-METHODS = ("dense", "rays")
+# How form factors are found, and with how many rays: of a pair, of a patch.
+METHODS = {"dense": 32, "rays": 256}
 # A dense matrix of more patches than that takes long to fill.
 _DENSE_PATCHES = 2048
 # Rays that ask whether a scene is closed, per patch.
 _PROBES = 64
-_SCALINGS = 1000
+_SCALINGS = 100
 _RESTART = 20
 _MAX_RESTARTS = 100
 _MOST_POWERS = 10_000
@@ -151,7 +153,8 @@ class Operator:
         Returns:
             Solution. Where rounding rules, `residual` tells how far the solver came.
         Raises:
-            InputError: unknown method, a depth below 1, or light that does not die out: a spectral radius of 1.
+            InputError: unknown method, a depth below 1, or light that does not die out: a spectral radius of 1 (which
+                is not looked for where albedos are traced).
         Differentiable in albedo and Le in both modes, for "gmres" by differentiating the equation, not the solver.
         """
         tolerance = 16 * float(jnp.finfo(self.Le.dtype).eps) if tolerance is None else tolerance
@@ -166,7 +169,7 @@ class Operator:
         else:
             self._check_radius()
             L = _gmres(self, tolerance)
-        return Solution(L, _norm(self.Le + self.T.mv(L) - L) / _norm(self.Le))
+        return Solution(L, safe_divide(_norm(self.Le + self.T.mv(L) - L), _norm(self.Le)))
 
     def _terms_for(self, tolerance):
         radius = self._check_radius()
@@ -203,7 +206,12 @@ class Operator:
 
 
 def operator(
-    scene: Scene, patches: int = 1000, method: str | None = None, rays: int = 256, seed: int = 0, faceted: bool = False
+    scene: Scene,
+    patches: int = 1000,
+    method: str | None = None,
+    rays: int | None = None,
+    seed: int = 0,
+    faceted: bool = False,
 ) -> Operator:
     """The transport operator of a diffuse scene.
 
@@ -211,8 +219,8 @@ def operator(
         patches: about how many cells of about equal area the scene is cut into; each primitive is at least one.
         method: "dense" (polygons, or the inside of one sphere: exact form factors, up to some thousand patches), "rays"
             (any shapes; form factors by ray casting, kept for the pairs that rays join), or None: what suits.
-        rays: for "dense" between the two patches of each pair that something may hide from each other; for "rays" from
-            each patch.
+        rays: for "dense" between the two patches of each pair that something may hide from each other, 32 if None; for
+            "rays" from each patch, 256 if None.
         seed: other seeds give independent rays.
         faceted: take meshes of smooth normals as the triangles that they are, instead of refusing them.
     Raises:
@@ -220,24 +228,28 @@ def operator(
     One-sided surfaces are black from behind, as in the renderer. Not for jitted functions, as shapes are not traced;
     `Operator.with_scene` changes the colours within them.
     """
+    cells = cut(scene, patches, faceted)
+    if method is None:
+        few = cells.count <= _DENSE_PATCHES and cells.first.shape[0] <= dense_factors.MOST_BLOCKERS
+        method = "dense" if few and dense_factors.can(scene) else "rays"
+    if method not in METHODS:
+        raise InputError(f"method {method!r} is unknown; use one of {', '.join(METHODS)}")
+    rays = METHODS[method] if rays is None else rays
     for name, value, least in (("rays", rays, 1), ("seed", seed, 0)):
         if not least <= value < 2**31:
             raise InputError(f"{name} = {value}; it must lie in [{least}, 2^31)")
-    cells = cut(scene, patches, faceted)
-    if method is None:
-        method = "dense" if cells.count <= _DENSE_PATCHES and dense_factors.can(scene) else "rays"
-    if method not in METHODS:
-        raise InputError(f"method {method!r} is unknown; use one of {', '.join(METHODS)}")
-    area, dtype = np.asarray(cells.area, float), cells.area.dtype
+    area = np.asarray(cells.area, float)
     if method == "dense":
         exchange, errors = dense_factors.form_factors(scene, cells, rays, seed)
         _, lost = ray_casting.cast(scene, cells, _PROBES, seed)
-        scale = _closing(exchange, area) if not lost.any() else np.ones_like(area)
-        factors = Dense(*(jnp.asarray(x * scale[:, None] * scale / area[:, None], dtype) for x in (exchange, errors)))
     else:
         counts, lost = ray_casting.cast(scene, cells, rays, seed)
         exchange, errors = ray_casting.exchange(counts, area, rays)
-        scale = _closing(exchange, area) if not lost.any() else np.ones_like(area)
+    scale = np.ones_like(area) if lost.any() else _closing(exchange, area)
+    dtype = cells.area.dtype
+    if method == "dense":
+        factors = Dense(*(jnp.asarray(x * scale[:, None] * scale / area[:, None], dtype) for x in (exchange, errors)))
+    else:
         i, j = exchange.row, exchange.col
         values = (jnp.asarray(x * scale[i] * scale[j] / area[i], dtype) for x in (exchange.data, errors))
         factors = Sparse(jnp.asarray(i, jnp.int32), jnp.asarray(j, jnp.int32), *values)

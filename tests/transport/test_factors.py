@@ -24,7 +24,11 @@ def placed(*steps):
 
 def plates(gap=2, between=""):
     """Two squares of side 2 that face each other across the z axis."""
-    return shape("rectangle") + shape("rectangle", placed('<rotate x="1" angle="180"/>', f'<translate z="{gap}"/>')) + between
+    return (
+        shape("rectangle")
+        + shape("rectangle", placed('<rotate x="1" angle="180"/>', f'<translate z="{gap}"/>'))
+        + between
+    )
 
 
 def between_shapes(op):

@@ -16,12 +16,13 @@ from pathjax.shapes import geometry
 from pathjax.transport import patches as patches_module
 
 OCTAHEDRON = '<string name="filename" value="meshes/octahedron.obj"/><boolean name="face_normals" value="true"/>'
-TURNED = '<transform name="to_world"><scale x="2" y="0.5" z="1"/><rotate x="0.6" y="0.8" angle="40"/></transform>'
+TURN = '<rotate x="0.6" y="0.8" angle="40"/></transform>'
+TURNED = f'<transform name="to_world"><scale x="2" y="0.5" z="1"/>{TURN}'
 SHAPES = {
     "rectangle": TURNED,
     "disk": TURNED,
     "obj": OCTAHEDRON + TURNED,
-    "sphere": '<float name="radius" value="2"/><transform name="to_world"><rotate x="0.6" y="0.8" angle="40"/></transform>',
+    "sphere": f'<float name="radius" value="2"/><transform name="to_world">{TURN}',
 }
 GREY = '<bsdf type="diffuse" id="grey"><rgb name="reflectance" value="0.5"/></bsdf>'
 LAMP = '<emitter type="area"><rgb name="radiance" value="1"/></emitter>'
