@@ -5,8 +5,8 @@ solution = op.solve()                                       # L = Le + T L on th
 image = transport.image(scene, op.radiosity(solution.L))    # through the camera, without noise
 """
 
-from pathjax.transport.image import Radiosity, image, radiance
-from pathjax.transport.operator import METHODS, Operator, Solution, operator
+from pathjax.transport.operators import METHODS, Operator, Solution, operator
 from pathjax.transport.patches import Patches
+from pathjax.transport.view import Radiosity, image, radiance
 
 __all__ = ["METHODS", "Operator", "Patches", "Radiosity", "Solution", "image", "operator", "radiance"]

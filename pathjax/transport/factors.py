@@ -33,6 +33,8 @@ from pathjax.transport.patches import Patches, point
 # Points along each side of a patch, and of one whose distance is less than _NEAR times the sum of the two radii: there
 # the share bends more than a cubic can. The difference between the two directions tells what is left.
 _FEW, _MANY, _NEAR = 2, 6, 3
+# A patch that misses less of its light than this misses none: corners are rounded, to float32 in most scenes.
+_MISSED = 1e-5
 # Pairs taken at once: their numbers stay in the second cache.
 _BLOCK = 1 << 15
 # More primitives than that are not asked one by one which pairs they might hide: all pairs are.
@@ -48,11 +50,14 @@ def can(scene: Scene) -> bool:
     )
 
 
-def form_factors(scene: Scene, patches: Patches, rays: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """A_i F_ij (U, U), symmetric, and its errors: half the difference of the two directions, and that of visibility.
+def form_factors(scene: Scene, patches: Patches, rays: int, seed: int) -> tuple[np.ndarray, np.ndarray, bool | None]:
+    """Form factors times the areas of their rows.
 
     Args:
         rays: between the two of each pair that something may hide from each other.
+    Returns:
+        A_i F_ij (U, U), symmetric; its errors (U, U), half the difference of the two directions, and that of
+        visibility; whether the scene is closed, None where that is hidden too.
     Raises:
         InputError: curved shapes, but for the inside of one sphere.
     """
@@ -69,13 +74,15 @@ def form_factors(scene: Scene, patches: Patches, rays: int, seed: int) -> tuple[
     # Coordinates are float32 in most scenes: what lies in a plane lies beside it by some roundings.
     slack = 16 * np.finfo(patches.area.dtype).eps * np.abs(corners).max()
     pairs = np.argwhere(np.triu(_maybe_hidden(*planes, corners, normals, slack) & (exchange > 0)))
+    closed = np.abs(one_way.sum(1) / area - 1).max() < _MISSED
     if len(pairs):
+        closed = None
         i, j = pairs.T
         seen, seen_error = _visible(scene, patches, pairs, rays, seed)
         for a, b in ((i, j), (j, i)):
             error[a, b] = np.hypot(error[a, b] * seen, exchange[a, b] * seen_error)
         exchange[i, j] = exchange[j, i] = exchange[i, j] * seen
-    return exchange, error
+    return exchange, error, closed
 
 
 def _in_sphere(table, patches):
@@ -83,7 +90,7 @@ def _in_sphere(table, patches):
     inwards = np.asarray(patches.back) == (np.asarray(table.sign)[0] > 0)
     area = np.where(inwards, np.asarray(patches.area, float), 0)
     exchange = np.outer(area, area) / (4 * math.pi * float(table.balls[0, 3]) ** 2)
-    return exchange, np.zeros_like(exchange)
+    return exchange, np.zeros_like(exchange), bool(inwards.all())
 
 
 # ---- patches as polygons --------------------------------------------------------------------------------------------

@@ -29,8 +29,8 @@ from pathjax.errors import InputError
 from pathjax.scene import Scene
 from pathjax.transport import factors as dense_factors
 from pathjax.transport import rays as ray_casting
-from pathjax.transport.image import Radiosity, radiosity
 from pathjax.transport.patches import Patches, cut
+from pathjax.transport.view import Radiosity, radiosity
 
 # How form factors are found, and with how many rays: of a pair, of a patch.
 METHODS = {"dense": 32, "rays": 256}
@@ -240,12 +240,14 @@ def operator(
             raise InputError(f"{name} = {value}; it must lie in [{least}, 2^31)")
     area = np.asarray(cells.area, float)
     if method == "dense":
-        exchange, errors = dense_factors.form_factors(scene, cells, rays, seed)
-        _, lost = ray_casting.cast(scene, cells, _PROBES, seed)
+        exchange, errors, closed = dense_factors.form_factors(scene, cells, rays, seed)
+        if closed is None:
+            closed = not ray_casting.cast(scene, cells, _PROBES, seed)[1].any()
     else:
         counts, lost = ray_casting.cast(scene, cells, rays, seed)
         exchange, errors = ray_casting.exchange(counts, area, rays)
-    scale = np.ones_like(area) if lost.any() else _closing(exchange, area)
+        closed = not lost.any()
+    scale = _closing(exchange, area) if closed else np.ones_like(area)
     dtype = cells.area.dtype
     if method == "dense":
         factors = Dense(*(jnp.asarray(x * scale[:, None] * scale / area[:, None], dtype) for x in (exchange, errors)))
