@@ -63,7 +63,10 @@ class Dense:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Sparse:
-    """Form factors of the pairs that some ray joins, by row: they take the space of rays, not of pairs."""
+    """Form factors of the pairs that some ray joins, by row: they take the space of rays, not of pairs.
+
+    Errors are those of counts; of pairs that no ray joins, none is known.
+    """
 
     row: jax.Array  # (K,) int32, ascending
     column: jax.Array  # (K,) int32
@@ -220,7 +223,7 @@ def operator(
         method: "dense" (polygons, or the inside of one sphere: exact form factors, up to some thousand patches), "rays"
             (any shapes; form factors by ray casting, kept for the pairs that rays join), or None: what suits.
         rays: for "dense" between the two patches of each pair that something may hide from each other, 32 if None; for
-            "rays" from each patch, 256 if None.
+            "rays" from each patch on the mean, 256 if None.
         seed: other seeds give independent rays.
         faceted: take meshes of smooth normals as the triangles that they are, instead of refusing them.
     Raises:
@@ -242,10 +245,10 @@ def operator(
     if method == "dense":
         exchange, errors, closed = dense_factors.form_factors(scene, cells, rays, seed)
         if closed is None:
-            closed = not ray_casting.cast(scene, cells, _PROBES, seed)[1].any()
+            closed = not ray_casting.cast(scene, cells, _PROBES, seed)[2].any()
     else:
-        counts, lost = ray_casting.cast(scene, cells, rays, seed)
-        exchange, errors = ray_casting.exchange(counts, area, rays)
+        counts, sent, lost = ray_casting.cast(scene, cells, rays, seed)
+        exchange, errors = ray_casting.exchange(counts, sent / area)
         closed = not lost.any()
     scale = _closing(exchange, area) if closed else np.ones_like(area)
     dtype = cells.area.dtype

@@ -23,28 +23,33 @@ from pathjax.transport.patches import Patches, patch_at, point
 _RAYS_PER_CALL = 1 << 22
 
 
-def cast(scene: Scene, patches: Patches, rays: int, seed: int) -> tuple[sparse.csr_array, np.ndarray]:
+def cast(scene: Scene, patches: Patches, rays: int, seed: int) -> tuple[sparse.csr_array, np.ndarray, np.ndarray]:
     """How many of the rays that each patch sends, uniform in area and by the cosine in direction, meet each other one.
 
+    Args:
+        rays: on the mean of all patches, of which each sends half, and more of the other half the larger it is: so that
+            those of a fine mesh do not take all.
     Returns:
-        counts (U, U) sparse, of rays from the patch of the row to that of the column; and lost (U,), those that met
-        nothing or a side that is black.
+        counts (U, U) sparse, of rays from the patch of the row to that of the column; sent (U,), rays of each patch;
+        and lost (U,), those that met nothing or a side that is black.
     """
-    count = patches.count
-    counts = sparse.csr_array((count, count))
-    lost = np.zeros(count)
-    each = max(min(rays, _RAYS_PER_CALL // count), 1)
-    for first in range(0, rays, each):
-        sender, number = np.divmod(np.arange(count * each, dtype=np.int32), np.int32(each))
-        # The last call repeats its last samples up to full length.
-        number = number + np.int32(first)
-        met = np.asarray(_cast(scene.geometry, patches, sender, number, np.uint32(seed)))
-        valid = number < rays
-        lost += np.bincount(sender[valid & (met == count)], minlength=count)
-        valid &= met < count
-        ones = np.ones(np.count_nonzero(valid))
-        counts = counts + sparse.csr_array((ones, (sender[valid], met[valid])), shape=(count, count))
-    return counts, lost
+    count, area = patches.count, np.asarray(patches.area, float)
+    sent = np.maximum(np.rint(rays / 2 * (1 + area / area.mean())), 1).astype(int)
+    first = np.cumsum([0, *sent])
+    counts, lost = sparse.csr_array((count, count)), np.zeros(count)
+    each = min(_RAYS_PER_CALL, first[-1])
+    for start in range(0, first[-1], each):
+        # The last call repeats its last ray up to full length.
+        ray = np.minimum(np.arange(start, start + each), first[-1] - 1)
+        sender = np.searchsorted(first, ray, side="right") - 1
+        work = (x.astype(np.int32) for x in (sender, ray - first[sender]))
+        met = np.asarray(_cast(scene.geometry, patches, *work, np.uint32(seed)))
+        sender, met = (x[: first[-1] - start] for x in (sender, met))
+        found = met < count
+        lost += np.bincount(sender[~found], minlength=count)
+        ones = np.ones(np.count_nonzero(found))
+        counts = counts + sparse.csr_array((ones, (sender[found], met[found])), shape=(count, count))
+    return counts, sent, lost
 
 
 @partial(jax.jit, static_argnames=("form", "devices"))
@@ -67,13 +72,12 @@ def _one(work, shapes, patches, seed):
     return jnp.where(hit.primitive >= 0, met, patches.count)
 
 
-def exchange(counts: sparse.csr_array, area: np.ndarray, rays: int) -> tuple[sparse.coo_array, np.ndarray]:
+def exchange(counts: sparse.csr_array, density: np.ndarray) -> tuple[sparse.coo_array, np.ndarray]:
     """A_i F_ij, symmetric, from the rays of both patches, and its standard errors at the same places.
 
-    Rays from i to j estimate A_i F_ij as do those from j to i; what is best known counts most, by rays per area: with
-    n_i = rays / A_i, (counts_ij + counts_ji) / (n_i + n_j) is unbiased and of the least variance.
+    Rays from i to j estimate A_i F_ij as do those from j to i. With n_i = rays / A_i, the density (U,),
+    (counts_ij + counts_ji) / (n_i + n_j) is unbiased and, as counts are Poisson's, of the least variance.
     """
     both = sparse.coo_array(counts + counts.T)
-    density = rays / area
     scale = 1 / (density[both.row] + density[both.col])
     return sparse.coo_array((both.data * scale, (both.row, both.col)), shape=both.shape), np.sqrt(both.data) * scale

@@ -116,8 +116,9 @@ def test_dense_and_ray_cast_form_factors_agree_within_their_errors(shipped, empt
     dense = transport.operator(scene, 150, method="dense", rays=128)
     cast = transport.operator(scene, 150, method="rays", rays=rays)
     F, G = (np.asarray(op.F.as_matrix(), float) for op in (dense, cast))
-    density = rays / np.asarray(dense.area, float)
-    expected = F * rays / density[:, None] * (density[:, None] + density)
+    area = np.asarray(dense.area, float)
+    density = rays / 2 * (1 / area + 1 / area.mean())
+    expected = F * area[:, None] * (density[:, None] + density)
     pairs = expected > 20
     # Poisson's error of the expected number: that of the observed one is too small where by chance few were met.
     errors = np.hypot(F[pairs] / np.sqrt(expected[pairs]), np.asarray(dense.factors.errors)[pairs])
