@@ -363,8 +363,8 @@ def refined(empty_cornell):
 
 @pytest.mark.slow
 def test_operator_against_the_path_tracer(refined):
-    """The bias falls with refinement down to the noise. Halving patches takes three quarters of an error of second order
-    away, so a third of what the last refinement changed is left.
+    """The bias falls with refinement down to the noise. Of an error of second order, halving the patches takes three
+    quarters away, so a third of what the last refinement changed is left.
     """
     errors, noise, images = against_renders(*refined)
     biases = np.sqrt(np.maximum(errors**2 - noise**2, 0))
