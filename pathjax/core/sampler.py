@@ -1,4 +1,4 @@
-"""Random numbers as a function: (seed, pixel, sample, dimension) -> [0, 1), float32 multiples of 2^-24.
+"""Random numbers as a function: (seed, pixel, sample, dimension) -> (0, 1), float32, odd multiples of 2^-24.
 
 The points of a pixel's paths are a rank-1 lattice in many dimensions at once, ordered by the radical inverse so that any
 first 2^m of them are a lattice too, and moved as a whole by a random shift (Dick, Kuo and Sloan 2013, Acta Numerica 22).
@@ -49,8 +49,8 @@ def combine(a, b):
 
 
 def to_unit(x):
-    """uint32 -> float32 in [0, 1): its upper 24 bits."""
-    return (x >> 8).astype(jnp.float32) * jnp.float32(2**-24)
+    """uint32 -> float32: the odd multiple of 2^-24 in the middle of one of 2^23 equal intervals, so never 0 or 1."""
+    return (x >> 9).astype(jnp.float32) * jnp.float32(2**-23) + jnp.float32(2**-24)
 
 
 def reverse_bits(x):

@@ -56,7 +56,8 @@ def mean(work, scene, choice, strategy, derivative=False, split_depth=0, points=
         now, weight = lax.optimization_barrier((now, weight))
         u = path.bounce_numbers(scene, stream, number, now.depth, points)
         now = path.extend(scene, choice, now, u, strategy, derivative)
-        sums = lax.cond(now.alive, lambda: sums, lambda: add_compensated(sums, weight * now.L))
+        value = lax.optimization_barrier(weight * now.L)
+        sums = lax.cond(now.alive, lambda: sums, lambda: add_compensated(sums, value))
         return number + jnp.where(now.alive, 0, 1).astype(number.dtype), now, weight, sums
 
     zero = jnp.zeros((3,), scene.camera.origin.dtype)

@@ -1,0 +1,15 @@
+"""Light transport as linear algebra: the operator T of a diffuse scene cut into patches, and (I - T)^-1 Le.
+
+    op = transport.operator(scene, patches=2000)
+    solution = op.solve()                                       # L = Le + T L on the patches
+    image = transport.image(scene, op.radiosity(solution.L))    # through the camera, without noise
+
+`operator` says what a scene may hold, `operators.py` what is discretised and how it errs, `radiance` looks light up
+at a point of a surface within code of one ray.
+"""
+
+from pathjax.transport.operators import METHODS, Operator, Solution, operator
+from pathjax.transport.patches import Patches
+from pathjax.transport.view import Radiosity, image, radiance
+
+__all__ = ["METHODS", "Operator", "Patches", "Radiosity", "Solution", "image", "operator", "radiance"]

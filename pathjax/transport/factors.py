@@ -1,0 +1,306 @@
+"""Form factors of polygons: exact from points, Gauss-Legendre over the points, rays where something may hide them.
+
+The share of the light of a point x with normal n that goes straight to a polygon is (Lambert 1760)
+
+    sum over its edges of  angle * n . axis / 2 pi,
+
+angle and axis those of the turn from one end of the edge to the other as seen from x, of the part of the polygon above
+the horizon of x. Shares of all that x sees add up to 1 exactly, so a closed scene loses no light, whatever the rule.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import partial, reduce
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from pathjax.core import sampler
+from pathjax.core.math import dot, larger, safe_divide, safe_sqrt, spawn_ray
+from pathjax.core.types import Surface
+from pathjax.errors import InputError
+from pathjax.runtime import native_map
+from pathjax.scene import Scene
+from pathjax.shapes import geometry
+from pathjax.shapes.planar import Planar
+from pathjax.shapes.sphere import Spheres
+from pathjax.shapes.triangle import Triangles
+from pathjax.transport.patches import Patches, point
+
+# Points along each side of a patch, and of one whose distance is less than _NEAR times the sum of the two radii: there
+# the share bends more than a cubic can. The difference between the two directions tells what is left.
+_FEW, _MANY, _NEAR = 2, 6, 3
+# A patch that misses less of its light than this misses none: corners are rounded, to float32 in most scenes.
+_MISSED = 1e-5
+# Pairs taken at once: their numbers stay in the second cache.
+_BLOCK = 1 << 15
+# More primitives than that are not asked one by one which pairs they might hide: all pairs are.
+MOST_BLOCKERS = 64
+
+
+def can(scene: Scene) -> bool:
+    """Whether the scene is made of polygons, or of one sphere."""
+    tables = scene.geometry.tables
+    one_sphere = len(tables) == 1 and isinstance(tables[0], Spheres) and len(tables[0].balls) == 1
+    return one_sphere or all(
+        isinstance(table, Triangles) or isinstance(table, Planar) and not table.disk for table in tables
+    )
+
+
+def form_factors(scene: Scene, patches: Patches, rays: int, seed: int) -> tuple[np.ndarray, np.ndarray, bool | None]:
+    """Form factors times the areas of their rows.
+
+    Args:
+        rays: between the two of each pair that something may hide from each other.
+    Returns:
+        A_i F_ij (U, U), symmetric; its errors (U, U), half the difference of the two directions, and that of
+        visibility; whether the scene is closed, None where that is hidden too.
+    Raises:
+        InputError: curved shapes, but for the inside of one sphere.
+    """
+    if not can(scene):
+        raise InputError('spheres and disks, but for the inside of one sphere alone, need method="rays"')
+    if isinstance(scene.geometry.tables[0], Spheres):
+        return _in_sphere(scene.geometry.tables[0], patches)
+    planes = _planes(scene)
+    corners, normals = _polygons(patches, *planes)
+    area = np.asarray(patches.area, float)
+    primitive = np.asarray(patches.primitive)[np.asarray(patches.cell)]
+    one_way = area[:, None] * _shares(corners, normals, primitive)
+    exchange, error = (one_way + one_way.T) / 2, np.abs(one_way - one_way.T) / 2
+    # Coordinates are float32 in most scenes: what lies in a plane lies beside it by some roundings.
+    slack = 16 * np.finfo(patches.area.dtype).eps * np.abs(corners).max()
+    pairs = np.argwhere(np.triu(_maybe_hidden(*planes, corners, normals, slack) & (exchange > 0)))
+    closed = np.abs(one_way.sum(1) / area - 1).max() < _MISSED
+    if len(pairs):
+        closed = None
+        i, j = pairs.T
+        seen, seen_error = _visible(scene, patches, pairs, rays, seed)
+        for a, b in ((i, j), (j, i)):
+            error[a, b] = np.hypot(error[a, b] * seen, exchange[a, b] * seen_error)
+        exchange[i, j] = exchange[j, i] = exchange[i, j] * seen
+    return exchange, error, closed
+
+
+def _in_sphere(table, patches):
+    """Chords of a sphere meet both ends at the same angle: every patch sends an equal share to equal areas."""
+    inwards = np.asarray(patches.back) == (np.asarray(table.sign)[0] > 0)
+    area = np.where(inwards, np.asarray(patches.area, float), 0)
+    exchange = np.outer(area, area) / (4 * math.pi * float(table.balls[0, 3]) ** 2)
+    return exchange, np.zeros_like(exchange), bool(inwards.all())
+
+
+# ---- patches as polygons --------------------------------------------------------------------------------------------
+
+
+def _planes(scene):
+    """Of all primitives: corner and two edges (Q, 3, 3), whether it is a triangle (Q,), unit normal (Q, 3), float64."""
+    bases, triangular, normals = [], [], []
+    for table in scene.geometry.tables:
+        if isinstance(table, Planar):
+            c, a, b, n = np.moveaxis(np.asarray(table.frames, float), 1, 0)
+            bases.append(np.stack([c - a - b, 2 * a, 2 * b], 1))
+        else:
+            v = np.asarray(table.vertices, float)
+            bases.append(np.stack([v[:, 0], v[:, 1] - v[:, 0], v[:, 2] - v[:, 0]], 1))
+            n = np.cross(bases[-1][:, 1], bases[-1][:, 2])
+        normals.append(n / np.linalg.norm(n, axis=-1, keepdims=True))
+        triangular.append(np.full(len(n), isinstance(table, Triangles)))
+    return tuple(np.concatenate(x) for x in (bases, triangular, normals))
+
+
+def _steps(triangular):
+    """(4, N, 2) corners of a cell along its two edges; the last of a triangle twice."""
+    square, triangle = ([[0, 0], [1, 0], [1, 1], [0, 1]], [[0, 0], [1, 0], [0, 1], [0, 1]])
+    return np.where(triangular[:, None], np.array(triangle)[:, None], np.array(square)[:, None])
+
+
+def _at(bases, xy):
+    """Points (4, 3, N) at the coordinates (4, N, 2) of bases (N, 3, 3)."""
+    return np.swapaxes(bases[:, 0] + xy[..., :1] * bases[:, 1] + xy[..., 1:] * bases[:, 2], 1, 2)
+
+
+def _polygons(patches, bases, triangular, normals):
+    """Corners (4, 3, U) in turn and unit normals (3, U) of the patches."""
+    cell = np.asarray(patches.cell)
+    primitive = np.asarray(patches.primitive)[cell]
+    grid, place = np.asarray(patches.grid)[primitive], np.asarray(patches.place)[cell]
+    triangular = triangular[primitive]
+    corner = np.where(triangular[:, None], np.stack([place[:, 0], place[:, 1] // 2], -1), place)
+    turned = triangular & (place[:, 1] % 2 == 1)
+    steps = _steps(triangular)
+    steps = np.where(turned[:, None], 1 - steps, steps)
+    side = np.where(np.asarray(patches.back), -1, 1)
+    return _at(bases[primitive], (corner + steps) / grid), (normals[primitive] * side[:, None]).T
+
+
+def _points(corners, order):
+    """Nodes (order^2, 3, U) and weights (order^2, U), of sum 1, on parallelograms and triangles."""
+    x, w = np.polynomial.legendre.leggauss(order)
+    x, w = (x + 1) / 2, w / 2
+    s, t = (a.ravel()[:, None, None] for a in np.meshgrid(x, x))
+    weights = np.outer(w, w).ravel()[:, None]
+    a, b, last = corners[1] - corners[0], corners[3] - corners[0], corners[2] - corners[3]
+    triangle = (last == 0).all(0)
+    # Of a triangle, the square is folded onto it; the fold's density goes into the weights.
+    t_folded = np.where(triangle, t * (1 - s), t)
+    weights = np.where(triangle, weights * 2 * (1 - s[:, 0]), weights)
+    return corners[0] + s * a + t_folded * b, weights
+
+
+def _shares(corners, normals, primitive):
+    """(U, U) share of the light of each patch that goes to each of other primitives, were nothing between them."""
+    count = len(primitive)
+    shares = np.empty((count, count))
+    nodes, weights = _points(corners, _FEW)
+    rows = max(_BLOCK // count, 1)
+    for first in range(0, count, rows):
+        i = slice(first, first + rows)
+        total = 0
+        for x, w in zip(nodes[:, :, i], weights[:, i], strict=True):
+            total += w[:, None] * _share(x[..., None], normals[:, i, None], corners[:, :, None], normals[:, None])
+        shares[i] = np.where(primitive[i, None] != primitive, total, 0)
+    pairs = np.argwhere(_near(corners) & ((shares > 0) | (shares.T > 0)))
+    for i, j in (part.T for part in np.split(pairs, range(_BLOCK, len(pairs), _BLOCK))):
+        nodes, weights = _points(corners[:, :, i], _MANY)
+        shares[i, j] = sum(
+            w * _share(x, normals[:, i], corners[:, :, j], normals[:, j]) for x, w in zip(nodes, weights, strict=True)
+        )
+    return shares
+
+
+def _near(corners):
+    """(U, U) bool: close for their size."""
+    center = corners.mean(0)
+    radius = np.linalg.norm(corners - center, axis=1).max(0)
+    squared = sum((x[:, None] - x) ** 2 for x in center)
+    return squared < (_NEAR * (radius[:, None] + radius)) ** 2
+
+
+def _share(x, n, corners, facing):
+    """Share of the light of points that goes to polygons, Lambert's formula; arguments broadcast.
+
+    Args:
+        x, n: (3, ...) points and their normals; corners: (4, 3, ...); facing: (3, ...) normals of the polygons.
+    """
+    r = [[corner[axis] - x[axis] for axis in range(3)] for corner in corners]
+    heights = [_dot(n, a) for a in r]
+    front = _dot(facing, r[0]) < 0
+    lowest, highest = (reduce(op, heights) for op in (np.minimum, np.maximum))
+    total = np.zeros(lowest.shape)
+    clear = np.nonzero(front & (lowest >= 0) & (highest > 0))
+    cut = np.nonzero(front & (lowest < 0) & (highest > 0))
+    for place, edges in ((clear, _edges), (cut, _edges_above)):
+        if len(place[0]):
+            picked = [[np.broadcast_to(a, total.shape)[place] for a in corner] for corner in r]
+            normal = [np.broadcast_to(a, total.shape)[place] for a in n]
+            total[place] = sum(_turn(normal, a, b) for a, b in edges(picked, normal))
+    return np.abs(total) / (2 * math.pi)
+
+
+def _edges(r, n):
+    return [(r[k], r[(k + 1) % 4]) for k in range(4)]
+
+
+def _edges_above(r, n):
+    """Edges of the part above the horizon: those of the polygon, cut, and the one on the horizon that closes it."""
+    edges, leave, enter = [], [0, 0, 0], [0, 0, 0]
+    for a, b in _edges(r, n):
+        ha, hb = _dot(n, a), _dot(n, b)
+        t = np.where(ha != hb, ha / np.where(ha != hb, ha - hb, 1), 0)
+        crossing = [p + t * (q - p) for p, q in zip(a, b, strict=True)]
+        up, down = (ha <= 0) & (hb > 0), (ha > 0) & (hb <= 0)
+        edges.append(
+            (
+                [np.where(up, c, np.where(ha > 0, p, 0)) for c, p in zip(crossing, a, strict=True)],
+                [np.where(down, c, np.where(hb > 0, q, 0)) for c, q in zip(crossing, b, strict=True)],
+            )
+        )
+        enter = [e + np.where(up, c, 0) for e, c in zip(enter, crossing, strict=True)]
+        leave = [e + np.where(down, c, 0) for e, c in zip(leave, crossing, strict=True)]
+    return [*edges, (leave, enter)]
+
+
+def _turn(n, a, b):
+    """Angle from a to b times the part of its axis along n; 0 where one of them is."""
+    axis = [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+    length = np.sqrt(_dot(axis, axis))
+    return np.arctan2(length, _dot(a, b)) * _dot(n, axis) / np.where(length > 0, length, 1)
+
+
+def _dot(a, b):
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+# ---- who may hide whom ----------------------------------------------------------------------------------------------
+
+
+def _maybe_hidden(bases, triangular, planes, corners, normals, slack):
+    """(U, U) bool: false where no primitive can come between two patches, as a plane tells that parts them from it.
+
+    Args:
+        bases, triangular, planes: of `_planes`; corners, normals: of `_polygons`.
+    """
+    count = corners.shape[2]
+    if len(bases) > MOST_BLOCKERS:
+        return np.ones((count, count), bool)
+    low, high = corners.min(0), corners.max(0)
+    maybe = np.zeros((count, count), bool)
+    for points, plane in zip(np.moveaxis(_at(bases, _steps(triangular)), 2, 0), planes, strict=True):
+        # The primitive lies behind one of the two, or both lie on one side of it or of a plane across an axis.
+        behind = (np.tensordot(points, normals, 1) - _dot(normals, corners[0]) <= slack).all(0)
+        clear = behind[:, None] | behind
+        heights = np.tensordot(plane, corners, (0, 1)) - plane @ points[0]
+        sides = [(heights >= -slack).all(0), (heights <= slack).all(0)]
+        sides += [low[axis] > points[:, axis].max() for axis in range(3)]
+        sides += [high[axis] < points[:, axis].min() for axis in range(3)]
+        for side in sides:
+            clear |= side[:, None] & side
+        maybe |= ~clear
+    return maybe
+
+
+def _visible(scene, patches, pairs, rays, seed):
+    """(K,) share of the light between the two patches of each pair (K, 2) that nothing blocks, and its standard error.
+
+    What all rays say is not certain: of m rays, v m seen, the error is that of the share (v m + 1) / (m + 2).
+    """
+    i, j = np.asarray(pairs, np.int32).T
+    sums = _visibility(scene.geometry, patches, i, j, np.int32(rays), np.uint32(seed))
+    seen, total, squares = (np.asarray(x, float) for x in sums)
+    share = np.divide(seen, total, out=np.zeros_like(seen), where=total > 0)
+    effective = np.divide(total**2, squares, out=np.ones_like(seen), where=squares > 0)
+    likely = (share * effective + 1) / (effective + 2)
+    return share, np.sqrt(likely * (1 - likely) / effective)
+
+
+@partial(jax.jit, static_argnames=("form", "devices"))
+def _visibility(shapes, patches, i, j, rays, seed, form=None, devices=None):
+    return native_map(_pair_visibility, (i, j), shapes, patches, rays, seed, form=form, devices=devices)
+
+
+def _pair_visibility(work, shapes, patches, rays, seed):
+    """Sums over the rays between two patches of what they carry and is seen, of what they carry, and of its square."""
+    i, j = work
+    stream = sampler.combine(sampler.pixel_stream(seed, i), j)
+
+    def add(number, sums):
+        numbers = (sampler.sobol_pair(stream, number, pair) for pair in (0, 1))
+        u, v = lax.optimization_barrier(tuple(x.astype(patches.area.dtype) for x in numbers))
+        primitive, p, n, margin = point(patches, shapes, i, u)
+        target, q, n_target, _ = point(patches, shapes, j, v)
+        squared = dot(q - p, q - p)
+        distance = safe_sqrt(squared)
+        d = (q - p) * safe_divide(1, distance)
+        carried = larger(dot(n, d), 0) * larger(-dot(n_target, d), 0) * safe_divide(1, squared)
+        # A shadow ray of negative length is not traced.
+        ray = spawn_ray(Surface(p, n, margin, n, u), d, primitive)._replace(t_max=jnp.where(carried > 0, distance, -1))
+        ray, carried = lax.optimization_barrier((ray, carried))
+        seen = jnp.where(geometry.occluded(shapes, ray, target), 0, carried)
+        return sums[0] + seen, sums[1] + carried, sums[2] + carried * carried
+
+    zero = jnp.zeros((), patches.area.dtype)
+    return lax.fori_loop(0, rays, add, (zero, zero, zero))

@@ -1,0 +1,366 @@
+"""The transport operator of a diffuse scene cut into patches, and what solves L = Le + T L with it.
+
+Radiance is taken as constant on each patch (Galerkin's method with constants; Goral et al. 1984): with the form factors
+
+    F_ij = 1 / A_i  integral over i and j of  cos cos visible / (pi r^2),        A_i F_ij = A_j F_ji,
+
+the light that leaves patch i is L_i = Le_i + rho_i sum_j F_ij L_j, so (T L)_i = rho_i (F L)_i.
+
+Two errors, apart from each other: that of the form factors, which `Operator.error` states, and that of the patches,
+which falls with their size h: by h in a point, by h^2 in means over many patches where the light is smooth. Refine and
+compare to know it; no number here holds it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import lineax as lx
+import numpy as np
+from jax import lax
+
+from pathjax.bsdfs import DiffuseTable
+from pathjax.core.math import safe_divide
+from pathjax.errors import InputError
+from pathjax.scene import Scene
+from pathjax.transport import factors as dense_factors
+from pathjax.transport import rays as ray_casting
+from pathjax.transport.patches import Patches, cut
+from pathjax.transport.view import Radiosity, radiosity
+
+# How form factors are found, and with how many rays: of a pair, of a patch.
+METHODS = {"dense": 32, "rays": 256}
+# A dense matrix of more patches than that takes long to fill.
+_DENSE_PATCHES = 2048
+# Rays that ask whether a scene is closed, per patch.
+_PROBES = 64
+_SCALINGS = 100
+_RESTART = 20
+_MAX_RESTARTS = 100
+_MOST_POWERS = 10_000
+_MOST_TERMS = 100_000
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Dense:
+    """Form factors, and their errors, as matrices."""
+
+    matrix: jax.Array  # (U, U) F_ij
+    errors: jax.Array  # (U, U)
+
+    def mv(self, x):
+        return jnp.matmul(self.matrix, x, precision=lax.Precision.HIGHEST)
+
+    def squared_errors_mv(self, x):
+        return jnp.matmul(self.errors**2, x, precision=lax.Precision.HIGHEST)
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Sparse:
+    """Form factors of the pairs that some ray joins, by row: they take the space of rays, not of pairs.
+
+    Errors are those of counts; of pairs that no ray joins, none is known.
+    """
+
+    row: jax.Array  # (K,) int32, ascending
+    column: jax.Array  # (K,) int32
+    value: jax.Array  # (K,) F_ij
+    errors: jax.Array  # (K,)
+
+    def mv(self, x):
+        return self._sum(self.value, x)
+
+    def squared_errors_mv(self, x):
+        return self._sum(self.errors**2, x)
+
+    def _sum(self, weights, x):
+        terms = weights.reshape(-1, *[1] * (x.ndim - 1)) * x[self.column]
+        return jax.ops.segment_sum(terms, self.row, x.shape[0], indices_are_sorted=True)
+
+
+class Solution(NamedTuple):
+    L: jax.Array  # (U, 3) radiance that leaves the patches, W m^-2 sr^-1
+    residual: jax.Array  # () |Le + T L - L| / |Le|
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Operator:
+    """T of a scene, U patches and 3 channels; a pytree, which may be passed to jitted functions."""
+
+    patches: Patches
+    factors: Dense | Sparse
+    albedo: jax.Array  # (U, 3)
+    Le: jax.Array  # (U, 3) radiance that the patches emit
+
+    @property
+    def area(self) -> jax.Array:
+        """(U,) of each patch."""
+        return self.patches.area
+
+    @property
+    def F(self) -> lx.AbstractLinearOperator:
+        """Form factors, an operator on (U,); `as_matrix()` shows those of few patches."""
+        if isinstance(self.factors, Dense):
+            return lx.MatrixLinearOperator(self.factors.matrix)
+        structure = jax.ShapeDtypeStruct(self.area.shape, self.area.dtype)
+        return lx.FunctionLinearOperator(self.factors.mv, structure)
+
+    @property
+    def T(self) -> lx.FunctionLinearOperator:
+        """One bounce, an operator on (U, 3): light that leaves the patches to light that they then reflect."""
+        return self._function(lambda L: self.albedo * self.factors.mv(L))
+
+    @property
+    def adjoint(self) -> lx.FunctionLinearOperator:
+        """T*, with <T f, g> = <f, T* g> for <f, g> = sum over patches of A f g: importance goes backwards by it."""
+        return self._function(lambda g: self.factors.mv(self.albedo * g))
+
+    def _function(self, f):
+        return lx.FunctionLinearOperator(f, jax.ShapeDtypeStruct(self.Le.shape, self.Le.dtype))
+
+    def with_scene(self, scene: Scene) -> Operator:
+        """The same form factors with the reflectances and radiances of a scene of the same shapes; may be traced."""
+        return replace(self, **dict(zip(("albedo", "Le"), _albedos_and_lights(scene, self.patches), strict=True)))
+
+    def radiosity(self, L) -> Radiosity:
+        """Light L (U, 3) on the patches, for `transport.image` and `transport.radiance`."""
+        return radiosity(self.patches, L)
+
+    def error(self, L) -> jax.Array:
+        """Standard error (U, 3) that the errors of the form factors leave in T L, for light L (U, 3)."""
+        return self.albedo * jnp.sqrt(self.factors.squared_errors_mv(L**2))
+
+    def terms(self, depth: int) -> jax.Array:
+        """Le, T Le, T^2 Le, ...: (depth, U, 3), the light that was reflected 0, 1, ... times. depth: at least 1."""
+        _check_depth(depth)
+        return lax.scan(lambda term, _: (self.T.mv(term), term), self.Le, length=depth)[1]
+
+    def spectral_radius(self) -> jax.Array:
+        """(3,) largest eigenvalue of T by channel, by the power method: below 1 if the light dies out."""
+        return _spectral_radius(self)
+
+    def solve(self, method: str = "gmres", depth: int | None = None, tolerance: float | None = None) -> Solution:
+        """L = (I - T)^-1 Le.
+
+        Args:
+            method: "gmres" (all bounces, by lineax) or "neumann" (the first `depth` terms of Le + T Le + ...).
+            depth: number of terms, as `max_depth` counts them; None: as many as leave less than `tolerance`.
+            tolerance: of the residual, relative to the largest radiance emitted; None: 16 roundings.
+        Returns:
+            Solution. Where rounding rules, `residual` tells how far the solver came.
+        Raises:
+            InputError: unknown method, a depth below 1, or light that does not die out: a spectral radius of 1 (which
+                is not looked for where albedos are traced).
+        Differentiable in albedo and Le in both modes, for "gmres" by differentiating the equation, not the solver.
+        """
+        tolerance = 16 * float(jnp.finfo(self.Le.dtype).eps) if tolerance is None else tolerance
+        if method == "neumann" and depth is not None:
+            L = self.terms(depth).sum(0)
+        elif method == "neumann":
+            L = _add_terms(self, self._terms_for(tolerance))
+        elif method != "gmres":
+            raise InputError(f'method {method!r} is unknown; use "gmres" or "neumann"')
+        elif depth is not None:
+            raise InputError('a depth goes with method="neumann"; GMRES finds the sum of all terms')
+        else:
+            self._check_radius()
+            L = _gmres(self, tolerance)
+        return Solution(L, safe_divide(_norm(self.Le + self.T.mv(L) - L), _norm(self.Le)))
+
+    def _terms_for(self, tolerance):
+        radius = self._check_radius()
+        if radius is None:
+            raise InputError('method="neumann" of a traced operator needs a depth')
+        terms = 1 if radius == 0 else 1 + int(np.ceil(np.log(tolerance * (1 - radius)) / np.log(radius)))
+        return min(max(terms, 1), _MOST_TERMS)
+
+    def _check_radius(self) -> float | None:
+        """Largest spectral radius; None: not known while traced."""
+        if any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves((self.factors, self.albedo))):
+            return None
+        radius = float(self.spectral_radius().max())
+        # Closer to 1 and rounding makes up the solution.
+        if radius > 1 - 100 * float(jnp.finfo(self.Le.dtype).eps):
+            raise InputError(
+                f"the spectral radius of the operator is {radius:.6f}: light in this scene does not die out, and "
+                "(I - T)^-1 does not exist. Give some surface an albedo below 1, or open the scene"
+            )
+        return radius
+
+    def residual_history(self, steps: int, method: str = "gmres") -> np.ndarray:
+        """|Le + T L - L| / |Le| for the best L made of Le, T Le, ..., T^(k-1) Le, k = 0, ..., steps: (steps + 1,).
+
+        method: "gmres", best by least squares, without restarts; or "neumann", their sum.
+        """
+        _check_depth(steps)
+        if method == "neumann":
+            norms = np.asarray(jax.vmap(_norm)(self.terms(steps + 1)))
+            return norms / norms[0]
+        if method != "gmres":
+            raise InputError(f'method {method!r} is unknown; use "gmres" or "neumann"')
+        return _krylov_residuals(self, steps)
+
+
+def operator(
+    scene: Scene,
+    patches: int = 1000,
+    method: str | None = None,
+    rays: int | None = None,
+    seed: int = 0,
+    faceted: bool = False,
+) -> Operator:
+    """The transport operator of a diffuse scene.
+
+    Args:
+        patches: about how many cells of about equal area the scene is cut into; each primitive is at least one.
+        method: "dense" (polygons, or the inside of one sphere: exact form factors, up to some thousand patches), "rays"
+            (any shapes; form factors by ray casting, kept for the pairs that rays join), or None: what suits.
+        rays: for "dense" between the two patches of each pair that something may hide from each other, 32 if None; for
+            "rays" from each patch on the mean, 256 if None.
+        seed: other seeds give independent rays.
+        faceted: take meshes of smooth normals as the triangles that they are, instead of refusing them.
+    Raises:
+        InputError: what is not diffuse or has area 0, named; numbers out of range.
+    One-sided surfaces are black from behind, as in the renderer. Not for jitted functions, as shapes are not traced;
+    `Operator.with_scene` changes the colours within them.
+    """
+    cells = cut(scene, patches, faceted)
+    if method is None:
+        few = cells.count <= _DENSE_PATCHES and cells.first.shape[0] <= dense_factors.MOST_BLOCKERS
+        method = "dense" if few and dense_factors.can(scene) else "rays"
+    if method not in METHODS:
+        raise InputError(f"method {method!r} is unknown; use one of {', '.join(METHODS)}")
+    rays = METHODS[method] if rays is None else rays
+    for name, value, least in (("rays", rays, 1), ("seed", seed, 0)):
+        if not least <= value < 2**31:
+            raise InputError(f"{name} = {value}; it must lie in [{least}, 2^31)")
+    area = np.asarray(cells.area, float)
+    if method == "dense":
+        exchange, errors, closed = dense_factors.form_factors(scene, cells, rays, seed)
+        if closed is None:
+            closed = not ray_casting.cast(scene, cells, _PROBES, seed)[2].any()
+    else:
+        counts, sent, lost = ray_casting.cast(scene, cells, rays, seed)
+        exchange, errors = ray_casting.exchange(counts, sent / area)
+        closed = not lost.any()
+    scale = _closing(exchange, area) if closed else np.ones_like(area)
+    dtype = cells.area.dtype
+    if method == "dense":
+        factors = Dense(*(jnp.asarray(x * scale[:, None] * scale / area[:, None], dtype) for x in (exchange, errors)))
+    else:
+        i, j = exchange.row, exchange.col
+        values = (jnp.asarray(x * scale[i] * scale[j] / area[i], dtype) for x in (exchange.data, errors))
+        factors = Sparse(jnp.asarray(i, jnp.int32), jnp.asarray(j, jnp.int32), *values)
+    return Operator(cells, factors, *_albedos_and_lights(scene, cells))
+
+
+def _closing(exchange, area):
+    """(U,) factors of rows and columns after which the rows of a symmetric matrix sum to the areas: no light is lost.
+
+    For a closed scene, whose form factors' errors would make light or lose it (van Leersum 1989, for two such sums).
+    """
+    scale = np.ones_like(area)
+    for _ in range(_SCALINGS):
+        wrong = scale * (exchange @ scale) / area
+        if np.abs(wrong - 1).max() < np.finfo(float).eps * len(area):
+            break
+        scale /= np.sqrt(np.where(wrong > 0, wrong, 1))
+    return scale
+
+
+def _albedos_and_lights(scene: Scene, patches: Patches):
+    """Albedo (U, 3) and emitted radiance (U, 3) of the patches."""
+
+    def of(table, rows):
+        # A row of black at the end stands for none.
+        return jnp.concatenate([table, jnp.zeros_like(table[:1])])[rows]
+
+    reflectance = next((t.reflectance for t in scene.materials.tables if isinstance(t, DiffuseTable)), None)
+    lights = scene.emitters.area
+    black = jnp.zeros((patches.count, 3), patches.area.dtype)
+    albedo = black if reflectance is None else of(reflectance, patches.row)
+    return albedo, black if lights is None else of(lights.radiance, patches.emitter)
+
+
+def _check_depth(depth):
+    if isinstance(depth, bool) or not isinstance(depth, int) or depth < 1:
+        raise InputError(f"depth = {depth!r}; a series has at least 1 term, which is the emission")
+
+
+def _norm(x):
+    return jnp.sqrt(jnp.sum(x * x))
+
+
+@jax.jit
+def _spectral_radius(op: Operator):
+    # T is symmetric in the inner product with weights A / albedo. In it the norms of T^k L grow by ever larger factors,
+    # towards the radius, also where -radius is an eigenvalue (two plates that see but each other).
+    tiny = jnp.finfo(op.Le.dtype).tiny
+
+    def norm(x):  # of albedo * x
+        return jnp.sqrt(jnp.sum(op.area[:, None] / jnp.sum(op.area) * op.albedo * x * x, 0))
+
+    def step(state):
+        k, x, last, _ = state
+        y = op.factors.mv(op.albedo * x)
+        size = norm(y)
+        return k + 1, y / jnp.maximum(size, tiny), size, last
+
+    def going(state):
+        k, _, now, last = state
+        return (k < 3) | (k < _MOST_POWERS) & jnp.any(now - last > jnp.finfo(now.dtype).eps * now)
+
+    x = jnp.ones_like(op.Le)
+    x = x / jnp.maximum(norm(x), tiny)
+    zero = jnp.zeros((3,), op.Le.dtype)
+    return lax.while_loop(going, step, (0, x, zero, zero))[2]
+
+
+@partial(jax.jit, static_argnames="count")
+def _add_terms(op: Operator, count):
+    def step(state, _):
+        term, total = state
+        term = op.T.mv(term)
+        return (term, total + term), None
+
+    return lax.scan(step, (op.Le, op.Le), length=count - 1)[0][1]
+
+
+@jax.jit
+def _gmres(op: Operator, tolerance):
+    # Radiances of order 1 in each channel: the tolerance is then relative, and counts for patches that emit nothing.
+    scale = lax.stop_gradient(jnp.max(op.Le, 0))
+    scale = jnp.where(scale > 0, scale, 1)
+    equation = op._function(lambda L: L - op.T.mv(L))
+    solver = lx.GMRES(rtol=tolerance, atol=tolerance, restart=_RESTART, max_steps=_MAX_RESTARTS)
+    return lx.linear_solve(equation, op.Le / scale, solver, throw=False).value * scale
+
+
+def _krylov_residuals(op: Operator, steps):
+    """Arnoldi's process (Saad and Schultz 1986), its small matrix in float64."""
+    apply = jax.jit(lambda op, L: L - op.T.mv(L))
+    size = float(_norm(op.Le))
+    basis = [op.Le / size]
+    H = np.zeros((steps + 1, steps))
+    residuals = [1.0]
+    for k in range(steps):
+        v = apply(op, basis[k])
+        for _ in range(2):  # again, for what rounding left
+            for i, q in enumerate(basis):
+                along = jnp.vdot(q, v)
+                H[i, k] += along
+                v = v - along * q
+        H[k + 1, k] = _norm(v)
+        basis.append(v / jnp.maximum(_norm(v), jnp.finfo(v.dtype).tiny))
+        target = np.eye(k + 2, 1)[:, 0]
+        small = H[: k + 2, : k + 1]
+        best, *_ = np.linalg.lstsq(small, target, rcond=None)
+        residuals.append(np.linalg.norm(target - small @ best))
+    return np.array(residuals)

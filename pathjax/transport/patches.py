@@ -1,0 +1,269 @@
+"""Patches: every primitive cut into cells of equal area, and which cell a point of it lies in.
+
+A side of a cell is a patch if it reflects or emits; other sides are black, as they are to the renderer. Rectangles are
+cut into parallelograms, disks by radius squared and angle, spheres by angle and height, triangles into similar ones.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from pathjax.bsdfs import DiffuseTable
+from pathjax.core.math import at, cos_sin_turns, cross, dot, normalize, rescale, safe_atan2, safe_sqrt
+from pathjax.core.warp import square_to_triangle
+from pathjax.errors import InputError
+from pathjax.scene import Scene
+from pathjax.shapes import geometry, planar, sphere, triangle
+from pathjax.shapes.geometry import Geometry
+from pathjax.shapes.planar import Planar
+from pathjax.shapes.sphere import Spheres
+from pathjax.shapes.triangle import Triangles
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Patches:
+    """U patches, the sides that are not black of C cells of Q primitives."""
+
+    first: jax.Array  # (Q,) int32 first cell of each primitive
+    grid: jax.Array  # (Q, 2) int32 cells along its two coordinates; of a triangle: cells along an edge, twice
+    primitive: jax.Array  # (C,) int32
+    place: jax.Array  # (C, 2) int32 in the grid; of a triangle: strip, and place in the strip
+    patch: jax.Array  # (2, C) int32 patch of the front and of the back of each cell; U: black
+    cell: jax.Array  # (U,) int32
+    back: jax.Array  # (U,) bool: the patch lies on the side that the normal points away from
+    area: jax.Array  # (U,)
+    row: jax.Array  # (U,) int32 row of the diffuse reflectances; -1: reflects nothing
+    emitter: jax.Array  # (U,) int32 row of the radiances of area lights; -1: emits nothing
+
+    @property
+    def count(self) -> int:
+        return self.cell.shape[0]
+
+
+def cut(scene: Scene, count: int, faceted: bool = False) -> Patches:
+    """Cut a scene into about `count` cells of about equal area, at least one for each primitive.
+
+    Raises:
+        InputError: nothing to cut, a primitive of zero area, or something that is not diffuse: named.
+    """
+    if not isinstance(count, int) or count < 1:
+        raise InputError(f"patches = {count}; a scene is cut into at least 1")
+    shapes = scene.geometry
+    if not shapes.tables:
+        raise InputError("a scene without shapes has no patches")
+    rows = _diffuse_rows(scene, faceted)
+    shape, light = np.asarray(shapes.shape), np.asarray(shapes.light)
+
+    area = np.concatenate([_areas(table) for table in shapes.tables])
+    if not (area > 0).all():
+        worst = _name(scene, shape[np.argmin(area > 0)])
+        raise InputError(f"{worst} has a part of area 0, which neither sends nor receives light; remove it")
+    size = math.sqrt(area.sum() / count)
+    grid = np.concatenate([_grid(table, size) for table in shapes.tables])
+    triangular = np.concatenate([np.full(len(_areas(t)), isinstance(t, Triangles)) for t in shapes.tables])
+    cells = np.prod(grid, axis=1)
+    first = np.cumsum([0, *cells])[:-1]
+    primitive = np.repeat(np.arange(len(cells)), cells)
+    local = np.arange(cells.sum()) - first[primitive]
+    place = np.stack([local // grid[primitive, 1], local % grid[primitive, 1]], -1)
+    # Strip a of a triangle cut k times holds 2 (k - a) - 1 cells, those before it a (2 k - a).
+    k = grid[primitive, 0]
+    strip = k - np.ceil(np.sqrt(np.maximum(k * k - local, 0))).astype(int)
+    place = np.where(triangular[primitive, None], np.stack([strip, local - strip * (2 * k - strip)], -1), place)
+
+    row = rows[shape[primitive]].T  # (2, C)
+    emitter = np.full_like(row, -1)
+    if scene.emitters.area is not None:
+        emitter[0] = np.where(light >= 0, np.asarray(scene.emitters.area.emitter)[light], -1)[primitive]
+    back, cell = np.nonzero((row >= 0) | (emitter >= 0))
+    if not len(cell):
+        raise InputError("everything in this scene is black: there is no light to transport")
+    patch = np.full(row.shape, len(cell))
+    patch[back, cell] = np.arange(len(cell))
+    dtype = scene.camera.origin.dtype
+    integers = (np.asarray(x, np.int32) for x in (first, grid, primitive, place, patch, cell))
+    rest = (area / cells)[primitive][cell].astype(dtype), row[back, cell], emitter[back, cell]
+    return jax.device_put(Patches(*integers, back.astype(bool), rest[0], *(x.astype(np.int32) for x in rest[1:])))
+
+
+def _name(scene, shape) -> str:
+    if scene.about is None:
+        return f"shape number {shape}"
+    return f"shape {scene.about.description.shapes[shape].name!r}"
+
+
+def _diffuse_rows(scene: Scene, faceted) -> np.ndarray:
+    """(S, 2) row of the reflectance of the front and the back of each shape; -1: reflects nothing."""
+    materials = scene.materials
+    sides = np.asarray(materials.sides)
+    rows = np.full(sides.shape[:2], -1)
+    for shape, side in np.ndindex(rows.shape):
+        kind, row = sides[shape, side]
+        if kind < 0:
+            continue
+        table = materials.tables[kind]
+        if not isinstance(table, DiffuseTable):
+            kind = type(table).__name__.removesuffix("Table").lower()
+            raise InputError(
+                f"{_name(scene, shape)} is a {kind}; patches send the same radiance in all directions, so all must be "
+                "diffuse. Use pathjax.render"
+            )
+        if table.texture is not None and table.texture[row] >= 0:
+            raise InputError(
+                f"{_name(scene, shape)} has a texture; a patch has one reflectance. Give it a constant one"
+            )
+        rows[shape, side] = row
+    if scene.emitters.constant is not None:
+        raise InputError("the scene has a constant emitter; patches hold the light of surfaces alone. Enclose it")
+    if not faceted and scene.about is not None:
+        for number, shape in enumerate(scene.about.description.shapes):
+            if getattr(shape.geometry, "normals", None) is not None:
+                raise InputError(
+                    f"{_name(scene, number)} has smooth normals, and patches are flat; load it with face_normals, or "
+                    "pass faceted=True to take its triangles as they are"
+                )
+    return rows
+
+
+def _areas(table) -> np.ndarray:
+    if isinstance(table, Planar):
+        return planar.area(np.asarray(table.frames, float), table.disk)
+    if isinstance(table, Spheres):
+        return sphere.area(np.asarray(table.balls, float))
+    return triangle.area(np.asarray(table.vertices, float))
+
+
+def _grid(table, size) -> np.ndarray:
+    """(P, 2) cells along the two coordinates of each primitive, whose sides are then about `size` long."""
+    area = _areas(table)
+    if isinstance(table, Planar) and not table.disk:
+        lengths = 2 * np.linalg.norm(np.asarray(table.frames, float)[:, 1:3], axis=-1)
+    elif isinstance(table, Triangles):
+        lengths = np.sqrt(area)[:, None].repeat(2, 1)
+    elif isinstance(table, Planar):
+        rings = np.maximum(np.rint(np.sqrt(area / math.pi) / size), 1)
+        lengths = np.stack([rings * size, area / (rings * size)], -1)
+    else:
+        belts = np.maximum(np.rint(np.sqrt(area / math.pi) / size), 1)
+        lengths = np.stack([area / (belts * size), belts * size], -1)
+    return np.maximum(np.rint(lengths / size), 1).astype(int)
+
+
+# ---- of one point ---------------------------------------------------------------------------------------------------
+
+
+def patch_at(patches: Patches, shapes: Geometry, primitive, p, back):
+    """Patch that a point of a surface belongs to.
+
+    Args:
+        primitive: () int32, of a hit; p: (3,) the point; back: () bool, the side that the normal points away from.
+    Returns:
+        () int32; `patches.count` where that side is black.
+    """
+    grid = at(patches.grid, primitive)
+
+    def place(table, row):
+        xy = _to_square(table, row, p)
+        if isinstance(table, Triangles):
+            k = grid[0]
+            a = jnp.clip(jnp.floor(xy[0] * k).astype(jnp.int32), 0, k - 1)
+            b = jnp.clip(jnp.floor(xy[1] * k).astype(jnp.int32), 0, k - 1 - a)
+            upper = (xy[0] + xy[1]) * k >= a + b + 1
+            return a * (2 * k - a) + jnp.minimum(2 * b + upper, 2 * (k - a - 1))
+        a, b = (jnp.clip(jnp.floor(xy[i] * grid[i]).astype(jnp.int32), 0, grid[i] - 1) for i in (0, 1))
+        return a * grid[1] + b
+
+    cell = at(patches.first, primitive) + _of_table(shapes, primitive, place)
+    return at(patches.patch, back.astype(jnp.int32), cell)
+
+
+def point(patches: Patches, shapes: Geometry, patch, u):
+    """Uniform point of a patch.
+
+    Args:
+        patch: () int32; u: (2,).
+    Returns:
+        primitive () int32, point (3,), unit normal (3,) on the patch's side, rounding error of the point along it ().
+    """
+    cell = at(patches.cell, patch)
+    primitive, place = at(patches.primitive, cell), at(patches.place, cell)
+    grid = at(patches.grid, primitive)
+
+    def place_of(table, row):
+        if not isinstance(table, Triangles):
+            return _from_square(table, row, (place + u) / grid)
+        # Cells of odd place are turned around.
+        corner = jnp.stack([place[0], place[1] // 2])
+        b, turned = square_to_triangle(u), place[1] % 2 == 1
+        return _from_square(table, row, (corner + jnp.where(turned, 1 - b, b)) / grid)
+
+    p, n, margin = _of_table(shapes, primitive, place_of)
+    return primitive, p, jnp.where(at(patches.back, patch), -n, n), margin
+
+
+def _of_table(shapes, primitive, f):
+    """f(table, row) of the table that holds the primitive."""
+    first = geometry.firsts(shapes)
+
+    def of(table, start):
+        return lambda: f(table, jnp.maximum(primitive - start, 0))
+
+    return geometry.switch_by_range(primitive, first, [of(*pair) for pair in zip(shapes.tables, first, strict=True)])
+
+
+def _to_square(table, row, p):
+    """Point of a primitive -> the two coordinates (2,) that its grid cuts; of triangles the barycentric ones."""
+    if isinstance(table, Spheres):
+        local = at(table.to_local, row) @ normalize(p - at(table.balls, row)[:3])
+        return jnp.stack([_turns(local[1], local[0]), (1 - local[2]) / 2])
+    if isinstance(table, Triangles):
+        corner, *others = at(table.vertices, row)
+        a, b = (other - corner for other in others)
+    else:
+        corner, a, b, _ = at(table.frames, row)
+    q = p - corner
+    aa, ab, bb, qa, qb = dot(a, a), dot(a, b), dot(b, b), dot(q, a), dot(q, b)
+    x, y = jnp.stack([bb * qa - ab * qb, aa * qb - ab * qa]) / (aa * bb - ab * ab)
+    if isinstance(table, Triangles):
+        return jnp.stack([x, y])
+    if table.disk:
+        return jnp.stack([x * x + y * y, _turns(y, x)])
+    return jnp.stack([(x + 1) / 2, (y + 1) / 2])
+
+
+def _turns(y, x):
+    angle = safe_atan2(y, x) / (2 * math.pi)
+    return jnp.where(angle < 0, angle + 1, angle)
+
+
+def _from_square(table, row, xy):
+    """The inverse: point (3,), normal (3,), rounding error of the point along it ()."""
+    if isinstance(table, Spheres):
+        center, radius = at(table.balls, row)[:3], at(table.balls, row)[3]
+        z = 1 - 2 * xy[1]
+        r = safe_sqrt(1 - z * z)
+        cos, sin = cos_sin_turns(xy[0])
+        outward = at(table.to_local, row).T @ jnp.stack([r * cos, r * sin, z])
+        reach, n = jnp.abs(center) + radius, outward * at(table.sign, row)
+        p = center + radius * outward
+    elif isinstance(table, Triangles):
+        vertices = at(table.vertices, row)
+        a, b = vertices[1] - vertices[0], vertices[2] - vertices[0]
+        reach, n = jnp.max(jnp.abs(vertices), 0), normalize(cross(rescale(a), rescale(b)))
+        p = vertices[0] + xy[0] * a + xy[1] * b
+    else:
+        center, a, b, n = at(table.frames, row)
+        if table.disk:
+            cos, sin = cos_sin_turns(xy[1])
+            x, y = safe_sqrt(xy[0]) * cos, safe_sqrt(xy[0]) * sin
+        else:
+            x, y = 2 * xy[0] - 1, 2 * xy[1] - 1
+        reach = jnp.abs(center) + jnp.abs(a) + jnp.abs(b)
+        p = center + x * a + y * b
+    return p, n, dot(jnp.abs(n), reach) * (4 * jnp.finfo(p.dtype).eps)

@@ -1,0 +1,83 @@
+"""Form factors by ray casting: for any shapes, and without a number for each pair of patches."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from scipy import sparse
+
+from pathjax.core import sampler
+from pathjax.core.math import dot, frame_from_normal, spawn_ray, to_world
+from pathjax.core.types import Surface
+from pathjax.core.warp import square_to_cosine_hemisphere
+from pathjax.runtime import native_map
+from pathjax.scene import Scene
+from pathjax.shapes import geometry
+from pathjax.transport.patches import Patches, patch_at, point
+
+# Rays of one call of the kernel: what they hit takes some tens of megabytes.
+_RAYS_PER_CALL = 1 << 22
+
+
+def cast(scene: Scene, patches: Patches, rays: int, seed: int) -> tuple[sparse.csr_array, np.ndarray, np.ndarray]:
+    """How many of the rays that each patch sends, uniform in area and by the cosine in direction, meet each other one.
+
+    Args:
+        rays: on the mean of all patches, of which each sends half, and more of the other half the larger it is: so that
+            those of a fine mesh do not take all.
+    Returns:
+        counts (U, U) sparse, of rays from the patch of the row to that of the column; sent (U,), rays of each patch;
+        and lost (U,), those that met nothing or a side that is black.
+    """
+    count, area = patches.count, np.asarray(patches.area, float)
+    sent = np.maximum(np.rint(rays / 2 * (1 + area / area.mean())), 1).astype(int)
+    first = np.cumsum([0, *sent])
+    counts, lost = sparse.csr_array((count, count)), np.zeros(count)
+    each = min(_RAYS_PER_CALL, first[-1])
+    for start in range(0, first[-1], each):
+        # The last call repeats its last ray up to full length.
+        ray = np.minimum(np.arange(start, start + each), first[-1] - 1)
+        sender = np.searchsorted(first, ray, side="right") - 1
+        work = (x.astype(np.int32) for x in (sender, ray - first[sender]))
+        met = np.asarray(_cast(scene.geometry, patches, *work, np.uint32(seed)))
+        sender, met = (x[: first[-1] - start] for x in (sender, met))
+        found = met < count
+        lost += np.bincount(sender[~found], minlength=count)
+        ones = np.ones(np.count_nonzero(found))
+        counts = counts + sparse.csr_array((ones, (sender[found], met[found])), shape=(count, count))
+    return counts, sent, lost
+
+
+@partial(jax.jit, static_argnames=("form", "devices"))
+def _cast(shapes, patches, sender, number, seed, form=None, devices=None):
+    return native_map(_one, (sender, number), shapes, patches, seed, form=form, devices=devices)
+
+
+def _one(work, shapes, patches, seed):
+    """Patch that ray `number` of the patch `sender` meets."""
+    sender, number = work
+    stream = sampler.pixel_stream(seed, sender)
+    numbers = (sampler.sobol_pair(stream, number, pair) for pair in (0, 1))
+    u, u_direction = lax.optimization_barrier(tuple(x.astype(patches.area.dtype) for x in numbers))
+    primitive, p, n, margin = point(patches, shapes, sender, u)
+    d = to_world(frame_from_normal(n), square_to_cosine_hemisphere(u_direction))
+    ray = lax.optimization_barrier(spawn_ray(Surface(p, n, margin, n, u), d, primitive))
+    hit = geometry.closest_hit(shapes, ray)
+    surface = geometry.surface(shapes, ray, hit)
+    met = patch_at(patches, shapes, jnp.maximum(hit.primitive, 0), surface.p, dot(surface.n, d) > 0)
+    return jnp.where(hit.primitive >= 0, met, patches.count)
+
+
+def exchange(counts: sparse.csr_array, density: np.ndarray) -> tuple[sparse.coo_array, np.ndarray]:
+    """A_i F_ij, symmetric, from the rays of both patches, and its standard errors at the same places.
+
+    Rays from i to j estimate A_i F_ij as do those from j to i. With n_i = rays / A_i, the density (U,),
+    (counts_ij + counts_ji) / (n_i + n_j) is unbiased and, as counts are Poisson's, of the least variance.
+    """
+    both = sparse.coo_array(counts + counts.T)
+    scale = 1 / (density[both.row] + density[both.col])
+    return sparse.coo_array((both.data * scale, (both.row, both.col)), shape=both.shape), np.sqrt(both.data) * scale

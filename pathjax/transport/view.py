@@ -1,0 +1,84 @@
+"""Light on patches, looked up: at a point of a surface, and through the camera."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from pathjax import film
+from pathjax.core import sampler
+from pathjax.core.math import at, dot
+from pathjax.errors import InputError
+from pathjax.integrators.path import check_sampling
+from pathjax.integrators.pixel import camera_path
+from pathjax.runtime import native_map
+from pathjax.scene import Scene
+from pathjax.shapes import geometry
+from pathjax.shapes.geometry import Geometry
+from pathjax.transport.patches import Patches, patch_at
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Radiosity:
+    """Light on the patches of a scene, to be looked up within kernels: pass it to them whole, as the scene."""
+
+    patches: Patches
+    L: jax.Array  # (U + 1, 3) radiance that leaves each patch; the last, black, stands for what is no patch
+
+
+def radiosity(patches: Patches, L) -> Radiosity:
+    """L: (U, 3)."""
+    return Radiosity(patches, jnp.concatenate([L, jnp.zeros_like(L[:1])]))
+
+
+def radiance(light: Radiosity, shapes: Geometry, primitive, p, back):
+    """Radiance (3,) that leaves a point of a surface, emission included; a look-up, for code of one ray.
+
+    Args:
+        shapes: geometry of the scene that was cut into patches, or of one with other colours.
+        primitive: () int32, of a hit; p: (3,) the point of `geometry.surface`.
+        back: () bool, seen from the side that the geometric normal points away from: dot(surface.n, ray.d) > 0.
+    """
+    return at(light.L, patch_at(light.patches, shapes, primitive, p, back))
+
+
+def image(scene: Scene, light: Radiosity, spp: int = 16, seed: int = 0) -> jax.Array:
+    """What the camera sees of the light on patches: (H, W, 3).
+
+    Rays are those of `pathjax.render` of the same spp and seed, so the two images share what the film's sampling does;
+    nothing else is random. Linear in `light.L`, and differentiable in it.
+
+    Raises:
+        InputError: spp or seed out of range; a scene that hides its emitters.
+    """
+    check_sampling("mis", spp, seed)
+    if scene.hide_emitters:
+        raise InputError(
+            "this scene hides its emitters from the camera, and patches show them; load it with hide_emitters false"
+        )
+    pixels = jnp.arange(film.pixel_count(scene.film), dtype=jnp.int32)
+    total = 0
+    for number in range(spp):
+        patch, weight = _seen(replace(scene, about=None), light.patches, pixels, jnp.uint32(number), jnp.uint32(seed))
+        total = total + weight[:, None] * light.L[patch]
+    return (total / spp).reshape(*film.image_shape(scene.film), 3)
+
+
+@partial(jax.jit, static_argnames=("form", "devices"))
+def _seen(scene, patches, pixels, number, seed, form=None, devices=None):
+    return native_map(_one, pixels, scene, patches, number, seed, form=form, devices=devices)
+
+
+def _one(pixel, scene, patches, number, seed):
+    """Patch that the ray of a sample meets, and the sample's weight."""
+    start, weight = camera_path(scene, pixel, sampler.pixel_stream(seed, pixel), number)
+    hit = geometry.closest_hit(scene.geometry, start.ray)
+    surface = geometry.surface(scene.geometry, start.ray, hit)
+    primitive = jnp.maximum(hit.primitive, 0)
+    patch = patch_at(patches, scene.geometry, primitive, surface.p, dot(surface.n, start.ray.d) > 0)
+    return jnp.where(hit.primitive >= 0, patch, patches.count), lax.stop_gradient(weight)

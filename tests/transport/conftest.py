@@ -1,0 +1,22 @@
+"""The Cornell box without its boxes."""
+
+from dataclasses import replace
+
+import jax.numpy as jnp
+import pytest
+
+from pathjax import description as desc
+from pathjax.io import mitsuba_xml
+from pathjax.scene import build
+
+
+@pytest.fixture(scope="session")
+def empty_cornell(root):
+    """(dtype, **parameters) -> Scene."""
+
+    def load(dtype=jnp.float32, **parameters):
+        full = mitsuba_xml.load(root / "scenes" / "cornell_box.xml", **parameters)
+        walls = tuple(shape for shape in full.shapes if not isinstance(shape.geometry, desc.Cube))
+        return build(replace(full, shapes=walls), dtype)
+
+    return load
