@@ -28,7 +28,8 @@ def schlick(cos_i, eta):
     """Schlick's approximation of `dielectric` (1994, Computer Graphics Forum 13(3)); exact are normal incidence, total
     internal reflection and the cosine of refraction.
 
-    The angle is that on the thinner side, so that light going back sees the same reflectance.
+    The angle is that on the thinner side, so that light going back sees the same reflectance. Wrong most at grazing
+    angles: by 0.036 at 85 degrees and IOR 1.5; even equal media reflect, (1 - cos)^5.
     """
     _, refracts, cos_t = _refraction(cos_i, eta)
     r0 = ((eta - 1) / (eta + 1)) ** 2
