@@ -1,10 +1,10 @@
 """Random numbers as a function: (seed, pixel, sample, dimension) -> (0, 1), float32, odd multiples of 2^-24.
 
-The points of a pixel's paths are a rank-1 lattice in many dimensions at once, ordered by the radical inverse so that any
-first 2^m of them are a lattice too, and moved as a whole by a random shift (Dick, Kuo and Sloan 2013, Acta Numerica 22).
-Every number is then uniform and the estimate unbiased; what a path decides at several vertices is stratified jointly,
-which padded pairs of a Sobol' sequence are not, for two multiplications. Roulette is hashed. Every pixel and every seed
-is an independent randomisation. POINTS holds what classic path tracers use instead, for comparison.
+The points of a pixel's paths are a rank-1 lattice in many dimensions at once, ordered by the radical inverse so that
+the first 2^m of them are a lattice for every m, and moved as a whole by a random shift (Dick, Kuo and Sloan 2013, Acta
+Numerica 22). So every number is uniform and the estimate unbiased, and what a path decides at several vertices is
+stratified jointly, which padded pairs of a Sobol' sequence are not. Choices are hashed. Every pixel and every seed is
+an independent randomisation. POINTS holds what classic path tracers use instead, for comparison.
 """
 
 from __future__ import annotations

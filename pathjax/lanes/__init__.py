@@ -19,10 +19,9 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from pathjax.lanes.flow import own_loop
+from pathjax.lanes.flow import flags_of, own_loop
 from pathjax.lanes.machine import Lanes, one_by_one
 from pathjax.lanes.queue import from_queue, in_groups
-
 
 __all__ = ["lanes", "one_by_one"]
 
@@ -41,11 +40,12 @@ def lanes(f: Callable, width: int) -> Callable:
         # True, and no pass over HLO knows it.
         always = lax.population_count(xs[0].ravel()[0].astype(jnp.int32)) >= 0
         machine = Lanes(width, always)
-        place = own_loop(program, [True] * len(xs) + [False] * len(shared))
+        flags = flags_of(program, [True] * len(xs) + [False] * len(shared))
+        place = own_loop(program, flags)
         if place is None:
             outputs = in_groups(machine, program, xs, shared)
         else:
-            outputs = from_queue(machine, program, xs, shared, place)
+            outputs = from_queue(machine, program, xs, shared, place, flags)
         return jax.tree.unflatten(jax.tree.structure(out), outputs)
 
     return run

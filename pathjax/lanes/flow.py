@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from jax.extend import core
 
 
@@ -46,34 +48,33 @@ def settled(step, flags: list[bool]) -> list[bool]:
     return flags
 
 
-def flow(program: core.ClosedJaxpr, differing: list[bool]) -> list[bool]:
-    """Which results may differ between lanes if these inputs do."""
-    *_, flags = flags_along(program, differing)
-    return flags(program.jaxpr.outvars)
-
-
-def flags_along(program: core.ClosedJaxpr, differing: list[bool]):
-    """Before each equation, and at the end: a function from atoms to whether each may differ."""
+def flags_of(program: core.ClosedJaxpr, differing: list[bool]) -> Callable:
+    """A function from atoms of a program to whether each may differ between lanes if these inputs do."""
     known = {v for v, d in zip(program.jaxpr.invars, differing, strict=True) if d}
 
-    def flags(atoms):
+    def flags(atoms) -> list[bool]:
         return [not isinstance(atom, core.Literal) and atom in known for atom in atoms]
 
     for eqn in program.jaxpr.eqns:
-        yield flags
         known.update(v for v, d in zip(eqn.outvars, eqn_flow(eqn, flags(eqn.invars)), strict=True) if d)
-    yield flags
+    return flags
 
 
-def own_loop(program: core.ClosedJaxpr, differing: list[bool]) -> int | None:
+def flow(program: core.ClosedJaxpr, differing: list[bool]) -> list[bool]:
+    """Which results may differ."""
+    return flags_of(program, differing)(program.jaxpr.outvars)
+
+
+def own_loop(program: core.ClosedJaxpr, flags: Callable) -> int | None:
     """Number of the last equation of a program that is a loop which lanes leave at different times."""
-    last = None
-    for number, (eqn, flags) in enumerate(zip(program.jaxpr.eqns, flags_along(program, differing), strict=False)):
-        if eqn.primitive.name == "while":
-            test_consts, _, _ = while_parts(eqn, flags(eqn.invars))
-            (leaves,) = flow(eqn.params["cond_jaxpr"], test_consts + eqn_flow(eqn, flags(eqn.invars)))
-            last = number if leaves else last
-    return last
+
+    def leaves_alone(eqn):
+        if eqn.primitive.name != "while":
+            return False
+        test_consts, *_ = while_parts(eqn, flags(eqn.invars))
+        return any(flow(eqn.params["cond_jaxpr"], test_consts + flags(eqn.outvars)))
+
+    return max((number for number, eqn in enumerate(program.jaxpr.eqns) if leaves_alone(eqn)), default=None)
 
 
 def eqn_flow(eqn, inputs: list[bool]) -> list[bool]:

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from functools import partial
 
 import jax.numpy as jnp
 from jax import lax
 
-from pathjax.lanes.flow import eqn_flow, read_by, variables, while_parts
-from pathjax.lanes.machine import Lanes
 from pathjax.core.math import at
-from pathjax.lanes.values import differs, join, rows, split
+from pathjax.lanes.flow import read_by, variables, while_parts
+from pathjax.lanes.machine import Lanes
+from pathjax.lanes.values import join, split
 
 
 def in_groups(machine: Lanes, program, xs, shared):
@@ -27,35 +28,38 @@ def in_groups(machine: Lanes, program, xs, shared):
     return [y.reshape(groups * width, *y.shape[2:])[:count] for y in lax.map(one_group, list(map(grouped, xs)))]
 
 
-def from_queue(machine: Lanes, program, xs, shared, place):
-    """The same where equation `place` of the program is its `own_loop`: a lane that leaves it takes the next item."""
+def from_queue(machine: Lanes, program, xs, shared, place, flags):
+    """The same where equation `place` of the program is its `own_loop`: a lane that leaves it takes the next item.
+
+    flags: of `flags_of`.
+    """
     width, count, jaxpr = machine.width, len(xs[0]), program.jaxpr
     before, loop, after = jaxpr.eqns[:place], jaxpr.eqns[place], jaxpr.eqns[place + 1 :]
     test_consts, body_consts, init = while_parts(loop, loop.invars)
 
-    def values_of(items, common):
-        """What is known before the loop; common: what all items share, where it is known already."""
-        values = machine.environment(program, [*(rows(x, items) for x in xs), *shared]) | common
+    def begin(item, common):
+        """Values before the loop, of one item; common: what all items share, where it is known already."""
+        values = machine.environment(program, [*(at(x, item) for x in xs), *shared]) | common
         machine.run_equations([eqn for eqn in before if any(v not in common for v in eqn.outvars)], values)
-        return values
+        return values | {v: machine.read(values, atom) for v, atom in zip(loop.outvars, init, strict=True)}
 
-    first = values_of(jnp.zeros((width,), jnp.int32), {})
-    common = {v: value for v, value in first.items() if not differs(value)}
+    first = begin(jnp.int32(0), {})
+    common = {v: value for v, value in first.items() if v not in loop.outvars and not flags([v])[0]}
+    # What a lane keeps of its item: what is made of it before the loop and read later, then what the loop carries.
     read_later = read_by(after) | variables([*test_consts, *body_consts, *jaxpr.outvars])
-    own = [v for v in first if v in read_later and v not in common]
-    # What a lane keeps of its item: what is known of it, then what the loop carries.
+    own = [v for v in first if v in read_later and v not in common and v not in loop.outvars]
     kept = [*own, *loop.outvars]
-    flags = [True] * len(own) + eqn_flow(loop, [differs(machine.read(first, v)) for v in loop.invars])
+    differing = [True] * len(own) + flags(loop.outvars)
     shapes = [v.aval.shape for v in kept]
 
-    def part(state, atoms):
-        return [machine.read(state, v) for v in atoms]
+    def part(values, atoms):
+        return [machine.read(values, v) for v in atoms]
 
     def unpacked(packed):
-        return common | dict(zip(kept, machine.unpack(packed, flags, shapes), strict=True))
+        return common | dict(zip(kept, machine.unpack(packed, differing, shapes), strict=True))
 
     def packed_from(values):
-        return machine.pack([values[v] for v in kept], flags)
+        return machine.pack([values[v] for v in kept], differing)
 
     def awaits(state):
         """(W,) whether a lane is done with its item, or has none while some are left."""
@@ -65,41 +69,53 @@ def from_queue(machine: Lanes, program, xs, shared, place):
         return jnp.where(item < count, ~goes_on.item(), following < count)
 
     def serve(state):
-        """Put results away, and begin other items."""
-        following, item, packed, results = state
-        waits = awaits(state)
-        old = unpacked(packed)
-        ended = dict(old)
-        machine.run_equations(after, ended)
-        joined = [join(value, width) for value in part(ended, jaxpr.outvars)]
+        """Put results away and begin other items, lane by lane."""
+        waits = jnp.concatenate([awaits(state), jnp.array([True])])
 
-        def of_lane(lane, state):
-            def put():
-                following, item, results = state
-                mine = at(item, lane)
-                # A lane without an item writes what its next one overwrites.
-                results = [
-                    lax.dynamic_update_index_in_dim(result, at(value, lane), jnp.minimum(mine, following), 0)
-                    for result, value in zip(results, joined, strict=True)
-                ]
-                return following + 1, item.at[lane].set(following), results
+        def seek(lane):
+            """The next that waits; W: none."""
+            return lax.while_loop(lambda k: ~at(waits, k), lambda k: k + 1, lane)
 
-            return lax.cond(at(waits, lane), put, lambda: state)
+        def serve_one(state):
+            lane, (following, item, packed, results) = state
+            ended = common | dict(zip(kept, map(partial(of_lane, lane), packed, differing, shapes), strict=True))
+            machine.run_equations(after, ended)
+            # A lane without an item writes what its next one overwrites.
+            row = jnp.minimum(at(item, lane), following)
+            outputs = zip(results, part(ended, jaxpr.outvars), strict=True)
+            results = [lax.dynamic_update_index_in_dim(result, value, row, 0) for result, value in outputs]
+            begun = begin(jnp.minimum(following, count - 1), common)
+            packed = [
+                [put(column, x, lane) for column, x in zip(columns, jnp.ravel(begun[v]), strict=True)] if d else columns
+                for v, columns, d in zip(kept, packed, differing, strict=True)
+            ]
+            return seek(lane + 1), (following + 1, put(item, following, lane), packed, results)
 
-        following, item, results = lax.fori_loop(0, width, of_lane, (following, item, results))
-        begun = values_of(jnp.minimum(item, count - 1), common)
-        begun |= zip(loop.outvars, part(begun, init), strict=True)
-        new = {v: machine.select(waits, old[v], begun[v]) if f else old[v] for v, f in zip(kept, flags, strict=True)}
-        return following, item, packed_from(new), results
+        return lax.while_loop(lambda state: state[0] < width, serve_one, (seek(jnp.int32(0)), state))[1]
 
     def trip(state):
-        following, item, packed, results = lax.while_loop(lambda s: jnp.any(awaits(s)), serve, state)
+        following, item, packed, results = lax.while_loop(lambda state: jnp.any(awaits(state)), serve, state)
         values = unpacked(packed)
         new = machine.run(loop.params["body_jaxpr"], part(values, [*body_consts, *loop.outvars]))
         return following, item, packed_from(values | dict(zip(loop.outvars, new, strict=True))), results
 
-    first |= zip(loop.outvars, part(first, init), strict=True)
+    copies = [
+        split(jnp.broadcast_to(first[v], (width, *v.aval.shape))) if d else first[v]
+        for v, d in zip(kept, differing, strict=True)
+    ]
+    packed = machine.pack(copies, differing)
     results = [jnp.zeros((count, *v.aval.shape), v.aval.dtype) for v in jaxpr.outvars]
-    state = jnp.int32(0), jnp.full((width,), count, jnp.int32), packed_from(first), results
+    state = jnp.int32(0), jnp.full((width,), count, jnp.int32), packed, results
     *_, results = lax.while_loop(lambda s: (s[0] < count) | jnp.any(s[1] < count), trip, state)
     return results
+
+
+def of_lane(lane, columns, differs, shape):
+    """A packed value, as one lane has it."""
+    if not differs:
+        return columns
+    return jnp.stack([at(column, lane) for column in columns]).reshape(shape) if columns else jnp.zeros(shape)
+
+
+def put(column, x, lane):
+    return lax.dynamic_update_index_in_dim(column, x, lane, 0, allow_negative_indices=False)
