@@ -1,7 +1,8 @@
 """Paths that follow both branches of their first dielectrics, one after the other.
 
-Branches that wait are kept with the path: a stack, whose depth is fixed. A branch that may split k times more lies in
-entry k. What a branch leaves behind may split less often than itself, so entries below are older, and none is taken.
+Branches that wait are kept with the path: a stack of fixed depth. One that may split k times more lies in entry k. What
+a path leaves behind may split less often than all that waits already, so no entry is needed twice, and the lowest
+that is taken is the youngest.
 """
 
 from __future__ import annotations
