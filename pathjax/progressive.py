@@ -60,7 +60,8 @@ def extend(scene: Scene, state: State, seed: int, strategy: str) -> Iterator[Non
         for first in range(0, missing.size, chunk):
             pixels = missing[first : first + chunk]
             before = state.count[pixels]
-            after = before + np.minimum(np.clip(3 * before, replicates.COUNT, MAX_PASS_SPP), state.goal[pixels] - before)
+            portion = np.clip(3 * before, replicates.COUNT, MAX_PASS_SPP)
+            after = before + np.minimum(portion, state.goal[pixels] - before)
             first_sample = replicates.shares(before)
             spp = replicates.shares(after) - first_sample
             means = _call(scene, chunk, pixels, first_sample, spp, seeds, strategy)

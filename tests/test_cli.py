@@ -177,7 +177,8 @@ def test_an_error_that_is_not_reached_is_a_failure(run, tmp_path, limit, reason,
 
 def test_checkpoint_is_taken_up(run, tmp_path):
     files = ("-o", tmp_path / "a.exr", "--checkpoint", tmp_path / "run.npz")
-    assert run("render", FURNACE, *SMALL, *files, "--spp", 8)[0] == 0
+    # Portions of 4 and 12, as without a stop.
+    assert run("render", FURNACE, *SMALL, *files, "--spp", 4)[0] == 0
     assert run("render", FURNACE, *SMALL, *files, "--spp", 16)[0] == 0
     expected = pj.render_until(pj.load_scene(FURNACE, res=8), spp=16).image
     np.testing.assert_array_equal(read_exr(tmp_path / "a.exr")[0]["R"], expected[..., 0])
@@ -520,7 +521,7 @@ def test_interrupt_keeps_what_is_done(interrupt, tmp_path):
     assert report["interrupted"] is True
     assert 0 < report["spp"] < 1_000_000
     channels, header = read_exr(output)
-    assert report["fewest_spp"] < report["spp"] < report["most_spp"]
+    assert report["fewest_spp"] <= report["spp"] <= report["most_spp"]
     assert header["pathjax.spp"] == pytest.approx(report["spp"])
     assert channels["R"].shape == (256, 256)
     assert np.isfinite(channels["R"]).all() and (channels["R"] > 0).mean() > 0.5
