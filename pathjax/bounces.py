@@ -46,12 +46,18 @@ class Bounces:
         return np.stack([estimate.standard_error(*term, count) for term in zip(images, variances, strict=True)])
 
     def tail(self) -> tail.Tail:
-        """How much light there is beyond these terms, in the mean over the image.
+        """How much light there is beyond these terms, in the mean over the pixels that are finite.
 
         Raises:
-            InputError: fewer than 3 terms.
+            InputError: fewer than 3 terms, or no such pixel.
         """
-        return _tail(*(np.asarray(x).reshape(len(x), -1, 3) for x in (self.terms, self.variance)))
+        means, variance = (np.asarray(x, float).reshape(len(x), -1, 3) for x in (self.terms, self.variance))
+        known = np.isfinite(means).all((0, 2))
+        if not known.any():
+            raise InputError("no pixel is finite, so nothing can be told of the light beyond these terms")
+        # Pixels are independent of each other.
+        error = np.sqrt(variance[:, known].sum(1)) / known.sum()
+        return tail.fit(means[:, known].mean(1), error)
 
 
 def render_bounces(
@@ -59,10 +65,10 @@ def render_bounces(
 ) -> Bounces:
     """An image of each of the first `depth` terms of L = Le + T Le + T^2 Le + ..., from the same paths.
 
-    Their sum is, to rounding, the image with max_depth = depth of `render_until(scene, spp=spp, seed=seed)`: the mean of
-    four replicates, whose spread gives the standard errors. With `errors=False` there is one sequence and no standard
-    error, and the sum is that of `render(scene, spp, seed)`. The scene's own max_depth does not count. Either costs
-    about as much as `render`.
+    Their sum is, to rounding, the image with max_depth = depth that `render_until(scene, spp=spp, seed=seed)` gives:
+    the mean of four replicates, whose spread tells the standard errors. With `errors=False` there is one sequence and
+    no standard error, and the sum is that of `render(scene, spp, seed)`. Either costs about as much as `render`. The
+    scene's own max_depth does not count.
 
     Pure; may be called inside `jax.jit`, under `jax.vmap`, and `terms` be differentiated in named reflectances,
     radiances and other colours, as `render`, forwards or backwards. `variance` has no derivative.
@@ -73,74 +79,29 @@ def render_bounces(
         seed, strategy: of `render`.
         errors: estimate the variance.
     Raises:
-        InputError: depth, spp or seed out of range, unknown strategy; differentiation in the IOR of glass or in anything
-            but named parameters.
+        InputError: depth, spp or seed out of range, unknown strategy; differentiation in the IOR of glass or in
+            anything but named parameters.
     """
     _check_depth(depth)
     path.check_sampling(strategy, spp, seed)
-    count = film.pixel_count(scene.film)
-    samples = jnp.broadcast_to(jnp.asarray(spp, jnp.int32).ravel(), (count,))
-    portions = 1 if isinstance(spp, jax.core.Tracer) else _portions(int(np.max(spp)), errors)
-    pixels = jnp.arange(count, dtype=jnp.int32)
     shape = film.image_shape(scene.film)
-    means, variance = _terms(scene, depth, pixels, samples, seed, strategy, errors, portions)
-    return Bounces(*(x.reshape(depth, *shape, 3) for x in (means, variance)), samples.reshape(shape))
+    pixels = jnp.arange(film.pixel_count(scene.film), dtype=jnp.int32).reshape(shape)
+    return _bounces(scene, int(depth), pixels, spp, seed, strategy, errors)
 
 
 def pilot(scene: Scene, seed: int = 0) -> tail.Tail:
     """The Tail after 12 terms, from 64 samples of at most 4096 pixels, spread evenly over the image."""
     count = film.pixel_count(scene.film)
-    pixels = jnp.asarray(np.unique(np.linspace(0, count - 1, min(PILOT_PIXELS, count)).astype(np.int32)))
-    samples = jnp.full(pixels.shape, PILOT_SPP, jnp.int32)
-    return _tail(*map(np.asarray, _terms(scene, PILOT_TERMS, pixels, samples, seed)))
-
-
-def _tail(means, variance):
-    """Of (depth, N, 3). Pixels are independent of each other."""
-    known = np.isfinite(means).all((0, 2))
-    if not known.any():
-        raise InputError("no pixel is finite, so nothing can be told of the light beyond these terms")
-    means, variance = means[:, known].astype(float), np.nan_to_num(variance[:, known]).astype(float)
-    return tail.fit(means.mean(1), np.sqrt(variance.sum(1)) / known.sum())
+    some = np.unique(np.linspace(0, count - 1, min(PILOT_PIXELS, count)).astype(np.int32))
+    return _bounces(scene, PILOT_TERMS, jnp.asarray(some)[None], PILOT_SPP, seed, "mis", True).tail()
 
 
 def _check_depth(depth) -> None:
     if isinstance(depth, bool) or not isinstance(depth, int | np.integer) or not 1 <= depth <= MOST_TERMS:
         raise InputError(
-            f"depth = {depth!r}; it is the number of terms Le, T Le, T^2 Le, ..., an integer in [1, {MOST_TERMS}]: each "
-            "is an image of its own, and 1 is emission alone"
+            f"depth = {depth!r}; it is the number of terms Le, T Le, T^2 Le, ..., an integer in [1, {MOST_TERMS}]: "
+            "without a term there is no image, and 1 is emission alone"
         )
-
-
-def _portions(spp: int, errors: bool) -> int:
-    return -(-spp // (_PORTION * (replicates.COUNT if errors else 1)))
-
-
-def _terms(scene, depth, pixels, samples, seed, strategy="mis", errors=True, portions=1):
-    """Means and their variances (depth, N, 3) of some pixels (N,); samples: (N,), rendered in some portions."""
-    shares = replicates.shares(samples) if errors else samples[None]
-    seeds = replicates.seeds(seed) if errors else jnp.asarray(seed, jnp.uint32)[None]
-    tiled = jnp.tile(pixels, len(shares))
-    static = _Static(differentiable(scene), int(depth), strategy)
-    scene = replace(scene, max_depth=jnp.int32(depth), about=None)
-    total = 0
-    for first in range(0, portions * _PORTION, _PORTION):
-        spp = shares if portions == 1 else jnp.clip(shares - first, 0, _PORTION)
-        numbers = pixel.numbers(tiled, first, spp.ravel(), jnp.repeat(seeds, len(pixels)))
-        total = total + _term_sums(static, scene, tiled, *numbers)
-    return _moments(total.reshape(len(shares), len(pixels), depth, 3), shares)
-
-
-@jax.jit
-def _moments(sums, shares):
-    """Means and their variances (depth, N, 3), of sums (R, N, depth, 3) of (R, N) samples; see `replicates.moments`."""
-    n = shares[..., None, None].astype(sums.dtype)
-    count = jnp.maximum(n.sum(0), 1)
-    mean = sums.sum(0) / count
-    spread = (n * (sums / jnp.maximum(n, 1) - mean) ** 2).sum(0) / count
-    freedom = jnp.sum(n > 0, 0) - 1
-    variance = jnp.where(freedom > 0, spread / jnp.maximum(freedom, 1), jnp.nan)
-    return jnp.moveaxis(mean, 1, 0), lax.stop_gradient(jnp.moveaxis(variance, 1, 0))
 
 
 @dataclass(frozen=True)
@@ -148,6 +109,45 @@ class _Static:
     wanted: tuple[tuple[str, Parameter], ...]  # parameters in which a derivative may be wanted
     depth: int
     strategy: str
+
+
+def _bounces(scene, depth, pixels, spp, seed, strategy, errors) -> Bounces:
+    """Of pixels (H, W)."""
+    samples = jnp.broadcast_to(jnp.asarray(spp, jnp.int32), pixels.shape)
+    shares = replicates.shares(samples.ravel()) if errors else samples.reshape(1, -1)
+    seeds = replicates.seeds(seed) if errors else jnp.asarray(seed, jnp.uint32)[None]
+    most = None if isinstance(shares, jax.core.Tracer) else int(shares.max())
+    static = _Static(differentiable(scene), depth, strategy)
+    scene = replace(scene, max_depth=jnp.int32(depth), about=None)
+    if most is None or most <= _PORTION:
+        sums = _replicate_sums(scene, pixels.ravel(), 0, shares, seeds, static=static)
+    else:
+        sums = 0
+        for first in range(0, most, _PORTION):
+            portion = jnp.clip(shares - first, 0, _PORTION)
+            sums = sums + _replicate_sums(scene, pixels.ravel(), first, portion, seeds, static=static)
+    return Bounces(*_moments(sums, shares, shape=pixels.shape), samples)
+
+
+@partial(jax.jit, static_argnames="shape")
+def _moments(sums, shares, *, shape):
+    """Means and their variances (depth, H, W, 3), of sums (R, N, depth, 3) of (R, N) samples; `replicates.moments`."""
+    sums, shares = list(sums), [x[:, None, None].astype(sums.dtype) for x in shares]  # a loop over them vectorises
+    count = jnp.maximum(sum(shares), 1)
+    mean = sum(sums) / count
+    spread = sum(n * (x / jnp.maximum(n, 1) - mean) ** 2 for x, n in zip(sums, shares, strict=True)) / count
+    freedom = sum(n > 0 for n in shares) - 1
+    variance = jnp.where(freedom > 0, spread / jnp.maximum(freedom, 1), jnp.nan)
+    depth = mean.shape[1]
+    return tuple(jnp.moveaxis(x, 1, 0).reshape(depth, *shape, 3) for x in (mean, lax.stop_gradient(variance)))
+
+
+@partial(jax.jit, static_argnames="static")
+def _replicate_sums(scene, pixels, first_sample, spp, seeds, *, static):
+    """(R, N, depth, 3) sums of pixels (N,); spp: (R, N) of each replicate."""
+    tiled = jnp.tile(pixels, len(seeds))
+    numbers = pixel.numbers(tiled, first_sample, spp.ravel(), jnp.repeat(seeds, len(pixels)))
+    return _term_sums(static, scene, tiled, *numbers).reshape(*spp.shape, static.depth, 3)
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))

@@ -220,7 +220,7 @@ def _tables(colors):
 
 
 def unit_tangents(scene, colors):
-    """A unit change of all channels of each entry, a path and an index: for every table (entries, *shape of the table)."""
+    """A unit change of all channels of each entry: for every table (entries, *shape of the table)."""
     tangents = []
     for table_path in _tables(colors):
         table = named.get(scene, table_path)

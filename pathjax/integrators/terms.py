@@ -14,8 +14,8 @@ def sums(work, scene, choice, strategy, depth, derivative=False):
     """(depth, 3) sums over a pixel's samples, the paths of `pixel.mean`: row k is T^k Le.
 
     Args:
-        work: the pixel () int32, and its `pixel.numbers`; plain sums, so their samples should be some thousands at most.
-        depth: number of terms, the max_depth of the scene; derivative: of `path.extend`.
+        work: the pixel () int32, and its `pixel.numbers`. Sums are plain, so for some thousand samples at most.
+        depth: number of terms, max_depth of the scene; derivative: of `path.extend`.
     """
     pixel, first_sample, spp, seed = work
     stream = sampler.pixel_stream(seed, pixel)
