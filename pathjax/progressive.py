@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from pathjax import film, replicates
-from pathjax.render import render_pixels
+from pathjax.render import _render_pixels
 from pathjax.scene import Scene
 
 # Paths in one call of the kernel: large enough that the call costs nothing, small enough that an interrupt is heard
 # at once. The schedule is fixed, not timed, so that the same command gives the same image.
 CHUNK_PIXELS = (1 << 14) // replicates.COUNT
-MAX_PASS_SPP = 16 * replicates.COUNT
+MAX_PASS_SPP = 32 * replicates.COUNT
 
 
 @dataclass
@@ -60,7 +60,7 @@ def extend(scene: Scene, state: State, seed: int, strategy: str) -> Iterator[Non
         for first in range(0, missing.size, chunk):
             pixels = missing[first : first + chunk]
             before = state.count[pixels]
-            after = before + np.minimum(np.clip(before, replicates.COUNT, MAX_PASS_SPP), state.goal[pixels] - before)
+            after = before + np.minimum(np.clip(3 * before, replicates.COUNT, MAX_PASS_SPP), state.goal[pixels] - before)
             first_sample = replicates.shares(before)
             spp = replicates.shares(after) - first_sample
             means = _call(scene, chunk, pixels, first_sample, spp, seeds, strategy)
@@ -92,6 +92,7 @@ def _call(scene, chunk, pixels, first_sample, spp, seeds, strategy):
         return np.pad(x, ((0, 0), (0, lacking)), **how).ravel()
 
     tiled = padded(np.tile(pixels.astype(np.int32), (replicates.COUNT, 1)), mode="edge")
-    numbers = padded(first_sample), padded(spp), np.repeat(seeds, chunk)
-    means = render_pixels(scene, tiled, *numbers, strategy)
+    numbers = (x.astype(np.uint32) for x in (padded(first_sample), padded(spp), np.repeat(seeds, chunk)))
+    # Without the derivatives of `render_pixels`, whose machinery takes longer than a call of few samples.
+    means = _render_pixels(replace(scene, about=None), tiled, *numbers, strategy=strategy)
     return np.asarray(means, np.float32).reshape(replicates.COUNT, chunk, 3)[:, : len(pixels)]
