@@ -120,12 +120,12 @@ def _bounces(scene, depth, pixels, spp, seed, strategy, errors) -> Bounces:
     static = _Static(differentiable(scene), depth, strategy)
     scene = replace(scene, max_depth=jnp.int32(depth), about=None)
     if most is None or most <= _PORTION:
-        sums = _replicate_sums(scene, pixels.ravel(), 0, shares, seeds, static=static)
+        sums = _term_sums(static, scene, pixels.ravel(), 0, shares, seeds)
     else:
         sums = 0
         for first in range(0, most, _PORTION):
             portion = jnp.clip(shares - first, 0, _PORTION)
-            sums = sums + _replicate_sums(scene, pixels.ravel(), first, portion, seeds, static=static)
+            sums = sums + _term_sums(static, scene, pixels.ravel(), first, portion, seeds)
     return Bounces(*_moments(sums, shares, shape=pixels.shape), samples)
 
 
@@ -142,17 +142,10 @@ def _moments(sums, shares, *, shape):
     return tuple(jnp.moveaxis(x, 1, 0).reshape(depth, *shape, 3) for x in (mean, lax.stop_gradient(variance)))
 
 
-@partial(jax.jit, static_argnames="static")
-def _replicate_sums(scene, pixels, first_sample, spp, seeds, *, static):
-    """(R, N, depth, 3) sums of pixels (N,); spp: (R, N) of each replicate."""
-    tiled = jnp.tile(pixels, len(seeds))
-    numbers = pixel.numbers(tiled, first_sample, spp.ravel(), jnp.repeat(seeds, len(pixels)))
-    return _term_sums(static, scene, tiled, *numbers).reshape(*spp.shape, static.depth, 3)
-
-
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _term_sums(static: _Static, scene, pixels, first_sample, spp, seed):
-    sums, _ = _kernel(scene, pixels, first_sample, spp, seed, depth=static.depth, strategy=static.strategy)
+def _term_sums(static: _Static, scene, pixels, first_sample, spp, seeds):
+    """(R, N, depth, 3) sums of pixels (N,); spp: (R, N) of each replicate, whose seeds (R,) are given."""
+    sums, _ = _kernel(scene, pixels, first_sample, spp, seeds, depth=static.depth, strategy=static.strategy)
     return sums
 
 
@@ -173,13 +166,13 @@ def _term_sums_jvp(static: _Static, primals, tangents):
     tangent = jnp.zeros_like(sums)
     for place, parameter in enumerate(wanted.values()):
         # Light keeps its channel, so the derivative in a colour is diagonal.
-        tangent = tangent + by_color[:, place] * named.get(scene_tangent, parameter.path)[parameter.index]
+        tangent = tangent + by_color[:, :, place] * named.get(scene_tangent, parameter.path)[parameter.index]
     return sums, tangent
 
 
 @partial(jax.jit, static_argnames=("depth", "strategy", "colors"))
-def _kernel(scene, pixels, first_sample, spp, seed, *, depth, strategy, colors=()):
-    """Sums (N, depth, 3), and derivatives (N, T, depth, 3) in the entries that `colors` lists."""
+def _kernel(scene, pixels, first_sample, spp, seeds, *, depth, strategy, colors=()):
+    """Sums (R, N, depth, 3), and derivatives (R, N, T, depth, 3) in the entries that `colors` lists."""
     choice = emitters.choice(scene.emitters, strategy)
 
     def one_pixel(work, scene, choice, tangents):
@@ -189,5 +182,7 @@ def _kernel(scene, pixels, first_sample, spp, seed, *, depth, strategy, colors=(
         sums, by_color, _ = gradient.by_tangent(of, scene, colors, tangents)
         return sums, by_color
 
-    work = pixels, first_sample, spp, seed
-    return native_map(one_pixel, work, scene, choice, gradient.unit_tangents(scene, colors))
+    tiled = jnp.tile(pixels, len(seeds))
+    work = tiled, *pixel.numbers(tiled, first_sample, spp.ravel(), jnp.repeat(seeds, len(pixels)))
+    results = native_map(one_pixel, work, scene, choice, gradient.unit_tangents(scene, colors))
+    return tuple(x.reshape(*spp.shape, *x.shape[1:]) for x in results)
