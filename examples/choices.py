@@ -2,9 +2,10 @@
 
     python examples/choices.py [QUESTION...]
 
-Which strategy, roulette from which depth, which split rule of the hierarchy, which filter? Choices are rendered with
-the same seeds, in turns; relMSE is measured against a converged reference. Writes choices.png. A further choice is one
-line here: its label, its scene, and what `pathjax.render` is to do otherwise.
+Which strategy, roulette from which depth, what does Schlick's approximation cost, does splitting at glass pay, which
+random numbers, which split rule of the hierarchy, which filter? Choices are rendered with the same seeds, in turns;
+relMSE is measured against a converged reference. Writes choices.png. A further choice is one line here: its label, its
+scene, and what `pathjax.render` is to do otherwise.
 """
 
 import argparse
@@ -18,7 +19,8 @@ import numpy as np
 
 import pathjax as pj
 from pathjax.bench import figures, plot
-from pathjax.integrators.path import STRATEGIES
+from pathjax.bsdfs import FRESNEL
+from pathjax.integrators.path import SAMPLERS, STRATEGIES
 from pathjax.io import mitsuba_xml
 from pathjax.scene import UNBOUNDED, Scene, build
 from pathjax.shapes.bvh_build import RULES
@@ -43,6 +45,10 @@ def description(name, res, **parameters):
     return mitsuba_xml.load(SCENES / f"{name}.xml", res=res, **parameters)
 
 
+def with_tent(scene):
+    return replace(scene, film=replace(scene.film, filter="tent", filter_radius=1.0))
+
+
 def strategy(res):
     """Sample lights, bsdfs, or both (Cornell box)?"""
     scene = build(description("cornell_box", res))
@@ -56,6 +62,24 @@ def roulette(res):
     return [Choice(label, replace(scene, rr_depth=np.int32(depth))) for label, depth in depths.items()]
 
 
+def fresnel(res):
+    """What does Schlick's approximation cost in accuracy (glass ball)?"""
+    scene = build(description("glass_ball", res))
+    return [Choice(name, scene, {"fresnel": name}) for name in FRESNEL]
+
+
+def splitting(res):
+    """Does following both branches of the first dielectrics pay (glass and mirror)?"""
+    scene = build(description("glass_and_mirror", res))
+    return [Choice(f"split_depth {depth}", scene, {"split_depth": depth}) for depth in range(4)]
+
+
+def sampler(res):
+    """A lattice, independent numbers, or 2 x 2 strata of the pixel (Cornell box, tent filter)?"""
+    scene = build(with_tent(description("cornell_box", res)))
+    return [Choice(name, scene, {"sampler": name}) for name in SAMPLERS]
+
+
 def split_rule(res):
     """How should the hierarchy be split (knot of 20,800 triangles)?"""
     scene = description("mesh", res)
@@ -65,11 +89,11 @@ def split_rule(res):
 def reconstruction(res):
     """A box or a tent filter, each against its own truth (Cornell box)?"""
     scene = description("cornell_box", res)
-    tent = replace(scene, film=replace(scene.film, filter="tent", filter_radius=1.0))
-    return [Choice("box", build(scene)), Choice("tent", build(tent), truth=1)]
+    return [Choice("box", build(scene)), Choice("tent", build(with_tent(scene)), truth=1)]
 
 
-QUESTIONS = {question.__name__: question for question in (strategy, roulette, split_rule, reconstruction)}
+QUESTIONS = (strategy, roulette, fresnel, splitting, sampler, split_rule, reconstruction)
+QUESTIONS = {question.__name__: question for question in QUESTIONS}
 
 
 def measure(choices, spps, seeds, reference_spp):
@@ -81,7 +105,7 @@ def measure(choices, spps, seeds, reference_spp):
         images = (pj.render(scene, each, REFERENCE_SEED + k, **how) for k in range(BATCHES))
         references[truth] = figures.reference_of(images, each)
     for choice in choices:
-        jax.block_until_ready(pj.render(choice.scene, 1, **choice.how))  # compiles
+        jax.block_until_ready(pj.render(choice.scene, spps[0], **choice.how))  # compiles
     rows = [[] for _ in choices]
     for spp in spps:
         done = [([], []) for _ in choices]

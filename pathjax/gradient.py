@@ -294,7 +294,7 @@ def _mean_and_differences(work, scene, choice, steps, rows, strategy, derivative
         moves = (jnp.arange(len(ratios)) == row) & (shift >= 0)
         change = jnp.where(k % 2 == 0, h, -h) * (1 + k // 2).astype(h.dtype)
         int_ior = jnp.where(moves, (ratios + change) * table.ext_ior, table.int_ior)
-        return _with_dielectrics(scene, DielectricTable(int_ior, table.ext_ior, jnp.where(moves, ratios, 0)))
+        return _with_dielectrics(scene, replace(table, int_ior=int_ior, choose_by=jnp.where(moves, ratios, 0)))
 
     def twice(number):
         return sampler.combine(stream, number) % RICHARDSON_EVERY == 0

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jax.custom_derivatives import SymbolicZero
 
-from pathjax import emitters, film, gradient, named
+from pathjax import bsdfs, emitters, film, gradient, named
 from pathjax.errors import InputError
 from pathjax.integrators import path, pixel
 from pathjax.named import Parameter
@@ -17,55 +17,94 @@ from pathjax.runtime import native_map
 from pathjax.scene import Scene
 
 
-def render(scene: Scene, spp: int = 64, seed: int = 0, strategy: str = "mis"):
-    """Image of a scene: (H, W, 3), linear RGB, unbiased up to the scene's max_depth.
+def render(
+    scene: Scene,
+    spp: int = 64,
+    seed: int = 0,
+    strategy: str = "mis",
+    *,
+    fresnel: str = "exact",
+    split_depth: int = 0,
+    sampler: str = "lattice",
+):
+    """Image of a scene: (H, W, 3), linear RGB, unbiased up to the scene's max_depth (but for `fresnel="schlick"`).
 
     Pure; may be called inside `jax.jit`, under `jax.vmap` over scenes that differ in parameters or cameras, and be
     differentiated in what `parameters` lists, forwards or backwards: the derivative is that of `jacobian`, which says
-    how, and for the IOR of smooth glass how far, it may be trusted. The same scene structure, image size and strategy
-    compile once: other parameters, cameras, spp and seeds reuse the kernel.
+    how, and for the IOR of smooth glass how far, it may be trusted. The same scene structure, image size and
+    choices below compile once: other parameters, cameras, spp and seeds reuse the kernel.
 
     Args:
         spp: samples per pixel, at least 1.
         seed: other seeds give independent images; the same seed gives the same image, bit for bit, on any number of
             CPU devices.
         strategy: "mis", or "light" or "bsdf" for experiments.
+    Further choices of classic path tracers, for experiments; the defaults compile nothing of them:
+        fresnel: of dielectrics, "exact", or "schlick", whose approximation biases the image.
+        split_depth: at the first so many dielectrics of a path both branches are followed, instead of one by chance;
+            0 to 8. A sample may then be 2^split_depth paths.
+        sampler: random numbers, "lattice", or "independent" of each other, or "subpixel": independent, but with a
+            quarter of the samples in each of 2 x 2 strata of the pixel's filter; spp is then a multiple of 4.
     Raises:
-        InputError: unknown strategy, spp or seed out of range; differentiation in anything but named parameters.
+        InputError: a choice is unknown or out of range, as spp or seed; differentiation in anything but named
+            parameters, or with another sampler or split_depth than the default.
     A sample that is not finite leaves its pixel not finite, and the others untouched.
     """
     pixels = jnp.arange(film.pixel_count(scene.film), dtype=jnp.int32)
-    image = render_pixels(scene, pixels, 0, spp, seed, strategy)
+    choices = {"fresnel": fresnel, "split_depth": split_depth, "sampler": sampler}
+    image = render_pixels(scene, pixels, 0, spp, seed, strategy, **choices)
     return image.reshape(*film.image_shape(scene.film), 3)
 
 
-def render_pixels(scene: Scene, pixels, first_sample, spp, seed, strategy: str = "mis", **how):
+def render_pixels(
+    scene: Scene,
+    pixels,
+    first_sample,
+    spp,
+    seed,
+    strategy: str = "mis",
+    *,
+    fresnel: str = "exact",
+    split_depth: int = 0,
+    sampler: str = "lattice",
+    **how,
+):
     """Means over the samples first_sample, ..., first_sample + spp - 1 of some pixels: (N,) int32 -> (N, 3).
 
     first_sample, spp, seed: each one number, or (N,) of the pixels.
+    strategy, fresnel, split_depth, sampler: of `render`.
     how: `form` and `devices` of `runtime.native_map`.
     """
-    path.check_sampling(strategy, spp, seed)
+    path.check_sampling(strategy, spp, seed, fresnel, split_depth, sampler)
     numbers = pixel.numbers(pixels, first_sample, spp, seed)
-    static = _Static(differentiable(scene), strategy, tuple(how.items()))
-    return _means(static, replace(scene, about=None), pixels, *numbers)
+    static = _Static(differentiable(scene), strategy, split_depth, sampler, tuple(how.items()))
+    materials = bsdfs.with_fresnel(scene.materials, fresnel)
+    return _means(static, replace(scene, materials=materials, about=None), pixels, *numbers)
 
 
 @dataclass(frozen=True)
 class _Static:
     wanted: tuple[tuple[str, Parameter], ...]  # parameters in which a derivative may be wanted
     strategy: str
+    split_depth: int
+    sampler: str
     how: tuple[tuple[str, object], ...]
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _means(static: _Static, scene, pixels, first_sample, spp, seed):
-    return _render_pixels(scene, pixels, first_sample, spp, seed, strategy=static.strategy, **dict(static.how))
+    how = {"strategy": static.strategy, "split_depth": static.split_depth, "sampler": static.sampler}
+    return _render_pixels(scene, pixels, first_sample, spp, seed, **how, **dict(static.how))
 
 
 @partial(_means.defjvp, symbolic_zeros=True)
 def _means_jvp(static: _Static, primals, tangents):
     """Tangent J @ d(parameters): linear, so that it also transposes."""
+    if static.split_depth or static.sampler != "lattice":
+        raise InputError(
+            f"derivatives are not made with split_depth={static.split_depth} and sampler={static.sampler!r}; "
+            "differentiate with split_depth=0 and sampler='lattice', whose image has the same expectation"
+        )
     scene, *arguments = primals
     scene_tangent, *_ = tangents
     wanted = differentiated(static.wanted, scene_tangent)
@@ -107,9 +146,11 @@ def differentiated(candidates, scene_tangent):
     return wanted
 
 
-@partial(jax.jit, static_argnames=("strategy", "form", "devices"))
-def _render_pixels(scene, pixels, first_sample, spp, seed, *, strategy, form=None, devices=None):
+@partial(jax.jit, static_argnames=("strategy", "split_depth", "sampler", "form", "devices"))
+def _render_pixels(
+    scene, pixels, first_sample, spp, seed, *, strategy, split_depth=0, sampler="lattice", form=None, devices=None
+):
     choice = emitters.choice(scene.emitters, strategy)
-    pixel_mean = partial(pixel.mean, strategy=strategy)
+    pixel_mean = partial(pixel.mean, strategy=strategy, split_depth=split_depth, points=sampler)
     work = pixels, first_sample, spp, seed
     return native_map(pixel_mean, work, scene, choice, form=form, devices=devices)

@@ -10,7 +10,7 @@ from pathjax.scene import UNBOUNDED, Scene
 from pathjax.shapes import geometry
 from pathjax.shapes.planar import Planar
 
-_SAMPLER = "Owen-scrambled Sobol' pairs, hashing for roulette"
+_SAMPLER = "randomly shifted lattice, hashing for roulette"
 
 
 def facts(scene: Scene) -> dict:

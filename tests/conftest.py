@@ -204,14 +204,14 @@ def estimate_type():
 
 @pytest.fixture(scope="session")
 def estimate():
-    """(scene, spp, count, strategy) -> Estimate over `count` seeds.
+    """(scene, spp, count, **how of `render`) -> Estimate over `count` seeds.
 
     Samples of one image share a sequence and are not independent of each other; images of different seeds are.
     """
 
-    def render(scene, spp=16, count=16, strategy="mis", first_seed=1, scale=1):
+    def render(scene, spp=16, count=16, first_seed=1, scale=1, **how):
         seeds = range(first_seed, first_seed + count)
-        return estimate_of([np.asarray(pathjax.render(scene, spp, seed, strategy)) * scale for seed in seeds])
+        return estimate_of([np.asarray(pathjax.render(scene, spp, seed, **how)) * scale for seed in seeds])
 
     return render
 

@@ -66,11 +66,14 @@ def test_convex_diffuse_object_under_uniform_light_reflects_its_albedo(make_scen
     np.testing.assert_allclose(pj.render(scene, 16), np.broadcast_to(RHO, (16, 16, 3)), rtol=2e-6)
 
 
-@pytest.mark.parametrize("kind", ["sphere", "cube"])
-def test_glass_in_uniform_light_is_invisible(make_scene, kind):
+SPLIT = {"fresnel": "schlick", "split_depth": 4}
+
+
+@pytest.mark.parametrize("kind, how", [("sphere", {}), ("cube", {}), ("sphere", SPLIT)])
+def test_glass_in_uniform_light_is_invisible(make_scene, kind, how):
     scene = with_depth(make_scene(shape(kind, GLASS) + UNIFORM, origin="1.2, 1.5, 4"), NO_LIMIT, NO_LIMIT)
     # Some 10 refractions by reciprocal factors, an ulp or two each.
-    np.testing.assert_allclose(pj.render(scene, 16), 1, rtol=1e-5)
+    np.testing.assert_allclose(pj.render(scene, 16, **how), 1, rtol=1e-5)
 
 
 def test_glass_under_roulette_stays_as_bright(make_scene, estimate, agree):

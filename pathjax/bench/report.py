@@ -86,7 +86,7 @@ def _sampler(sampler: dict) -> list[str]:
     return [
         f"Independent numbers: relMSE of one sample, {single}, over spp.",
         "",
-        *_table(["sampler, spp", "relMSE, Owen-scrambled Sobol'", "relMSE, independent", "ratio"], cells),
+        *_table(["sampler, spp", "relMSE, shifted lattice", "relMSE, independent", "ratio"], cells),
     ]
 
 

@@ -7,7 +7,7 @@ from outside.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import jax
 import jax.numpy as jnp
@@ -20,6 +20,7 @@ from pathjax.bsdfs.diffuse import DiffuseTable
 from pathjax.core.math import at
 from pathjax.core.types import BSDFSample
 
+FRESNEL = tuple(dielectric.REFLECTANCES)
 MODULES = {DiffuseTable: diffuse, DielectricTable: dielectric, ConductorTable: conductor}
 
 
@@ -38,6 +39,12 @@ def any_smooth(materials: Materials) -> bool:
 def any_glass(materials: Materials) -> bool:
     """Whether some kind present lies between two media."""
     return any(isinstance(table, DielectricTable) for table in materials.tables)
+
+
+def with_fresnel(materials: Materials, fresnel: str) -> Materials:
+    """The same, whose dielectrics reflect by one of `dielectric.REFLECTANCES`."""
+    tables = (replace(t, fresnel=fresnel) if isinstance(t, DielectricTable) else t for t in materials.tables)
+    return replace(materials, tables=tuple(tables))
 
 
 def select(materials: Materials, shape, front):
@@ -89,3 +96,9 @@ def sample(materials: Materials, kind, row, uv, wi, u) -> BSDFSample:
     if len(materials.tables) == 1:
         return of(materials.tables[0])()
     return lax.switch(jnp.maximum(kind, 0), [of(table) for table in materials.tables])
+
+
+def sample_other(materials: Materials, row, uv, wi, u) -> BSDFSample:
+    """The branch of a dielectric that `sample` leaves out."""
+    table = next(table for table in materials.tables if isinstance(table, DielectricTable))
+    return dielectric.sample(table, row, uv, wi, u, other=True)

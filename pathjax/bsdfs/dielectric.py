@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import jax
 import jax.numpy as jnp
@@ -21,16 +21,20 @@ class DielectricTable:
     # (R,) int_ior / ext_ior by which rows choose between reflection and refraction while their own IOR varies, for
     # derivatives; 0: this row chooses by its own. None, outside derivatives: all do.
     choose_by: jax.Array | None = None
+    fresnel: str = field(default="exact", metadata={"static": True})  # of REFLECTANCES
 
 
 SMOOTH = False
+REFLECTANCES = {"exact": fresnel.dielectric, "schlick": fresnel.schlick}
 # Least probability of either branch where the choice is by another IOR: with one that vanishes as Fresnel's terms do,
 # derivatives near the critical angle have infinite variance; with a constant it grows as a logarithm.
 MIN_BRANCH = 0.1
 
 
-def sample(table: DielectricTable, row, uv, wi, u) -> BSDFSample:
+def sample(table: DielectricTable, row, uv, wi, u, other: bool = False) -> BSDFSample:
     """Reflect with probability R, else refract; by the probabilities of `choose_by` where a row has it.
+
+    other: what would not have been drawn, of pdf 0 where it cannot be. For both, pdf * weight is the share of light.
 
     wi may lie on either side: wi.z < 0 comes from inside. Radiance is scaled by 1/eta^2 on refraction, eta being the
     IOR of the far side over that of the near side (PBRT 4 ed., 9.5.2).
@@ -39,13 +43,14 @@ def sample(table: DielectricTable, row, uv, wi, u) -> BSDFSample:
     outside = wi[2] > 0
     eta = jnp.where(outside, ratio, 1 / ratio)
     cos_i = smaller(jnp.abs(wi[2]), jnp.ones_like(eta))
-    r, cos_t = fresnel.dielectric(cos_i, eta)
+    reflectance = REFLECTANCES[table.fresnel]
+    r, cos_t = reflectance(cos_i, eta)
     p, choose_by = r, None
     if table.choose_by is not None:
         choose_by = at(table.choose_by, row)
-        p = jnp.where(choose_by > 0, _frozen_choice(cos_i, choose_by, outside, r), r)
+        p = jnp.where(choose_by > 0, _frozen_choice(reflectance, cos_i, choose_by, outside, r), r)
     p = lax.stop_gradient(p)
-    reflect = u[0] < p
+    reflect = u[0] >= p if other else u[0] < p
     inv = 1 / eta
     refracted = jnp.stack([-wi[0] * inv, -wi[1] * inv, jnp.where(outside, -cos_t, cos_t)])
     wo = jnp.where(reflect, jnp.stack([-wi[0], -wi[1], wi[2]]), refracted)
@@ -57,7 +62,7 @@ def sample(table: DielectricTable, row, uv, wi, u) -> BSDFSample:
     return BSDFSample(wo, jnp.broadcast_to(weight, (3,)), pdf, jnp.bool_(True), weight)
 
 
-def _frozen_choice(cos_i, ratio, outside, r):
+def _frozen_choice(reflectance, cos_i, ratio, outside, r):
     """Probability of reflection by another IOR `ratio`, for a path whose own reflectance is r: 1 where that is."""
-    p, _ = fresnel.dielectric(cos_i, jnp.where(outside, ratio, 1 / ratio))
+    p, _ = reflectance(cos_i, jnp.where(outside, ratio, 1 / ratio))
     return jnp.where(r < 1, jnp.clip(p, MIN_BRANCH, 1 - MIN_BRANCH), 1)

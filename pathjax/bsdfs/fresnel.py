@@ -17,15 +17,33 @@ def dielectric(cos_i, eta):
         R (), in [0, 1]; cos_t () >= 0, 0 under total internal reflection, where R = 1.
     Derivatives are finite everywhere: at and beyond the critical angle they are those of the constant 1.
     """
-    # With the contrast taken out, nothing cancels: equal media reflect 0 at any angle, with derivative 0.
-    contrast = (eta - 1) * (eta + 1)
-    cos2_t = (cos_i * cos_i + contrast) / (eta * eta)
-    refracts = cos2_t > 0
-    cos_t = safe_sqrt(cos2_t)
+    contrast, refracts, cos_t = _refraction(cos_i, eta)
     s, p = cos_i + eta * cos_t, eta * cos_i + cos_t
     r_s = contrast / jnp.where(refracts, s * s, 1)
     r_p = contrast * ((eta * eta + 1) * cos_i * cos_i - 1) / jnp.where(refracts, eta * eta * p * p, 1)
     return jnp.where(refracts, smaller((r_s * r_s + r_p * r_p) / 2, jnp.ones_like(cos_t)), 1), cos_t
+
+
+def schlick(cos_i, eta):
+    """Schlick's approximation of `dielectric` (1994, Computer Graphics Forum 13(3)); exact are normal incidence, total
+    internal reflection and the cosine of refraction.
+
+    The angle is that on the thinner side, so that light going back sees the same reflectance. Wrong most at grazing
+    angles: by 0.036 at 85 degrees and IOR 1.5; even equal media reflect, (1 - cos)^5.
+    """
+    _, refracts, cos_t = _refraction(cos_i, eta)
+    r0 = ((eta - 1) / (eta + 1)) ** 2
+    missing = 1 - jnp.where(eta < 1, cos_t, cos_i)
+    return jnp.where(refracts, r0 + (1 - r0) * missing**5, 1), cos_t
+
+
+def _refraction(cos_i, eta):
+    """eta^2 - 1, whether light refracts, and the cosine if so."""
+    # With the contrast taken out, nothing cancels: equal media reflect 0 at any angle, with derivative 0.
+    contrast = (eta - 1) * (eta + 1)
+    cos2_t = (cos_i * cos_i + contrast) / (eta * eta)
+    refracts = cos2_t > 0
+    return contrast, refracts, safe_sqrt(cos2_t)
 
 
 def conductor(cos_i, eta, k):

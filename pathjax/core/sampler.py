@@ -4,7 +4,7 @@ The points of a pixel's paths are a rank-1 lattice in many dimensions at once, o
 the first 2^m of them are a lattice for every m, and moved as a whole by a random shift (Dick, Kuo and Sloan 2013, Acta
 Numerica 22). So every number is uniform and the estimate unbiased, and what a path decides at several vertices is
 stratified jointly, which padded pairs of a Sobol' sequence are not. Choices are hashed. Every pixel and every seed is
-an independent randomisation.
+an independent randomisation. POINTS holds what classic path tracers use instead, for comparison.
 """
 
 from __future__ import annotations
@@ -70,6 +70,28 @@ def lattice_point(stream, sample, vertex):
     vertex = _u32(vertex)
     generators = at(jnp.asarray(_GENERATORS), vertex % len(_GENERATORS))
     return to_unit(reverse_bits(_u32(sample)) * generators + _hashes(stream, vertex * DIMENSIONS, DIMENSIONS))
+
+
+def independent_point(stream, sample, vertex):
+    """(4,) float32 of `lattice_point`, none of which knows of another."""
+    return to_unit(_point_hashes(stream, sample, vertex))
+
+
+def subpixel_point(stream, sample, vertex):
+    """The same, but of four samples in a row each has the film position, the first pair of vertex 0, in its own quarter
+    of the unit square, as in smallpt (Beason 2008)."""
+    bits, sample = _point_hashes(stream, sample, vertex), _u32(sample)
+    quarter = jnp.stack([sample & 1, (sample >> 1) & 1]) << 31
+    first = jnp.where(_u32(vertex) == 0, quarter | (bits[:2] >> 1), bits[:2])
+    return to_unit(jnp.concatenate([first, bits[2:]]))
+
+
+def _point_hashes(stream, sample, vertex):
+    return _hashes(path_key(~stream, sample), _u32(vertex) * DIMENSIONS, DIMENSIONS)
+
+
+POINTS = {"lattice": lattice_point, "independent": independent_point, "subpixel": subpixel_point}
+SUBPIXELS = 4
 
 
 def pixel_stream(seed, pixel):

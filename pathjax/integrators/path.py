@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 
 from pathjax import bsdfs, emitters
@@ -14,9 +15,13 @@ from pathjax.core.math import dot, frame_from_normal, larger, safe_divide, small
 from pathjax.core.types import Ray
 from pathjax.emitters import Choice
 from pathjax.errors import InputError
+from pathjax.integrators import splitting
 from pathjax.shapes import geometry
 
 STRATEGIES = ("mis", "light", "bsdf")
+SAMPLERS = tuple(sampler.POINTS)
+# Branches double with each.
+MOST_SPLITS = 8
 # Roulette never spares a path for certain, so that every path ends even between perfect mirrors; and never ends one for
 # certain, so that what is black keeps its derivative.
 MIN_SURVIVAL, MAX_SURVIVAL = 0.05, 0.95
@@ -40,6 +45,8 @@ class Path(NamedTuple):
     depth: jax.Array  # () int32 vertices so far
     alive: jax.Array  # () bool
     glass: jax.Array | None  # () int32 bit r % 31 is set once the path met row r of the dielectrics; None: not asked
+    splits: jax.Array | None = None  # () int32 how many dielectrics may still split it; None: none ever
+    pending: Path | None = None  # (split_depth, ...) branches that wait, those alive; see `splitting`
 
 
 class Bounce(NamedTuple):
@@ -51,10 +58,16 @@ class Bounce(NamedTuple):
     roulette: jax.Array  # ()
 
 
-def check_sampling(strategy, spp, seed) -> None:
-    """Refuse, with an InputError, what no path tracer can do; numbers that are traced pass."""
-    if strategy not in STRATEGIES:
-        raise InputError(f"strategy {strategy!r} is unknown; use one of {', '.join(STRATEGIES)}")
+def check_sampling(strategy, spp, seed, fresnel="exact", split_depth=0, points="lattice") -> None:
+    """Refuse, with an InputError, what no path tracer can do; numbers that are traced pass. points: of SAMPLERS."""
+    named = ("strategy", strategy, STRATEGIES), ("fresnel", fresnel, bsdfs.FRESNEL), ("sampler", points, SAMPLERS)
+    for name, value, known in named:
+        if value not in known:
+            raise InputError(f"{name} {value!r} is unknown; use one of {', '.join(known)}")
+    if not isinstance(split_depth, int) or not 0 <= split_depth <= MOST_SPLITS:
+        raise InputError(f"split_depth = {split_depth!r}; it must be an integer in [0, {MOST_SPLITS}]")
+    if points == "subpixel" and not isinstance(spp, jax.core.Tracer) and np.any(np.asarray(spp) % sampler.SUBPIXELS):
+        raise InputError(f"spp = {spp}; sampler='subpixel' takes samples by fours, so make it a multiple of 4")
     for name, value, least in (("spp", spp, 1), ("seed", seed, 0)):
         if isinstance(value, int) and not least <= value < 2**31:
             raise InputError(f"{name} = {value}; it must lie in [{least}, 2^31)")
@@ -69,11 +82,12 @@ def trace(scene, choice: Choice | None, ray: Ray, numbers, strategy: str) -> Pat
     return lax.while_loop(lambda path: path.alive, on, start(scene, ray))
 
 
-def start(scene, ray: Ray, watch_glass: bool = False, by_vertex: bool = False) -> Path:
+def start(scene, ray: Ray, watch_glass: bool = False, split_depth: int = 0, by_vertex: bool = False) -> Path:
     """A path that has its camera ray.
 
     Args:
         watch_glass: tell which dielectrics it meets.
+        split_depth: of so many dielectrics, the first that it meets, follow both branches.
         by_vertex: `L` is the Gain of each vertex.
     """
     one, zero3 = jnp.ones_like(ray.t_max), jnp.zeros_like(ray.o)
@@ -81,7 +95,8 @@ def start(scene, ray: Ray, watch_glass: bool = False, by_vertex: bool = False) -
     glass = jnp.int32(0) if watch_glass else None
     throughput = zero3 + (scene.max_depth > 0)
     L = Gain(zero3, zero3) if by_vertex else zero3
-    return Path(ray, L, throughput, one * jnp.inf, passive, jnp.int32(0), scene.max_depth > 0, glass)
+    path = Path(ray, L, throughput, one * jnp.inf, passive, jnp.int32(0), scene.max_depth > 0, glass)
+    return splitting.start(path, split_depth) if split_depth and passive is not None else path
 
 
 def extend(scene, choice: Choice | None, path: Path, u: Bounce, strategy: str, derivative: bool = False) -> Path:
@@ -179,6 +194,9 @@ def extend(scene, choice: Choice | None, path: Path, u: Bounce, strategy: str, d
         drawn = bsdfs.sample(materials, kind, row, surface.uv, wi, u.bsdf)
         d = to_world(frame, drawn.wo)
         drawn, d = lax.optimization_barrier((drawn, d))
+        if path.pending is not None:
+            splits = bsdfs.is_glass(materials, kind) & (path.splits > 0)
+            drawn = drawn._replace(weight=jnp.where(splits, drawn.pdf, 1) * drawn.weight)
         throughput = path.throughput * drawn.weight
 
         # ---- roulette ---------------------------------------------------------------------------------------------
@@ -196,15 +214,31 @@ def extend(scene, choice: Choice | None, path: Path, u: Bounce, strategy: str, d
         if path.glass is not None:
             glass = path.glass | bsdfs.glass_bit(materials, kind, row)
         ray_on = spawn_ray(surface, d, hit.primitive)
-        return Path(ray_on, L, throughput / survival, pdf, passive, path.depth, alive, glass)
+        on = Path(ray_on, L, throughput / survival, pdf, passive, path.depth, alive, glass)
+        if path.pending is None:
+            return on
+        on = on._replace(splits=path.splits - splits.astype(jnp.int32), pending=path.pending)
+        return lax.cond(splits, split, lambda path, on: on, path, on)
+
+    def split(path: Path, on: Path) -> Path:
+        other = bsdfs.sample_other(materials, row, surface.uv, wi, u.bsdf)
+        branch = on._replace(
+            ray=spawn_ray(surface, to_world(frame, other.wo), hit.primitive),
+            throughput=path.throughput * other.weight * other.pdf,  # roulette comes at the next vertex
+            passive=path.passive * other.passive,
+            alive=other.pdf > 0,
+        )
+        return splitting.push(on, branch)
 
     if not shapes.tables:
         return end(path)
     if scene.hide_emitters:
         beyond = spawn_ray(surface, ray.d, hit.primitive)._replace(t_max=ray.t_max - hit.t)
         through = path._replace(ray=beyond, depth=jnp.int32(0))
-        return lax.cond(hidden, lambda path: through, lambda path: lax.cond(goes_on, scatter, end, path), path)
-    return lax.cond(goes_on, scatter, end, path)
+        path = lax.cond(hidden, lambda path: through, lambda path: lax.cond(goes_on, scatter, end, path), path)
+    else:
+        path = lax.cond(goes_on, scatter, end, path)
+    return path if path.pending is None else splitting.resume(path)
 
 
 def shading(materials, ray: Ray, hit, surface):
@@ -233,19 +267,19 @@ def mis_weight(pdf, other_pdf):
 # The camera is vertex 0 of the sampler, so what a path meets at depth d is vertex d + 1.
 
 
-def camera_numbers(scene, stream, sample):
+def camera_numbers(scene, stream, sample, points="lattice"):
     """Film (2,) and lens (2,).
 
     Args:
-        stream: () uint32 of `sampler.pixel_stream`; sample: () uint32 number of the sample.
+        stream: () uint32 of `sampler.pixel_stream`; sample: () uint32 number of the sample; points: of SAMPLERS.
     """
-    u = sampler.lattice_point(stream, sample, 0).astype(scene.camera.origin.dtype)
+    u = sampler.POINTS[points](stream, sample, 0).astype(scene.camera.origin.dtype)
     return u[:2], u[2:]
 
 
-def bounce_numbers(scene, stream, sample, depth) -> Bounce:
+def bounce_numbers(scene, stream, sample, depth, points="lattice") -> Bounce:
     """Random numbers of the vertex number depth."""
     dtype = scene.camera.origin.dtype
-    u = sampler.lattice_point(stream, sample, depth + 1).astype(dtype)
+    u = sampler.POINTS[points](stream, sample, depth + 1).astype(dtype)
     rest = sampler.hashed(sampler.path_key(stream, sample), 2 * depth, 2).astype(dtype)
     return Bounce(u[:2], u[2:], rest[0], rest[1])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 from jax import lax
@@ -17,14 +19,14 @@ def numbers(pixels, first_sample, spp, seed):
     return tuple(jnp.broadcast_to(jnp.asarray(x, jnp.uint32), pixels.shape) for x in (first_sample, spp, seed))
 
 
-def camera_path(scene, pixel, stream, number, **how):
+def camera_path(scene, pixel, stream, number, points="lattice", **how):
     """Path of one sample at the camera, and the sample's weight ().
 
     Args:
-        pixel: () int32; stream: () uint32, its `sampler.pixel_stream`; number: () uint32.
-        how: `watch_glass` of `path.start`.
+        pixel: () int32; stream: () uint32, its `sampler.pixel_stream`; number: () uint32; points: of `path.SAMPLERS`.
+        how: `watch_glass` and `split_depth` of `path.start`.
     """
-    u_film, u_lens = lax.optimization_barrier(path.camera_numbers(scene, stream, number))
+    u_film, u_lens = lax.optimization_barrier(path.camera_numbers(scene, stream, number, points))
     position, weight = film.sample_position(scene.film, pixel, u_film)
     ray = sample_ray(scene.camera, position, u_lens)
     return lax.optimization_barrier((path.start(scene, ray, **how), weight))
@@ -36,26 +38,30 @@ def no_path(scene, **how):
     return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), nothing)
 
 
-def mean(work, scene, choice, strategy, derivative=False):
-    """(3,) mean of a pixel's samples. work: the pixel () int32, and its `numbers`; derivative: of `path.extend`."""
+def mean(work, scene, choice, strategy, derivative=False, split_depth=0, points="lattice"):
+    """(3,) mean of a pixel's samples.
+
+    Args:
+        work: the pixel () int32, and its `numbers`.
+        derivative: of `path.extend`; split_depth: of `path.start`; points: of `path.SAMPLERS`.
+    """
     pixel, first_sample, spp, seed = work
     stream = sampler.pixel_stream(seed, pixel)
+    begin = partial(camera_path, scene, pixel, stream, points=points, split_depth=split_depth)
 
     # One loop over the vertices of all samples, so that no lane waits for the longest path of another.
     def step(state):
         number, now, weight, sums = state
-        now, weight = lax.cond(
-            now.alive, lambda: (now, weight), lambda: camera_path(scene, pixel, stream, number)
-        )
+        now, weight = lax.cond(now.alive, lambda: (now, weight), lambda: begin(number))
         now, weight = lax.optimization_barrier((now, weight))
-        u = path.bounce_numbers(scene, stream, number, now.depth)
+        u = path.bounce_numbers(scene, stream, number, now.depth, points)
         now = path.extend(scene, choice, now, u, strategy, derivative)
         value = lax.optimization_barrier(weight * now.L)
         sums = lax.cond(now.alive, lambda: sums, lambda: add_compensated(sums, value))
         return number + jnp.where(now.alive, 0, 1).astype(number.dtype), now, weight, sums
 
     zero = jnp.zeros((3,), scene.camera.origin.dtype)
-    start = first_sample, *no_path(scene), (zero, zero)
+    start = first_sample, *no_path(scene, split_depth=split_depth), (zero, zero)
     *_, (total, _) = lax.while_loop(lambda state: state[0] != first_sample + spp, step, start)
     return total / spp.astype(total.dtype)
 

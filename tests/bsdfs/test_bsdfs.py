@@ -1,5 +1,6 @@
 """What each bsdf samples has its density and weight; energy, reciprocity, Snell's law; textures against NumPy."""
 
+from dataclasses import replace
 from functools import partial
 
 import jax
@@ -159,6 +160,23 @@ def test_dielectric_returns_all_energy():
     z = np.asarray(wi)[:, 2]
     eta = np.where(drawn.wo[:, 2] * z > 0, 1, np.where(z > 0, 1.5, 1 / 1.5))
     np.testing.assert_allclose(drawn.weight * eta[:, None] ** 2, 1, rtol=1e-6)
+
+
+@pytest.mark.parametrize("fresnel", bsdfs.FRESNEL)
+@pytest.mark.parametrize("row", [0, 1, 2])
+def test_dielectric_and_its_other_branch_share_the_light(row, fresnel):
+    """One reflects and one refracts; what cannot be drawn has pdf 0."""
+    glass, n = replace(GLASS, fresnel=fresnel), 10_000
+    wi, u = directions(n, upper=False), uniform(n, 2)
+    drawn = draw(dielectric.sample, glass, wi, u, row)
+    other = draw(partial(dielectric.sample, other=True), glass, wi, u, row)
+    z = np.asarray(wi)[:, 2]
+    eta = float(GLASS.int_ior[row] / GLASS.ext_ior[row]) ** np.sign(z)
+    power = [b.pdf * b.weight[:, 0] * np.where(b.wo[:, 2] * z > 0, 1, eta**2) for b in (drawn, other)]
+    np.testing.assert_allclose(sum(power), 1, atol=1e-6)
+    possible = other.pdf > 0
+    assert ((drawn.wo[:, 2] * other.wo[:, 2] < 0) | ~possible).all()
+    assert possible.any() == (row != 1 or fresnel == "schlick")
 
 
 def test_no_numbers_at_the_ends_are_not_finite():

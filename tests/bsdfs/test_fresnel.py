@@ -112,6 +112,41 @@ def test_equal_media_have_derivative_zero():
     np.testing.assert_allclose(slope, 0, atol=1e-6)
 
 
+# ---- Schlick's approximation ----------------------------------------------------------------------------------------
+
+
+def schlick(cos_i, eta):
+    r, cos_t = jax.jit(jax.vmap(fresnel.schlick))(*np.broadcast_arrays(np.float32(cos_i), np.float32(eta)))
+    return np.asarray(r, np.float64), np.asarray(cos_t, np.float64)
+
+
+@pytest.mark.parametrize("eta", ETAS)
+def test_schlick_is_exact_at_normal_and_grazing_incidence_and_beyond_the_critical_angle(eta):
+    ends = [critical_cos(eta) - 1e-5, 1] if eta < 1 else [0, 1]
+    exact, cos_exact = dielectric(ends, eta)
+    r, cos_t = schlick(ends, eta)
+    np.testing.assert_allclose(r, exact, atol=ROUNDING)
+    np.testing.assert_array_equal(cos_t, cos_exact)
+
+
+@pytest.mark.parametrize("eta", [1.33, 1.5, 2.4])
+def test_schlick_is_the_polynomial_in_the_angle_on_the_thinner_side_from_either_side(eta):
+    cos_i = np.linspace(0.05, 1, 200)
+    expected = ((eta - 1) / (eta + 1)) ** 2 + (1 - ((eta - 1) / (eta + 1)) ** 2) * (1 - cos_i) ** 5
+    r, cos_t = schlick(cos_i, eta)
+    np.testing.assert_allclose(r, expected, atol=ROUNDING)
+    np.testing.assert_allclose(schlick(cos_t, 1 / eta)[0], expected, atol=1e-4)  # of a cosine that was rounded
+
+
+def test_schlick_is_off_by_what_its_users_accept():
+    """At IOR 1.5 by up to 0.036, at 85 degrees; of diffuse light it reflects 6.6 % too little."""
+    cos_i = np.sqrt((np.arange(10_000) + 0.5) / 10_000)  # cosine-distributed
+    difference = schlick(cos_i, 1.5)[0] - exact_dielectric(cos_i, 1.5)
+    assert np.abs(difference).max() == pytest.approx(0.0357, abs=1e-4)
+    assert np.degrees(np.arccos(cos_i[np.abs(difference).argmax()])) == pytest.approx(85, abs=0.1)
+    assert difference.mean() / exact_dielectric(cos_i, 1.5).mean() == pytest.approx(-0.066, abs=1e-3)
+
+
 def test_dielectric_derivatives_are_the_analytic_ones(x64):
     step = 1e-30
     gradient = jax.jit(jax.vmap(jax.grad(lambda c, e: fresnel.dielectric(c, e)[0], (0, 1)), (0, None)))

@@ -57,6 +57,33 @@ def test_each_dimension_is_stratified_for_every_stream(count):
     assert_stratified(lattice(np.arange(20), 7 * np.arange(20), np.arange(count)))
 
 
+@pytest.mark.parametrize("name", ["independent", "subpixel"])
+def test_points_of_classic_path_tracers_are_uniform_and_independent(name):
+    """Each dimension with the next, and, but for the film, with itself four samples later."""
+    n = 1 << 16
+
+    def one(sample):
+        return jax.vmap(lambda vertex: sampler.POINTS[name](jnp.uint32(7), sample, vertex))(jnp.arange(4))
+
+    u = np.asarray(jax.jit(jax.vmap(one))(jnp.arange(n, dtype=jnp.uint32)), np.float64).reshape(n, 16)
+    assert 0 < u.min() and u.max() < 1
+    pairs = [(u[:, i], u[:, i + 1]) for i in range(15)] + [(u[4:, i], u[:-4, i]) for i in range(2, 16)]
+    p = []
+    for a, b in pairs:
+        counts = np.histogram2d(a, b, 16, [[0, 1], [0, 1]])[0]
+        # Strata make counts more even than chance does.
+        p.append(stats.chi2.sf(((counts - len(a) / 256) ** 2).sum() * 256 / len(a), 255))
+    assert sidak(p) > FALSE_ALARM
+
+
+def test_four_subpixel_points_in_a_row_lie_in_the_four_quarters_of_the_pixel():
+    stream = sampler.pixel_stream(1, 2)
+    for first in (0, 6, (1 << 32) - 2):
+        samples = (first + np.arange(4)) % (1 << 32)
+        film = [np.asarray(sampler.subpixel_point(stream, np.uint32(i), 0))[:2] for i in samples]
+        assert {tuple(q) for q in (np.array(film) // 0.5).tolist()} == {(0, 0), (1, 0), (0, 1), (1, 1)}
+
+
 @pytest.mark.parametrize("first", [256, 5 * 256, 1 << 24, (1 << 32) - 256])
 def test_each_aligned_block_of_samples_is_stratified(first):
     assert_stratified(lattice(np.arange(8), np.arange(8), first + np.arange(256, dtype=np.int64)))

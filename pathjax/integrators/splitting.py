@@ -1,0 +1,50 @@
+"""Paths that follow both branches of their first dielectrics, one after the other.
+
+Branches that wait are kept with the path: a stack of fixed depth. One that may split k times more lies in entry k. What
+a path leaves behind may split less often than all that waits already, so no entry is needed twice, and the lowest
+that is taken is the youngest.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from pathjax.core.math import at
+
+
+def start(path, depth: int):
+    """A path that may split `depth` times, depth > 0."""
+    path = path._replace(splits=jnp.int32(depth))
+    nothing = jax.tree.map(lambda x: jnp.zeros((depth, *jnp.shape(x)), x.dtype), _branch(path))
+    return path._replace(pending=nothing)
+
+
+def push(path, branch):
+    """Let a branch, a Path, wait; branch.splits < depth."""
+
+    def put(entries, new):
+        here = jnp.arange(len(entries)) == branch.splits
+        return jnp.where(here.reshape(-1, *[1] * new.ndim), new, entries)
+
+    return path._replace(pending=jax.tree.map(put, path.pending, _branch(branch)))
+
+
+def resume(path):
+    """The youngest branch that waits, if the path has ended: alive again, with the radiance that it had gathered."""
+    waits = path.pending.alive
+    numbers = jnp.arange(len(waits))
+    youngest = jnp.min(jnp.where(waits, numbers, len(waits)))
+
+    def take():
+        branch = jax.tree.map(lambda entries: at(entries, youngest), path.pending)
+        left = path.pending._replace(alive=waits & (numbers != youngest))
+        return branch._replace(L=path.L, glass=path.glass, pending=left)
+
+    return lax.cond(path.alive | (youngest == len(waits)), lambda: path, take)
+
+
+def _branch(path):
+    """What a branch has of its own; the rest belongs to the whole sample."""
+    return path._replace(L=None, glass=None, pending=None)
