@@ -156,9 +156,8 @@ def extend(scene, choice: Choice | None, path: Path, u: Bounce, strategy: str, d
 
     # Most surfaces are dark.
     bright = ~found | geometry.emits(shapes, hit) if shapes.tables else True
-    dark = jnp.zeros_like(path.throughput)
-    emitted = lax.cond(bright, emission, lambda: dark)
-    L = Gain(emitted, dark) if isinstance(path.L, Gain) else path.L + emitted
+    emitted = lax.cond(bright, emission, lambda: jnp.zeros_like(path.throughput))
+    L = Gain(emitted, jnp.zeros_like(emitted)) if isinstance(path.L, Gain) else path.L + emitted
     if scene.hide_emitters:
         hidden = found & (path.depth == 0) & geometry.emits(shapes, hit)
     path = path._replace(L=L, depth=path.depth + 1)
@@ -187,7 +186,7 @@ def extend(scene, choice: Choice | None, path: Path, u: Bounce, strategy: str, d
                 visible = useful & ~geometry.occluded(shapes, shadow_ray, drawn.primitive)
                 return jnp.where(visible, contribution, 0)
 
-            light = path.throughput * lax.cond(smooth, direct, lambda: dark)
+            light = path.throughput * lax.cond(smooth, direct, lambda: jnp.zeros_like(path.throughput))
             L = L._replace(light=light) if isinstance(L, Gain) else L + light
 
         # ---- bsdf sample ------------------------------------------------------------------------------------------
