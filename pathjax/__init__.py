@@ -2,6 +2,7 @@
 
 from pathjax import runtime as _runtime  # noqa: F401  first: sets XLA up before a backend starts
 from pathjax.aovs import render_aovs
+from pathjax.bounces import Bounces, render_bounces
 from pathjax.errors import InputError
 from pathjax.gradient import Jacobian, jacobian
 from pathjax.named import parameters, with_parameters
@@ -12,6 +13,7 @@ from pathjax.until import RenderResult, render_until
 
 __version__ = "0.1.0"
 __all__ = [
+    "Bounces",
     "Fit",
     "GradientCheck",
     "InputError",
@@ -27,6 +29,7 @@ __all__ = [
     "parameters",
     "render",
     "render_aovs",
+    "render_bounces",
     "render_until",
     "with_parameters",
 ]

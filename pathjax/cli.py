@@ -49,7 +49,7 @@ def _parser() -> argparse.ArgumentParser:
     checkpoint = "save the state there, and go on from it when called again"
     render.add_argument("--checkpoint", metavar="FILE.npz", help=checkpoint)
     aov = "further channels of an EXR file, separated by commas"
-    render.add_argument("--aov", type=_names, default=[], metavar="{error,depth,normal,albedo}", help=aov)
+    render.add_argument("--aov", type=_names, default=[], metavar="{error,depth,normal,albedo,bounces}", help=aov)
     render.add_argument("--seed", type=_seed, default=0, metavar="K")
     render.add_argument("--strategy", default="mis", metavar="{mis,light,bsdf}", help="how light is sampled")
     render.add_argument("--json", action="store_true", help="print one JSON object on stdout")
@@ -68,6 +68,8 @@ def _parser() -> argparse.ArgumentParser:
 
     info = commands.add_parser("info", help="what a scene holds and what is compiled for it")
     _add_scene(info)
+    tail = "suggest a max_depth that cuts off no more than this share of light (renders a few terms)"
+    info.add_argument("--tail", type=_real, metavar="E", help=tail)
     info.add_argument("--json", action="store_true", help="print one JSON object on stdout")
     info.set_defaults(run=_info)
 
@@ -209,17 +211,19 @@ def _render(options) -> int:
 
     from pathjax import aovs
 
-    aovs.check_names(options.aov, tuple(CHANNELS))
+    aovs.check_names(options.aov, (*CHANNELS, "bounces"))
     if options.aov and output.suffix.lower() == ".png":
         raise InputError(f"{output}: --aov needs an .exr file; a .png holds one image")
     started = time.perf_counter()
     scene = _load(options)
+    if "bounces" in options.aov:
+        _check_terms(scene, options)
     spp = options.spp
     if spp is None and options.error is None and options.time is None:
         spp = scene.about.description.spp
     loaded = time.perf_counter()
-    result, images = _rendered(scene, spp, options)
-    _write(output, result, images, options)
+    result, layers = _rendered(scene, spp, options)
+    _write(output, result, layers, options)
     pixels_lost = int((result.image != result.image).any(-1).sum())
     if pixels_lost:
         print(f"pathjax: {pixels_lost} pixels met a sample that is not finite, and hold nan", file=sys.stderr)
@@ -250,7 +254,7 @@ def _render(options) -> int:
 
 
 def _rendered(scene, spp: int | None, options):
-    """RenderResult, and the output variables by name."""
+    """RenderResult, and the channels of the output variables by name."""
     from rich.console import Console
 
     from pathjax import aovs
@@ -269,7 +273,47 @@ def _rendered(scene, spp: int | None, options):
         os._exit(FAILED)
     result = render.run(progress=True)
     images["error"] = result.standard_error
-    return result, {name: images[name] for name in options.aov}
+    layers = {}
+    for name in options.aov:
+        if name == "bounces":
+            layers |= _terms(scene, result, options)
+        else:
+            layers |= {f"{name}.{channel}": images[name][..., i] for i, channel in enumerate(CHANNELS[name])}
+    return result, layers
+
+
+def _check_terms(scene, options) -> None:
+    from pathjax.bounces import MOST_TERMS
+
+    depth = int(scene.max_depth)
+    if not 1 <= depth <= MOST_TERMS:
+        asked = "no limit" if depth > MOST_TERMS else depth
+        raise InputError(
+            f"{options.scene}: --aov bounces writes a term for each depth, and max_depth is {asked}; set one of 1 to "
+            f"{MOST_TERMS} (`pathjax info --tail 0.01` suggests one)"
+        )
+
+
+def _terms(scene, result, options) -> dict:
+    """Channels of the terms of the series, of the same samples as the image, and of their standard errors."""
+    import numpy as np
+
+    from pathjax.bounces import render_bounces
+
+    try:
+        if result.reason == "interrupted":
+            raise KeyboardInterrupt
+        bounces = render_bounces(scene, int(scene.max_depth), result.samples, options.seed, options.strategy)
+        images = {"": np.asarray(bounces.terms), "error.": bounces.standard_error}
+    except KeyboardInterrupt:
+        print("pathjax: interrupted; the bounces are left out", file=sys.stderr)
+        return {}
+    return {
+        f"bounces.{k}.{what}{channel}": term[..., i]
+        for what, terms in images.items()
+        for k, term in enumerate(terms)
+        for i, channel in enumerate("RGB")
+    }
 
 
 def _reached(result, output: Path, spp: int | None, options) -> str:
@@ -310,7 +354,7 @@ def _interruptible(call):
     return result
 
 
-def _write(output: Path, result, images, options) -> None:
+def _write(output: Path, result, layers, options) -> None:
     from pathjax import __version__
     from pathjax.io import image as files
 
@@ -325,9 +369,7 @@ def _write(output: Path, result, images, options) -> None:
         "pathjax.seed": options.seed,
     }
     channels = {name: result.image[..., i] for i, name in enumerate("RGB")}
-    for name, image in images.items():
-        channels |= {f"{name}.{channel}": image[..., i] for i, channel in enumerate(CHANNELS[name])}
-    files.write_exr(output, channels, header)
+    files.write_exr(output, channels | layers, header)
 
 
 # ---- fit ----------------------------------------------------------------------------------------------------------
@@ -404,7 +446,10 @@ def _compare(options) -> int:
 def _info(options) -> int:
     from pathjax import report
 
-    facts = report.facts(_load(options))
+    scene = _load(options)
+    facts = report.facts(scene)
+    if options.tail is not None:
+        facts["tail"] = report.tail_facts(scene, options.tail)
     print(json.dumps(facts) if options.json else report.text(facts))
     return DONE
 

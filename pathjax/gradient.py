@@ -210,7 +210,7 @@ def _jacobians(scene, pixels, first_sample, spp, seed, steps, *, wanted, strateg
     choice = emitters.choice(scene.emitters, strategy)
     one_pixel = partial(_pixel_jacobian, wanted=wanted, strategy=strategy)
     work = pixels, first_sample, spp, seed
-    shared = scene, choice, _tangents(scene, wanted.colors), steps
+    shared = scene, choice, unit_tangents(scene, wanted.colors), steps
     return native_map(one_pixel, work, *shared, form=form, devices=devices)
 
 
@@ -219,7 +219,7 @@ def _tables(colors):
     return list(dict.fromkeys(table_path for table_path, _ in colors))
 
 
-def _tangents(scene, colors):
+def unit_tangents(scene, colors):
     """A unit change of all channels of each entry: for every table (entries, *shape of the table)."""
     tangents = []
     for table_path in _tables(colors):
@@ -237,27 +237,39 @@ def _pixel_jacobian(work, scene, choice, tangents, steps, wanted, strategy):
 
     work: the pixel () int32, and its `pixel.numbers`.
     """
-    places = _tables(wanted.colors)
+    derivative = bool(wanted.colors)
 
-    def of(tables):
-        varied = scene
-        for place, table in zip(places, tables, strict=True):
-            varied = named.put(varied, place, table)
-        derivative = bool(wanted.colors)
+    def of(scene):
         if not wanted.glass:
             none = jnp.zeros((0, 3), scene.camera.origin.dtype)
-            return pixel.mean(work, varied, choice, strategy, derivative), (none, none)
-        return _mean_and_differences(work, varied, choice, steps, wanted.glass, strategy, derivative)
+            return pixel.mean(work, scene, choice, strategy, derivative), (none, none)
+        return _mean_and_differences(work, scene, choice, steps, wanted.glass, strategy, derivative)
+
+    mean, by_color, differences = by_tangent(of, scene, wanted.colors, tangents)
+    return mean, by_color, *differences
+
+
+def by_tangent(of, scene, colors, tangents):
+    """A value of the scene, its derivatives (T, *shape), and what comes with it: `of(scene)` is value and company.
+
+    tangents: `unit_tangents` of the colors.
+    """
+    places = _tables(colors)
+    tables = [named.get(scene, place) for place in places]
+
+    def varied(tables):
+        changed = scene
+        for place, table in zip(places, tables, strict=True):
+            changed = named.put(changed, place, table)
+        return of(changed)
 
     def push(tangents):
-        return jax.jvp(of, (tables,), (tangents,), has_aux=True)
+        return jax.jvp(varied, (tables,), (tangents,), has_aux=True)
 
-    tables = [named.get(scene, place) for place in places]
-    if not wanted.colors:
-        mean, differences = of(tables)
-        return mean, jnp.zeros((0, 3), mean.dtype), *differences
-    mean, by_color, differences = jax.vmap(push, out_axes=(None, 0, None))(tangents)
-    return mean, by_color, *differences
+    if not colors:
+        value, company = of(scene)
+        return value, jnp.zeros((0, *value.shape), value.dtype), company
+    return jax.vmap(push, out_axes=(None, 0, None))(tangents)
 
 
 def _mean_and_differences(work, scene, choice, steps, rows, strategy, derivative):

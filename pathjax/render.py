@@ -77,7 +77,7 @@ def render_pixels(
     """
     path.check_sampling(strategy, spp, seed, fresnel, split_depth, sampler)
     numbers = pixel.numbers(pixels, first_sample, spp, seed)
-    static = _Static(_differentiable(scene), strategy, split_depth, sampler, tuple(how.items()))
+    static = _Static(differentiable(scene), strategy, split_depth, sampler, tuple(how.items()))
     materials = bsdfs.with_fresnel(scene.materials, fresnel)
     return _means(static, replace(scene, materials=materials, about=None), pixels, *numbers)
 
@@ -107,7 +107,7 @@ def _means_jvp(static: _Static, primals, tangents):
         )
     scene, *arguments = primals
     scene_tangent, *_ = tangents
-    wanted = _differentiated(static.wanted, scene_tangent)
+    wanted = differentiated(static.wanted, scene_tangent)
     image, derivatives, _, _ = gradient.pixel_jacobians(
         scene, wanted, *arguments, strategy=static.strategy, method="difference", step=None, **dict(static.how)
     )
@@ -118,7 +118,7 @@ def _means_jvp(static: _Static, primals, tangents):
     return image, tangent
 
 
-def _differentiable(scene: Scene):
+def differentiable(scene: Scene):
     """Parameters that may be traced, by name."""
     if scene.about is None:
         return ()
@@ -127,7 +127,7 @@ def _differentiable(scene: Scene):
     return tuple((name, parameters[name]) for name in parameters if name in names)
 
 
-def _differentiated(candidates, scene_tangent):
+def differentiated(candidates, scene_tangent):
     """Parameters by name whose tangents may be other than zero."""
     leaves, _ = jax.tree_util.tree_flatten_with_path(scene_tangent, is_leaf=lambda x: isinstance(x, SymbolicZero))
     wanted = {}

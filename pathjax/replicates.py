@@ -6,6 +6,7 @@ replicate, count (N,) samples of all replicates together.
 
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -16,9 +17,10 @@ COUNT = 4
 _BLOCK = 1 << 16
 
 
-def seeds(seed: int) -> np.ndarray:
-    """(COUNT,) uint32 seeds of the replicates of a seed."""
-    return np.asarray(sampler.combine(jnp.arange(COUNT, dtype=jnp.uint32), jnp.uint32(seed)))
+def seeds(seed) -> np.ndarray | jax.Array:
+    """(COUNT,) uint32 seeds of the replicates of a seed; a JAX array within `jax.jit`."""
+    seeds = sampler.combine(jnp.arange(COUNT, dtype=jnp.uint32), jnp.uint32(seed))
+    return seeds if isinstance(seeds, jax.core.Tracer) else np.asarray(seeds)
 
 
 def shares(count: np.ndarray) -> np.ndarray:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pathjax import bsdfs, film
+from pathjax import bounces, bsdfs, film
 from pathjax.named import parameters
 from pathjax.scene import UNBOUNDED, Scene
 from pathjax.shapes import geometry
@@ -56,6 +56,42 @@ def facts(scene: Scene) -> dict:
     }
 
 
+def tail_facts(scene: Scene, error: float) -> dict:
+    """What the scene's max_depth cuts off, and the one that cuts off a share `error` of light, from a quick render.
+
+    Raises:
+        InputError: error is not between 0 and 1.
+    """
+    tail, max_depth = bounces.pilot(scene), int(scene.max_depth)
+    share, uncertainty = tail.cut_off(max_depth)
+    return {
+        "error": error,
+        "terms": tail.terms.tolist(),
+        "ratio": [_finite(x) for x in tail.ratio],
+        "cut_off": share.tolist() if max_depth < UNBOUNDED else [0.0] * 3,
+        "cut_off_error": [_finite(x) for x in uncertainty] if max_depth < UNBOUNDED else [0.0] * 3,
+        "max_depth": tail.depth_for(error),
+    }
+
+
+def _finite(x) -> float | None:
+    """JSON has no inf."""
+    return float(x) if np.isfinite(x) else None
+
+
+def _tail_lines(tail: dict, max_depth) -> list[str]:
+    if tail["max_depth"] is None:
+        return [f"tail        the last of {len(tail['terms'])} terms do not decay, so no max_depth can be suggested"]
+    worst = int(np.argmax(tail["cut_off"]))
+    ratio = ", ".join(f"{x:.3g}" for x in tail["ratio"])
+    lines = [f"tail        each bounce leaves {ratio} of the light before it (red, green, blue)"]
+    if max_depth is not None:
+        share, uncertainty = tail["cut_off"][worst], tail["cut_off_error"][worst]
+        lines.append(f"            max_depth {max_depth} cuts off {share:.2g} +- {uncertainty:.1g} of all light")
+    lines.append(f"            max_depth {tail['max_depth']} would cut off no more than {tail['error']:g}")
+    return lines
+
+
 def _bounds(about, name):
     low, high = about.parameters[name].bounds
     return [low, None if high == np.inf else high]
@@ -91,6 +127,8 @@ def text(facts: dict) -> str:
             f"tree        {kind}s: {tree['nodes']} nodes, {tree['leaves']} leaves "
             f"of {tree['primitives per leaf']:.1f}, depth {tree['depth']}, SAH cost {tree['sah cost']:.1f}"
         )
+    if "tail" in facts:
+        lines += _tail_lines(facts["tail"], integrator["max_depth"])
     lines.append("parameters" if facts["parameters"] else "parameters  none")
     for name, parameter in facts["parameters"].items():
         low, high = parameter["bounds"]

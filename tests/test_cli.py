@@ -199,6 +199,17 @@ def test_output_variables_are_channels(run, tmp_path):
         np.testing.assert_array_equal(image, expected[name])
 
 
+def test_bounces_are_channels_that_add_up_to_the_image(run, tmp_path):
+    arguments = ("-D", "max_depth=3", "--aov", "bounces", "--spp", 4, "--seed", 2)
+    assert run("render", FURNACE, *SMALL, "-o", tmp_path / "a.exr", *arguments)[0] == 0
+    channels, _ = read_exr(tmp_path / "a.exr")
+    layers = {f"bounces.{k}.{what}{c}" for k in range(3) for what in ("", "error.") for c in "RGB"}
+    assert set(channels) == {*"RGB", *layers}
+    for c in "RGB":
+        np.testing.assert_allclose(sum(channels[f"bounces.{k}.{c}"] for k in range(3)), channels[c], rtol=1e-6)
+        assert (channels[f"bounces.2.error.{c}"] > 0).all()
+
+
 # ---- what is refused ------------------------------------------------------------------------------------------------
 
 
@@ -259,6 +270,8 @@ def test_limits_that_are_no_positive_number(refused, tmp_path, option, value):
 def test_output_variables_that_cannot_be(refused, tmp_path):
     exr, png = ("-o", tmp_path / "a.exr"), ("-o", tmp_path / "a.png")
     refused("render", FURNACE, *exr, "--aov", "depht", says=["depht", "error, depth, normal, albedo"])
+    refused("render", FURNACE, *exr, "--aov", "bounces", "-D", "max_depth=-1", says=["no limit", "1 to 64", "--tail"])
+    refused("info", FURNACE, "--tail", "2", says=["error = 2", "between 0 and 1"])
     refused("render", FURNACE, *exr, "--aov", "", says=["error, depth, normal, albedo"])
     refused("render", FURNACE, *exr, "--aov", "depth,error,depth", says=["depth", "twice"])
     refused("render", FURNACE, *png, "--aov", "depth", says=["a.png", ".exr"])
@@ -410,6 +423,16 @@ def test_info_tells_of_the_sampler_and_the_tree(run):
     assert "20800 triangles" in out
     assert "SAH cost" in out
     assert "sampler" in out
+
+
+def test_info_suggests_a_depth_for_a_tail(run):
+    """The furnace's largest albedo is 0.8: 0.8^30 > 0.001 > 0.8^31."""
+    _, out, _ = run("info", FURNACE, *SMALL, "--tail", 0.001)
+    assert "max_depth 31 would cut off no more than 0.001" in out
+    _, out, _ = run("info", FURNACE, *SMALL, "--tail", 0.001, "--json")
+    facts = json.loads(out)["tail"]
+    assert facts["max_depth"] == 31
+    np.testing.assert_allclose(facts["cut_off"], [0.2**8, 0.5**8, 0.8**8], rtol=0.1)
 
 
 def test_info_of_a_scene_without_parameters_or_shapes(run, write_scene):

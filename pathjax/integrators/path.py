@@ -27,11 +27,18 @@ MOST_SPLITS = 8
 MIN_SURVIVAL, MAX_SURVIVAL = 0.05, 0.95
 
 
+class Gain(NamedTuple):
+    """Radiance that a path gathers at one vertex, by the term of L = Le + T Le + T^2 Le + ... that it belongs to."""
+
+    emission: jax.Array  # (3,) of the term T^depth Le, depth being that of the path before the vertex
+    light: jax.Array  # (3,) of the next one: the light sample
+
+
 class Path(NamedTuple):
     """What a path carries from one vertex to the next."""
 
     ray: Ray  # from the last vertex to the next
-    L: jax.Array  # (3,) radiance gathered so far
+    L: jax.Array | Gain  # (3,) radiance gathered so far; a Gain: at the last vertex alone
     throughput: jax.Array  # (3,) product of the weights so far
     pdf: jax.Array  # () density [1/sr] of ray.d by bsdf sampling; inf from a camera or a Dirac lobe
     passive: jax.Array | None  # () what glass did to the throughput, which roulette takes out; None: there is no glass
@@ -75,18 +82,20 @@ def trace(scene, choice: Choice | None, ray: Ray, numbers, strategy: str) -> Pat
     return lax.while_loop(lambda path: path.alive, on, start(scene, ray))
 
 
-def start(scene, ray: Ray, watch_glass: bool = False, split_depth: int = 0) -> Path:
+def start(scene, ray: Ray, watch_glass: bool = False, split_depth: int = 0, by_vertex: bool = False) -> Path:
     """A path that has its camera ray.
 
     Args:
         watch_glass: tell which dielectrics it meets.
         split_depth: of so many dielectrics, the first that it meets, follow both branches.
+        by_vertex: `L` is the Gain of each vertex.
     """
     one, zero3 = jnp.ones_like(ray.t_max), jnp.zeros_like(ray.o)
     passive = one if bsdfs.any_glass(scene.materials) else None
     glass = jnp.int32(0) if watch_glass else None
     throughput = zero3 + (scene.max_depth > 0)
-    path = Path(ray, zero3, throughput, one * jnp.inf, passive, jnp.int32(0), scene.max_depth > 0, glass)
+    L = Gain(zero3, zero3) if by_vertex else zero3
+    path = Path(ray, L, throughput, one * jnp.inf, passive, jnp.int32(0), scene.max_depth > 0, glass)
     return splitting.start(path, split_depth) if split_depth and passive is not None else path
 
 
@@ -147,7 +156,8 @@ def extend(scene, choice: Choice | None, path: Path, u: Bounce, strategy: str, d
 
     # Most surfaces are dark.
     bright = ~found | geometry.emits(shapes, hit) if shapes.tables else True
-    L = path.L + lax.cond(bright, emission, lambda: jnp.zeros_like(path.L))
+    emitted = lax.cond(bright, emission, lambda: jnp.zeros_like(path.throughput))
+    L = Gain(emitted, jnp.zeros_like(emitted)) if isinstance(path.L, Gain) else path.L + emitted
     if scene.hide_emitters:
         hidden = found & (path.depth == 0) & geometry.emits(shapes, hit)
     path = path._replace(L=L, depth=path.depth + 1)
@@ -176,7 +186,8 @@ def extend(scene, choice: Choice | None, path: Path, u: Bounce, strategy: str, d
                 visible = useful & ~geometry.occluded(shapes, shadow_ray, drawn.primitive)
                 return jnp.where(visible, contribution, 0)
 
-            L = L + path.throughput * lax.cond(smooth, direct, lambda: jnp.zeros_like(L))
+            light = path.throughput * lax.cond(smooth, direct, lambda: jnp.zeros_like(path.throughput))
+            L = L._replace(light=light) if isinstance(L, Gain) else L + light
 
         # ---- bsdf sample ------------------------------------------------------------------------------------------
         drawn = bsdfs.sample(materials, kind, row, surface.uv, wi, u.bsdf)

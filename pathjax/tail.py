@@ -1,0 +1,107 @@
+"""How much light a last depth cuts off: a geometric series through the last terms of L = Le + T Le + T^2 Le + ...
+
+Terms decay like powers of the largest eigenvalue of T once their light is spread over the scene. What passes through
+more vertices than were rendered before it comes to light at all (glass in glass) no fit to these terms can know.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from pathjax.errors import InputError
+
+# Terms that the series is fitted to; the first, lamps in view, says nothing of how light decays.
+LAST = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Tail:
+    """NumPy, float64, by channel. The series goes on from the last term as light * (1 - ratio) * ratio^k."""
+
+    terms: np.ndarray  # (depth, 3) mean radiance of each term over the image
+    standard_error: np.ndarray  # (depth, 3)
+    ratio: np.ndarray  # (3,) of a term to the one before it; 0 where none is left
+    light: np.ndarray  # (3,) radiance of all terms beyond; inf where they do not decay
+    covariance: np.ndarray  # (3, 2, 2) of log(last term) and log(ratio)
+
+    def cut_off(self, max_depth: int) -> tuple[np.ndarray, np.ndarray]:
+        """Share of all light (3,) that is lost beyond max_depth terms, and its standard error (3,).
+
+        Errors of terms add up as if they went together, at worst.
+        """
+        if max_depth < 0:
+            raise InputError(f"max_depth = {max_depth}; it is a number of terms, 0 or more")
+        depth = len(self.terms)
+        further = max(max_depth - depth, 0)
+        with np.errstate(invalid="ignore"):
+            beyond = self.light * self.ratio**further
+            by_log = np.stack([np.ones(3), 1 / np.maximum(1 - self.ratio, np.finfo(float).tiny) + further], -1)
+            error = beyond * np.sqrt(np.einsum("ci,cij,cj->c", by_log, self.covariance, by_log))
+        lost = beyond + self.terms[max_depth:].sum(0)
+        error = error + self.standard_error[max_depth:].sum(0)
+        total = self.terms.sum(0) + self.light
+        with np.errstate(invalid="ignore", divide="ignore"):
+            shares = [
+                np.where(np.isinf(self.light), bad, np.where(total > 0, x / total, 0))
+                for x, bad in ((lost, 1.0), (error, np.inf))
+            ]
+        return tuple(shares)
+
+    def depth_for(self, error: float) -> int | None:
+        """Least max_depth that cuts off no more than this share of light in any channel; None: light does not decay.
+
+        Raises:
+            InputError: error is not between 0 and 1.
+        """
+        if not 0 < error < 1:
+            raise InputError(f"error = {error}; a share of light that may be cut off lies between 0 and 1")
+        if not np.isfinite(self.light).all():
+            return None
+        depth = len(self.terms)
+        for max_depth in range(1, depth + 1):
+            if (self.cut_off(max_depth)[0] <= error).all():
+                return max_depth
+        share, _ = self.cut_off(depth)
+        lacking = share > error
+        further = np.log(error / share[lacking]) / np.log(self.ratio[lacking])
+        return depth + math.ceil(further.max())
+
+
+def fit(terms: np.ndarray, standard_error: np.ndarray) -> Tail:
+    """The Tail of mean radiances (depth, 3) with their standard errors.
+
+    Least squares for the logarithms, weighted by their errors; where they scatter by more than these, so does the fit.
+
+    Raises:
+        InputError: fewer than 3 terms.
+    """
+    if len(terms) < 3:
+        raise InputError(f"depth = {len(terms)}; a tail needs two terms beside emission, so render 3 or more")
+    terms, standard_error = np.asarray(terms, float), np.asarray(standard_error, float)
+    first = max(1, len(terms) - LAST)
+    fits = [_fit(terms[first:, channel], standard_error[first:, channel]) for channel in range(3)]
+    ratio, light, covariance = (np.array(x) for x in zip(*fits, strict=True))
+    return Tail(terms, standard_error, ratio, light, covariance)
+
+
+def _fit(m, error):
+    """Ratio, light beyond, and the covariance (2, 2) of one channel."""
+    if m[-1] <= 0:
+        return 0.0, 0.0, np.zeros((2, 2))
+    k = np.arange(len(m)) - (len(m) - 1.0)
+    lit = m > 0
+    k, m, error = k[lit], m[lit], error[lit]
+    if len(m) < 2:
+        return np.inf, np.inf, np.full((2, 2), np.inf)
+    # What is rendered without noise still has rounding.
+    sigma = np.maximum(np.nan_to_num(error), np.finfo(np.float32).eps * m) / m
+    design = np.stack([np.ones_like(k), k], -1) / sigma[:, None]
+    covariance = np.linalg.inv(design.T @ design)
+    last, slope = covariance @ design.T @ (np.log(m) / sigma)
+    misfit = ((np.log(m) / sigma - design @ [last, slope]) ** 2).sum()
+    covariance = covariance * max(1.0, misfit / max(len(m) - 2, 1))
+    ratio = float(np.exp(slope))
+    return ratio, float(np.exp(last) * ratio / (1 - ratio)) if ratio < 1 else np.inf, covariance
