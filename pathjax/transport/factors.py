@@ -288,8 +288,8 @@ def _pair_visibility(work, shapes, patches, rays, seed):
     stream = sampler.combine(sampler.pixel_stream(seed, i), j)
 
     def add(number, sums):
-        numbers = (sampler.sobol_pair(stream, number, pair) for pair in (0, 1))
-        u, v = lax.optimization_barrier(tuple(x.astype(patches.area.dtype) for x in numbers))
+        numbers = sampler.lattice_point(stream, number, 0).astype(patches.area.dtype)
+        u, v = lax.optimization_barrier((numbers[:2], numbers[2:]))
         primitive, p, n, margin = point(patches, shapes, i, u)
         target, q, n_target, _ = point(patches, shapes, j, v)
         squared = dot(q - p, q - p)

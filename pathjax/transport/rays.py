@@ -61,8 +61,8 @@ def _one(work, shapes, patches, seed):
     """Patch that ray `number` of the patch `sender` meets."""
     sender, number = work
     stream = sampler.pixel_stream(seed, sender)
-    numbers = (sampler.sobol_pair(stream, number, pair) for pair in (0, 1))
-    u, u_direction = lax.optimization_barrier(tuple(x.astype(patches.area.dtype) for x in numbers))
+    numbers = sampler.lattice_point(stream, number, 0).astype(patches.area.dtype)
+    u, u_direction = lax.optimization_barrier((numbers[:2], numbers[2:]))
     primitive, p, n, margin = point(patches, shapes, sender, u)
     d = to_world(frame_from_normal(n), square_to_cosine_hemisphere(u_direction))
     ray = lax.optimization_barrier(spawn_ray(Surface(p, n, margin, n, u), d, primitive))
