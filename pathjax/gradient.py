@@ -246,7 +246,7 @@ def _pixel_jacobian(work, scene, choice, tangents, steps, wanted, strategy):
         derivative = bool(wanted.colors)
         if not wanted.glass:
             none = jnp.zeros((0, 3), scene.camera.origin.dtype)
-            return pixel.mean(work, varied, choice, strategy, derivative), (none, none)
+            return pixel.mean(work, varied, choice, strategy=strategy, derivative=derivative), (none, none)
         return _mean_and_differences(work, varied, choice, steps, wanted.glass, strategy, derivative)
 
     def push(tangents):
