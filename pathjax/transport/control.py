@@ -59,7 +59,9 @@ class Control:
         left = path.throughput * S0
         size = left[0] + left[1] + left[2]
         expected = jnp.where(path.depth == 1, size, path.expected)
-        survival = larger(smaller(self.effort * safe_divide(size, expected), most), least)
+        # Where nothing is expected, the patches know nothing.
+        share = jnp.where(expected > 0, safe_divide(size, expected), 1)
+        survival = larger(smaller(self.effort * share, most), least)
         survival = lax.optimization_barrier(jnp.where(path.depth >= _FIRST, survival, 1))
         survives = u < survival
         L = path.L + left * jnp.where(survives, 1 - 1 / survival, 1)
