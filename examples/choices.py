@@ -3,9 +3,9 @@
     python examples/choices.py [QUESTION...]
 
 Which strategy, roulette from which depth, what does Schlick's approximation cost, does splitting at glass pay, which
-random numbers, which split rule of the hierarchy, which filter? Choices are rendered with the same seeds, in turns;
-relMSE is measured against a converged reference. Writes choices.png. A further choice is one line here: its label, its
-scene, and what `pathjax.render` is to do otherwise.
+random numbers, which split rule of the hierarchy, which filter, does a coarse solution help? Choices are rendered with
+the same seeds, in turns; relMSE is measured against a converged reference. Writes choices.png. A further choice is one
+line here: its label, its scene, and what `pathjax.render` is to do otherwise.
 """
 
 import argparse
@@ -18,6 +18,7 @@ import jax
 import numpy as np
 
 import pathjax as pj
+from pathjax import transport
 from pathjax.bench import figures, plot
 from pathjax.bsdfs import FRESNEL
 from pathjax.integrators.path import SAMPLERS, STRATEGIES
@@ -27,6 +28,7 @@ from pathjax.shapes.bvh_build import RULES
 
 SCENES = Path(__file__).resolve().parents[1] / "scenes"
 BATCHES = 16  # independent images that make up a reference
+PATCHES = 400  # of the coarse solution
 REFERENCE_SEED = 1 << 20  # of the first; no timed render has it
 LOOKS = [
     {"color": color, "marker": marker}
@@ -92,7 +94,18 @@ def reconstruction(res):
     return [Choice("box", build(scene)), Choice("tent", build(with_tent(scene)), truth=1)]
 
 
-QUESTIONS = (strategy, roulette, fresnel, splitting, sampler, split_rule, reconstruction)
+def control(res):
+    """Does it pay to end paths in a coarse solution, whose own time comes on top (Cornell box, max_depth 32)?"""
+    scene = build(description("cornell_box", res, max_depth=32))
+    transport.operator(scene, PATCHES).solve()  # compiles
+    started = time.perf_counter()
+    op = transport.operator(scene, PATCHES)
+    L = jax.block_until_ready(op.solve().L)
+    label = f"solved in {time.perf_counter() - started:.2f} s, effort"
+    return [Choice("none", scene)] + [Choice(f"{label} {x}", scene, {"control": op.control(L, x)}) for x in (1, 2, 4)]
+
+
+QUESTIONS = (strategy, roulette, fresnel, splitting, sampler, split_rule, reconstruction, control)
 QUESTIONS = {question.__name__: question for question in QUESTIONS}
 
 

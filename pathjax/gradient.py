@@ -242,7 +242,7 @@ def _pixel_jacobian(work, scene, choice, tangents, steps, wanted, strategy):
     def of(scene):
         if not wanted.glass:
             none = jnp.zeros((0, 3), scene.camera.origin.dtype)
-            return pixel.mean(work, scene, choice, strategy, derivative), (none, none)
+            return pixel.mean(work, scene, choice, strategy=strategy, derivative=derivative), (none, none)
         return _mean_and_differences(work, scene, choice, steps, wanted.glass, strategy, derivative)
 
     mean, by_color, differences = by_tangent(of, scene, wanted.colors, tangents)

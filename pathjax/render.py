@@ -26,6 +26,7 @@ def render(
     fresnel: str = "exact",
     split_depth: int = 0,
     sampler: str = "lattice",
+    control=None,
 ):
     """Image of a scene: (H, W, 3), linear RGB, unbiased up to the scene's max_depth (but for `fresnel="schlick"`).
 
@@ -45,13 +46,15 @@ def render(
             0 to 8. A sample may then be 2^split_depth paths.
         sampler: random numbers, "lattice", or "independent" of each other, or "subpixel": independent, but with a
             quarter of the samples in each of 2 x 2 strata of the pixel's filter; spp is then a multiple of 4.
+        control: a `transport.Control`, of `Operator.control`, into which paths end instead of into darkness. The mean
+            stays, whatever light it holds. It pays where paths are long, and some seconds of them: see the README.
     Raises:
         InputError: a choice is unknown or out of range, as spp or seed; differentiation in anything but named
-            parameters, or with another sampler or split_depth than the default.
+            parameters, or with another sampler, split_depth or control than the default.
     A sample that is not finite leaves its pixel not finite, and the others untouched.
     """
     pixels = jnp.arange(film.pixel_count(scene.film), dtype=jnp.int32)
-    choices = {"fresnel": fresnel, "split_depth": split_depth, "sampler": sampler}
+    choices = {"fresnel": fresnel, "split_depth": split_depth, "sampler": sampler, "control": control}
     image = render_pixels(scene, pixels, 0, spp, seed, strategy, **choices)
     return image.reshape(*film.image_shape(scene.film), 3)
 
@@ -67,19 +70,29 @@ def render_pixels(
     fresnel: str = "exact",
     split_depth: int = 0,
     sampler: str = "lattice",
+    control=None,
     **how,
 ):
     """Means over the samples first_sample, ..., first_sample + spp - 1 of some pixels: (N,) int32 -> (N, 3).
 
     first_sample, spp, seed: each one number, or (N,) of the pixels.
-    strategy, fresnel, split_depth, sampler: of `render`.
+    strategy, fresnel, split_depth, sampler, control: of `render`.
     how: `form` and `devices` of `runtime.native_map`.
     """
     path.check_sampling(strategy, spp, seed, fresnel, split_depth, sampler)
+    if control is not None:
+        from pathjax.transport import Control  # imports lineax, a quarter of a second
+
+        if not isinstance(control, Control):
+            raise InputError(
+                f"control = {control!r}; give a transport.Control: op = transport.operator(scene); "
+                "control = op.control(op.solve().L)"
+            )
+        control.check(scene.geometry)
     numbers = pixel.numbers(pixels, first_sample, spp, seed)
     static = _Static(differentiable(scene), strategy, split_depth, sampler, tuple(how.items()))
     materials = bsdfs.with_fresnel(scene.materials, fresnel)
-    return _means(static, replace(scene, materials=materials, about=None), pixels, *numbers)
+    return _means(static, replace(scene, materials=materials, about=None), control, pixels, *numbers)
 
 
 @dataclass(frozen=True)
@@ -92,9 +105,9 @@ class _Static:
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _means(static: _Static, scene, pixels, first_sample, spp, seed):
+def _means(static: _Static, scene, control, pixels, first_sample, spp, seed):
     how = {"strategy": static.strategy, "split_depth": static.split_depth, "sampler": static.sampler}
-    return _render_pixels(scene, pixels, first_sample, spp, seed, **how, **dict(static.how))
+    return _render_pixels(scene, pixels, first_sample, spp, seed, control, **how, **dict(static.how))
 
 
 @partial(_means.defjvp, symbolic_zeros=True)
@@ -105,7 +118,9 @@ def _means_jvp(static: _Static, primals, tangents):
             f"derivatives are not made with split_depth={static.split_depth} and sampler={static.sampler!r}; "
             "differentiate with split_depth=0 and sampler='lattice', whose image has the same expectation"
         )
-    scene, *arguments = primals
+    scene, control, *arguments = primals
+    if control is not None:
+        raise InputError("derivatives are not made with a control; without one the image has the same expectation")
     scene_tangent, *_ = tangents
     wanted = differentiated(static.wanted, scene_tangent)
     image, derivatives, _, _ = gradient.pixel_jacobians(
@@ -148,9 +163,20 @@ def differentiated(candidates, scene_tangent):
 
 @partial(jax.jit, static_argnames=("strategy", "split_depth", "sampler", "form", "devices"))
 def _render_pixels(
-    scene, pixels, first_sample, spp, seed, *, strategy, split_depth=0, sampler="lattice", form=None, devices=None
+    scene,
+    pixels,
+    first_sample,
+    spp,
+    seed,
+    control=None,
+    *,
+    strategy,
+    split_depth=0,
+    sampler="lattice",
+    form=None,
+    devices=None,
 ):
     choice = emitters.choice(scene.emitters, strategy)
     pixel_mean = partial(pixel.mean, strategy=strategy, split_depth=split_depth, points=sampler)
     work = pixels, first_sample, spp, seed
-    return native_map(pixel_mean, work, scene, choice, form=form, devices=devices)
+    return native_map(pixel_mean, work, scene, choice, control, form=form, devices=devices)

@@ -47,6 +47,7 @@ class Path(NamedTuple):
     glass: jax.Array | None  # () int32 bit r % 31 is set once the path met row r of the dielectrics; None: not asked
     splits: jax.Array | None = None  # () int32 how many dielectrics may still split it; None: none ever
     pending: Path | None = None  # (split_depth, ...) branches that wait, those alive; see `splitting`
+    expected: jax.Array | None = None  # () what a control expects of it, all channels; None: there is no control
 
 
 class Bounce(NamedTuple):
@@ -82,24 +83,37 @@ def trace(scene, choice: Choice | None, ray: Ray, numbers, strategy: str) -> Pat
     return lax.while_loop(lambda path: path.alive, on, start(scene, ray))
 
 
-def start(scene, ray: Ray, watch_glass: bool = False, split_depth: int = 0, by_vertex: bool = False) -> Path:
+def start(
+    scene,
+    ray: Ray,
+    watch_glass: bool = False,
+    split_depth: int = 0,
+    by_vertex: bool = False,
+    controlled: bool = False,
+) -> Path:
     """A path that has its camera ray.
 
     Args:
         watch_glass: tell which dielectrics it meets.
         split_depth: of so many dielectrics, the first that it meets, follow both branches.
         by_vertex: `L` is the Gain of each vertex.
+        controlled: `extend` is given a control.
     """
     one, zero3 = jnp.ones_like(ray.t_max), jnp.zeros_like(ray.o)
     passive = one if bsdfs.any_glass(scene.materials) else None
     glass = jnp.int32(0) if watch_glass else None
     throughput = zero3 + (scene.max_depth > 0)
     L = Gain(zero3, zero3) if by_vertex else zero3
-    path = Path(ray, L, throughput, one * jnp.inf, passive, jnp.int32(0), scene.max_depth > 0, glass)
+    expected = jnp.zeros_like(one) if controlled else None
+    path = Path(
+        ray, L, throughput, one * jnp.inf, passive, jnp.int32(0), scene.max_depth > 0, glass, expected=expected
+    )
     return splitting.start(path, split_depth) if split_depth and passive is not None else path
 
 
-def extend(scene, choice: Choice | None, path: Path, u: Bounce, strategy: str, derivative: bool = False) -> Path:
+def extend(
+    scene, choice: Choice | None, path: Path, u: Bounce, strategy: str, derivative: bool = False, control=None
+) -> Path:
     """Follow a path to its next vertex.
 
     Args:
@@ -108,6 +122,7 @@ def extend(scene, choice: Choice | None, path: Path, u: Bounce, strategy: str, d
         u: Bounce, the vertex's own.
         strategy: "mis", or for experiments "light" (next-event estimation alone) or "bsdf" (without it).
         derivative: follow also what carries nothing, since its derivative may; the value is the same.
+        control: `transport.Control` whose roulette takes the place of the usual one, or None.
     Returns:
         Path; once it is not alive, `L` is the radiance that arrives, unbiased up to max_depth.
     Gradient: what is drawn is detached from albedos and radiances, so weights carry the derivative, unbiased. Where the
@@ -206,14 +221,15 @@ def extend(scene, choice: Choice | None, path: Path, u: Bounce, strategy: str, d
             passive = lax.stop_gradient(path.passive * drawn.passive)
             left = safe_divide(largest, passive)
         survival = larger(smaller(left, most), least)
-        survival = lax.optimization_barrier(jnp.where(path.depth >= scene.rr_depth, survival, 1))
+        survival = jnp.where(path.depth >= scene.rr_depth, survival, 1) if control is None else jnp.ones_like(left)
+        survival = lax.optimization_barrier(survival)
         # A direction of density 0 (a random number of exactly 0 can give one) carries nothing.
         alive = (kind >= 0) & (drawn.pdf > 0) & (derivative | (largest > 0)) & (u.roulette < survival)
         pdf = jnp.where(drawn.delta, jnp.inf, drawn.pdf)
         if path.glass is not None:
             glass = path.glass | bsdfs.glass_bit(materials, kind, row)
         ray_on = spawn_ray(surface, d, hit.primitive)
-        on = Path(ray_on, L, throughput / survival, pdf, passive, path.depth, alive, glass)
+        on = Path(ray_on, L, throughput / survival, pdf, passive, path.depth, alive, glass, expected=path.expected)
         if path.pending is None:
             return on
         on = on._replace(splits=path.splits - splits.astype(jnp.int32), pending=path.pending)
@@ -231,6 +247,13 @@ def extend(scene, choice: Choice | None, path: Path, u: Bounce, strategy: str, d
 
     if not shapes.tables:
         return end(path)
+    if control is not None:
+        path, goes_on = lax.cond(
+            goes_on,
+            lambda path: control.roulette(shapes, path, hit, surface, u.roulette, least, most),
+            lambda path: (path, goes_on),
+            path,
+        )
     if scene.hide_emitters:
         beyond = spawn_ray(surface, ray.d, hit.primitive)._replace(t_max=ray.t_max - hit.t)
         through = path._replace(ray=beyond, depth=jnp.int32(0))

@@ -24,7 +24,7 @@ def camera_path(scene, pixel, stream, number, points="lattice", **how):
 
     Args:
         pixel: () int32; stream: () uint32, its `sampler.pixel_stream`; number: () uint32; points: of `path.SAMPLERS`.
-        how: `watch_glass` and `split_depth` of `path.start`.
+        how: `watch_glass`, `split_depth` and `controlled` of `path.start`.
     """
     u_film, u_lens = lax.optimization_barrier(path.camera_numbers(scene, stream, number, points))
     position, weight = film.sample_position(scene.film, pixel, u_film)
@@ -38,16 +38,17 @@ def no_path(scene, **how):
     return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), nothing)
 
 
-def mean(work, scene, choice, strategy, derivative=False, split_depth=0, points="lattice"):
+def mean(work, scene, choice, control=None, *, strategy, derivative=False, split_depth=0, points="lattice"):
     """(3,) mean of a pixel's samples.
 
     Args:
         work: the pixel () int32, and its `numbers`.
-        derivative: of `path.extend`; split_depth: of `path.start`; points: of `path.SAMPLERS`.
+        derivative, control: of `path.extend`; split_depth: of `path.start`; points: of `path.SAMPLERS`.
     """
     pixel, first_sample, spp, seed = work
     stream = sampler.pixel_stream(seed, pixel)
-    begin = partial(camera_path, scene, pixel, stream, points=points, split_depth=split_depth)
+    how = {"split_depth": split_depth, "controlled": control is not None}
+    begin = partial(camera_path, scene, pixel, stream, points=points, **how)
 
     # One loop over the vertices of all samples, so that no lane waits for the longest path of another.
     def step(state):
@@ -55,13 +56,13 @@ def mean(work, scene, choice, strategy, derivative=False, split_depth=0, points=
         now, weight = lax.cond(now.alive, lambda: (now, weight), lambda: begin(number))
         now, weight = lax.optimization_barrier((now, weight))
         u = path.bounce_numbers(scene, stream, number, now.depth, points)
-        now = path.extend(scene, choice, now, u, strategy, derivative)
+        now = path.extend(scene, choice, now, u, strategy, derivative, control)
         value = lax.optimization_barrier(weight * now.L)
         sums = lax.cond(now.alive, lambda: sums, lambda: add_compensated(sums, value))
         return number + jnp.where(now.alive, 0, 1).astype(number.dtype), now, weight, sums
 
     zero = jnp.zeros((3,), scene.camera.origin.dtype)
-    start = first_sample, *no_path(scene, split_depth=split_depth), (zero, zero)
+    start = first_sample, *no_path(scene, **how), (zero, zero)
     *_, (total, _) = lax.while_loop(lambda state: state[0] != first_sample + spp, step, start)
     return total / spp.astype(total.dtype)
 

@@ -5,11 +5,12 @@
     image = transport.image(scene, op.radiosity(solution.L))    # through the camera, without noise
 
 `operator` says what a scene may hold, `operators.py` what is discretised and how it errs, `radiance` looks light up
-at a point of a surface within code of one ray.
+at a point of a surface within code of one ray, `Operator.control` makes paths end in it.
 """
 
+from pathjax.transport.control import Control
 from pathjax.transport.operators import METHODS, Operator, Solution, operator
 from pathjax.transport.patches import Patches
 from pathjax.transport.view import Radiosity, image, radiance
 
-__all__ = ["METHODS", "Operator", "Patches", "Radiosity", "Solution", "image", "operator", "radiance"]
+__all__ = ["METHODS", "Control", "Operator", "Patches", "Radiosity", "Solution", "image", "operator", "radiance"]

@@ -29,6 +29,7 @@ from pathjax.errors import InputError
 from pathjax.scene import Scene
 from pathjax.transport import factors as dense_factors
 from pathjax.transport import rays as ray_casting
+from pathjax.transport.control import Control
 from pathjax.transport.patches import Patches, cut
 from pathjax.transport.view import Radiosity, radiosity
 
@@ -132,6 +133,13 @@ class Operator:
     def radiosity(self, L) -> Radiosity:
         """Light L (U, 3) on the patches, for `transport.image` and `transport.radiance`."""
         return radiosity(self.patches, L)
+
+    def control(self, L, effort: float = 2.0) -> Control:
+        """Light L (U, 3), best the solution, as a control variate for `pathjax.render`; see `control`.
+
+        effort: survival where all of a path's light is still to be found; more makes paths longer and less noisy.
+        """
+        return Control(self.radiosity(self.T.mv(L)), jnp.asarray(effort, self.Le.dtype))
 
     def error(self, L) -> jax.Array:
         """Standard error (U, 3) that the errors of the form factors leave in T L, for light L (U, 3)."""

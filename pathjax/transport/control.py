@@ -1,0 +1,68 @@
+"""A coarse solution as a control variate of the path tracer: roulette that ends paths into L0 instead of into 0.
+
+At a vertex y of a path let S(y) = (T L)(y) be the light that it reflects, S0(y) its value on the patches, and s the
+estimate of S(y) that the rest of the path would make. With survival q, independent of s,
+
+    S0(y)  if the path ends,        S0(y) + (s - S0(y)) / q  if it goes on,
+
+has the mean of s whatever S0 is, and the variance Var(s) / q + (1 / q - 1) (S(y) - S0(y))^2, where plain roulette has
+S(y)^2 in the last term. The first term remains however good S0 is: a perfect one saves time at the price of noise.
+
+Survival is proportional to the share of a path's expected light that is still to be found at y, throughput * S0(y)
+over S0 at its first vertex (Vorba and Krivanek 2016, "Adjoint-driven Russian roulette and splitting").
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from pathjax.core.math import dot, larger, safe_divide, smaller
+from pathjax.errors import InputError
+from pathjax.shapes.geometry import Geometry
+from pathjax.transport.view import Radiosity, radiance
+
+# Pixels would show the patches if paths ended at what the camera sees.
+_FIRST = 2
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Control:
+    """For `pathjax.render`, of `Operator.control`."""
+
+    reflected: Radiosity  # S0
+    effort: jax.Array  # () survival where all of a path's light is still to be found
+
+    def check(self, shapes: Geometry) -> None:
+        """Refuse, with an InputError, the patches of other shapes."""
+        cut, held = self.reflected.patches.first.shape[0], shapes.shape.shape[0]
+        if cut != held:
+            raise InputError(
+                f"control was made of a scene of {cut} primitives, and this one has {held}; make it of this scene: "
+                "op = transport.operator(scene); control = op.control(op.solve().L)"
+            )
+
+    def roulette(self, shapes: Geometry, path, hit, surface, u, least, most):
+        """Decide at a vertex, before its light is sampled, whether a path goes on.
+
+        Args:
+            path: `integrators.path.Path` that has reached the vertex, where `geometry.surface` is `surface`.
+            u: () uniform; least, most: () bounds of survival.
+        Returns:
+            Path, its L and throughput weighted; () bool whether it goes on.
+        """
+        S0 = radiance(self.reflected, shapes, hit.primitive, surface.p, dot(surface.n, path.ray.d) > 0)
+        left = path.throughput * S0
+        size = left[0] + left[1] + left[2]
+        expected = jnp.where(path.depth == 1, size, path.expected)
+        # Where nothing is expected, the patches know nothing.
+        share = jnp.where(expected > 0, safe_divide(size, expected), 1)
+        survival = larger(smaller(self.effort * share, most), least)
+        survival = lax.optimization_barrier(jnp.where(path.depth >= _FIRST, survival, 1))
+        survives = u < survival
+        L = path.L + left * jnp.where(survives, 1 - 1 / survival, 1)
+        return path._replace(L=L, throughput=path.throughput / survival, expected=expected), survives
