@@ -5,7 +5,6 @@ Exit status: 0 done, 1 the work failed (of `compare`: the images differ), 2 the 
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
 import os
@@ -14,13 +13,15 @@ import threading
 import time
 from pathlib import Path
 
+from pathjax.arguments import parser
 from pathjax.errors import InputError
 
 DONE, FAILED, WRONG = 0, 1, 2
 
 
 def main(arguments: list[str] | None = None) -> int:
-    options = _parser().parse_args(arguments)
+    commands = {"render": _render, "fit": _fit, "info": _info, "bench": _bench, "compare": _compare}
+    options = parser(commands).parse_args(arguments)
     try:
         return options.run(options)
     except InputError as error:
@@ -32,148 +33,6 @@ def main(arguments: list[str] | None = None) -> int:
     except BrokenPipeError:
         sys.stderr.close()
         return FAILED
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="pathjax", description="A differentiable Monte Carlo path tracer.")
-    commands = parser.add_subparsers(required=True, metavar="COMMAND")
-
-    render = commands.add_parser("render", help="render a scene to an image")
-    _add_scene(render)
-    render.add_argument("-o", "--output", required=True, metavar="OUT.{exr,png}")
-    spp = "most samples per pixel; default: the file's, where neither --error nor --time is given"
-    render.add_argument("--spp", type=_positive, metavar="N", help=spp)
-    error = "stop when sqrt(relMSE) is as low: 0.02 is 2 %%"
-    render.add_argument("--error", type=_real, metavar="E", help=error)
-    render.add_argument("--time", type=_real, metavar="SECONDS", help="stop after so much rendering")
-    checkpoint = "save the state there, and go on from it when called again"
-    render.add_argument("--checkpoint", metavar="FILE.npz", help=checkpoint)
-    aov = "further channels of an EXR file, separated by commas"
-    render.add_argument("--aov", type=_names, default=[], metavar="{error,depth,normal,albedo,bounces}", help=aov)
-    render.add_argument("--seed", type=_seed, default=0, metavar="K")
-    render.add_argument("--strategy", default="mis", metavar="{mis,light,bsdf}", help="how light is sampled")
-    render.add_argument("--json", action="store_true", help="print one JSON object on stdout")
-    render.set_defaults(run=_render)
-
-    fit = commands.add_parser("fit", help="recover parameters from an image of the scene")
-    _add_scene(fit)
-    fit.add_argument("target", metavar="TARGET.{exr,png}")
-    param = "a parameter to recover; may be repeated"
-    fit.add_argument("--param", dest="params", action="append", required=True, metavar="NAME[=START]", help=param)
-    fit.add_argument("--spp", type=_positive, default=128, metavar="N", help="of each of the two last renders")
-    fit.add_argument("--seed", type=_seed, default=0, metavar="K")
-    fit.add_argument("-o", "--output", default="fit", metavar="PREFIX", help="writes PREFIX.json and PREFIX.png")
-    fit.add_argument("--json", action="store_true", help="print one JSON object on stdout")
-    fit.set_defaults(run=_fit)
-
-    info = commands.add_parser("info", help="what a scene holds and what is compiled for it")
-    _add_scene(info)
-    tail = "suggest a max_depth that cuts off no more than this share of light (renders a few terms)"
-    info.add_argument("--tail", type=_real, metavar="E", help=tail)
-    info.add_argument("--json", action="store_true", help="print one JSON object on stdout")
-    info.set_defaults(run=_info)
-
-    bench = commands.add_parser("bench", help="speed against error")
-    bench.add_argument("scenes", nargs="+", metavar="SCENE.xml")
-    bench.add_argument("-D", dest="defines", action="append", default=[], type=_pair, metavar="name=value")
-    bench.add_argument("--against", choices=("mitsuba",), help="measure this peer in the same run")
-    bench.add_argument("--spp", type=_spp_list, default=[16, 64, 256], metavar="16,64,256")
-    bench.add_argument("--reference-spp", type=_positive, default=16384, metavar="N", help="of the converged reference")
-    bench.add_argument("--repeat", type=_positive, default=5, metavar="N", help="timed runs of each; medians are shown")
-    bench.add_argument("-o", "--output", metavar="DIR", help="also write bench.md, bench.json and plots there")
-    bench.add_argument("--quick", action="store_true", help="speed against error alone")
-    bench.add_argument("--json", action="store_true", help="print one JSON object on stdout")
-    bench.set_defaults(run=_bench)
-
-    compare = commands.add_parser(
-        "compare",
-        help="how an image differs from a reference",
-        description="Of image A against reference B, in linear light: MSE; relMSE = mean((A - B)^2 / (B^2 + 0.01)); "
-        "PSNR, whose peak is B's maximum; HDR-FLIP. If one is PNG or JPEG, the peak is 1 and FLIP is LDR-FLIP.",
-        epilog="Exit status: 0 the images agree, or no limit was set; 1 they differ: relMSE or FLIP is above its "
-        "limit, or with --errors p is below ALPHA; 2 the command or a file is wrong.",
-    )
-    compare.add_argument("image", metavar="A.{exr,png,jpg}")
-    compare.add_argument("reference", metavar="B.{exr,png,jpg}")
-    compare.add_argument(
-        "--errors",
-        action="store_true",
-        help="weigh differences by the standard errors in channels error.R, error.G, error.B of one or both; where "
-        "only one holds them the other is taken as exact",
-    )
-    alpha = "with --errors: the chance that equal scenes are said to differ; default: 0.001"
-    compare.add_argument("--alpha", type=_chance, default=1e-3, help=alpha)
-    compare.add_argument("--max-relmse", type=_limit, metavar="X", help="differ where relMSE is above")
-    compare.add_argument("--max-flip", type=_limit, metavar="X", help="differ where the mean of FLIP is above")
-    picture = "a picture: A, B, their difference (red: A is brighter) and, with --errors, its z-scores"
-    compare.add_argument("-o", "--output", metavar="DIFF.png", help=picture)
-    compare.add_argument("--json", action="store_true", help="print one JSON object on stdout")
-    compare.set_defaults(run=_compare)
-    return parser
-
-
-def _add_scene(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("scene", metavar="SCENE.xml")
-    parser.add_argument(
-        "-D", dest="defines", action="append", default=[], type=_pair, metavar="name=value", help="a $name of the file"
-    )
-    parser.add_argument(
-        "--set", dest="settings", action="append", default=[], type=_pair, metavar="NAME=VALUE", help="a parameter"
-    )
-
-
-def _pair(text: str) -> tuple[str, str]:
-    name, equals, value = text.partition("=")
-    if not name or not equals:
-        raise argparse.ArgumentTypeError(f"{text!r} is not of the form name=value")
-    return name, value
-
-
-def _positive(text: str) -> int:
-    if not text.isdecimal() or not 0 < int(text) < 2**31:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a positive integer below 2^31")
-    return int(text)
-
-
-def _real(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not (value > 0 and math.isfinite(value)):
-        raise argparse.ArgumentTypeError(f"{text!r} is not a positive number")
-    return value
-
-
-def _names(text: str) -> list[str]:
-    return text.split(",")
-
-
-def _seed(text: str) -> int:
-    if not text.isdecimal() or int(text) >= 2**31:
-        raise argparse.ArgumentTypeError(f"{text!r} is not an integer in [0, 2^31)")
-    return int(text)
-
-
-def _limit(text: str) -> float:
-    return _between(text, math.inf, "a number that is not negative")
-
-
-def _chance(text: str) -> float:
-    return _between(text, 1, "a number in [0, 1]")
-
-
-def _between(text: str, most: float, what: str) -> float:
-    try:
-        if 0 <= float(text) <= most:
-            return float(text)
-    except ValueError:
-        pass
-    raise argparse.ArgumentTypeError(f"{text!r} is not {what}")
-
-
-def _spp_list(text: str) -> list[int]:
-    return [_positive(part) for part in text.split(",")]
 
 
 def _numbers(option: str, name: str, text: str):

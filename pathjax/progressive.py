@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pathjax import film, replicates
-from pathjax.render import _render_pixels
+from pathjax.render import pixel_means
 from pathjax.scene import Scene
 
 # Paths in one call of the kernel: large enough that the call costs nothing, small enough that an interrupt is heard
@@ -95,5 +95,5 @@ def _call(scene, chunk, pixels, first_sample, spp, seeds, strategy):
     tiled = padded(np.tile(pixels.astype(np.int32), (replicates.COUNT, 1)), mode="edge")
     numbers = (x.astype(np.uint32) for x in (padded(first_sample), padded(spp), np.repeat(seeds, chunk)))
     # Without the derivatives of `render_pixels`, whose machinery takes longer than a call of few samples.
-    means = _render_pixels(replace(scene, about=None), tiled, *numbers, strategy=strategy)
+    means = pixel_means(replace(scene, about=None), tiled, *numbers, strategy=strategy)
     return np.asarray(means, np.float32).reshape(replicates.COUNT, chunk, 3)[:, : len(pixels)]

@@ -107,7 +107,7 @@ class _Static:
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _means(static: _Static, scene, control, pixels, first_sample, spp, seed):
     how = {"strategy": static.strategy, "split_depth": static.split_depth, "sampler": static.sampler}
-    return _render_pixels(scene, pixels, first_sample, spp, seed, control, **how, **dict(static.how))
+    return pixel_means(scene, pixels, first_sample, spp, seed, control, **how, **dict(static.how))
 
 
 @partial(_means.defjvp, symbolic_zeros=True)
@@ -162,7 +162,7 @@ def differentiated(candidates, scene_tangent):
 
 
 @partial(jax.jit, static_argnames=("strategy", "split_depth", "sampler", "form", "devices"))
-def _render_pixels(
+def pixel_means(
     scene,
     pixels,
     first_sample,
@@ -176,6 +176,7 @@ def _render_pixels(
     form=None,
     devices=None,
 ):
+    """What `render_pixels` gives, without its checks and derivatives; arguments as there, spp and seed (N,) uint32."""
     choice = emitters.choice(scene.emitters, strategy)
     pixel_mean = partial(pixel.mean, strategy=strategy, split_depth=split_depth, points=sampler)
     work = pixels, first_sample, spp, seed

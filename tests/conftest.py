@@ -18,7 +18,7 @@ from pathjax import gradient
 from pathjax.film import image_shape, pixel_count
 from pathjax.integrators import pixel
 from pathjax.io import mitsuba_xml
-from pathjax.render import _render_pixels
+from pathjax.render import pixel_means
 from pathjax.scene import build
 
 os.environ["PATHJAX_CACHE"] = "0"  # tests leave the user's cache of kernels alone, and compile what they test
@@ -136,7 +136,7 @@ def kernel_of(shipped):
         scene = shipped(name, dtype, res=16)
         pixels = jnp.arange(pixel_count(scene.film), dtype=jnp.int32)
         numbers = pixel.numbers(pixels, 0, 1, 1)
-        lowered = _render_pixels.lower(replace(scene, about=None), pixels, *numbers, strategy="mis")
+        lowered = pixel_means.lower(replace(scene, about=None), pixels, *numbers, strategy="mis")
         return Kernel(scene, lowered.compile())
 
     return compile

@@ -10,7 +10,7 @@ import pytest
 import pathjax as pj
 from pathjax import bsdfs, runtime
 from pathjax.integrators import path, pixel
-from pathjax.render import _render_pixels, render_pixels
+from pathjax.render import pixel_means, render_pixels
 
 INTERFACE = """
 <shape type="rectangle"><transform name="to_world"><scale value="5"/></transform>
@@ -145,7 +145,7 @@ def test_two_by_two_strata_lower_the_error_of_independent_numbers(make_scene, es
 def lowered(scene, fresnel="exact", **static):
     pixels = jnp.arange(256, dtype=jnp.int32)
     scene = replace(scene, materials=bsdfs.with_fresnel(scene.materials, fresnel), about=None)
-    return _render_pixels.lower(scene, pixels, *pixel.numbers(pixels, 0, 4, 1), strategy="mis", **static)
+    return pixel_means.lower(scene, pixels, *pixel.numbers(pixels, 0, 4, 1), strategy="mis", **static)
 
 
 TRACES = {  # what the debug information of a program names, if it was chosen

@@ -12,7 +12,7 @@ import pathjax as pj
 from pathjax import aovs, query, runtime
 from pathjax.film import pixel_count
 from pathjax.integrators import pixel
-from pathjax.render import _render_pixels
+from pathjax.render import pixel_means
 
 ROOT = Path(__file__).resolve().parents[1]
 NAMES = sorted(path.stem for path in (*ROOT.glob("scenes/*.xml"), *ROOT.glob("tests/scenes/*.xml")))
@@ -28,7 +28,7 @@ def lowered(scene, strategy="mis", devices=None, pixels=256, form=None):
     pixels = jnp.arange(pixels, dtype=jnp.int32)
     numbers = pixel.numbers(pixels, 0, 4, 1)
     static = {"strategy": strategy, "devices": devices, "form": form}
-    return _render_pixels.lower(replace(scene, about=None), pixels, *numbers, **static)
+    return pixel_means.lower(replace(scene, about=None), pixels, *numbers, **static)
 
 
 def assert_one_native_kernel(compiled):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import pathjax as pj
-from pathjax import gradient, named
+from pathjax import gradient, ior_step, named
 from pathjax.film import pixel_count
 from pathjax.io.image import write_exr
 
@@ -508,7 +508,7 @@ def test_motion_of_the_image_behind_a_ball_lens(stage):
     dy_deta = HEIGHT * BEHIND / f**2 * df
     pixel = 2 * np.tan(np.radians(1e-4 / 2)) / 16
     dy_dpixel = pixel * (EYE + BEHIND - BEHIND * EYE / f)
-    (motion,) = gradient._motions(replace(scene, about=None), jnp.asarray([0], jnp.int32))
+    (motion,) = ior_step.motions(replace(scene, about=None), jnp.asarray([0], jnp.int32))
     assert float(motion) == pytest.approx(abs(dy_deta / dy_dpixel), rel=5e-3)
 
 

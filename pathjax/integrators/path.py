@@ -223,7 +223,7 @@ def extend(
         survival = larger(smaller(left, most), least)
         survival = jnp.where(path.depth >= scene.rr_depth, survival, 1) if control is None else jnp.ones_like(left)
         survival = lax.optimization_barrier(survival)
-        # A direction of density 0 (a random number of exactly 0 can give one) carries nothing.
+        # A direction of density 0 (in the surface, by rounding; a branch of glass that cannot be) carries nothing.
         alive = (kind >= 0) & (drawn.pdf > 0) & (derivative | (largest > 0)) & (u.roulette < survival)
         pdf = jnp.where(drawn.delta, jnp.inf, drawn.pdf)
         if path.glass is not None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
-
 import jax
 import jax.numpy as jnp
 from jax import lax
@@ -24,7 +22,7 @@ def camera_path(scene, pixel, stream, number, points="lattice", **how):
 
     Args:
         pixel: () int32; stream: () uint32, its `sampler.pixel_stream`; number: () uint32; points: of `path.SAMPLERS`.
-        how: `watch_glass`, `split_depth` and `controlled` of `path.start`.
+        how: of `path.start`.
     """
     u_film, u_lens = lax.optimization_barrier(path.camera_numbers(scene, stream, number, points))
     position, weight = film.sample_position(scene.film, pixel, u_film)
@@ -45,26 +43,44 @@ def mean(work, scene, choice, control=None, *, strategy, derivative=False, split
         work: the pixel () int32, and its `numbers`.
         derivative, control: of `path.extend`; split_depth: of `path.start`; points: of `path.SAMPLERS`.
     """
-    pixel, first_sample, spp, seed = work
-    stream = sampler.pixel_stream(seed, pixel)
-    how = {"split_depth": split_depth, "controlled": control is not None}
-    begin = partial(camera_path, scene, pixel, stream, points=points, **how)
 
-    # One loop over the vertices of all samples, so that no lane waits for the longest path of another.
-    def step(state):
-        number, now, weight, sums = state
-        now, weight = lax.cond(now.alive, lambda: (now, weight), lambda: begin(number))
-        now, weight = lax.optimization_barrier((now, weight))
-        u = path.bounce_numbers(scene, stream, number, now.depth, points)
-        now = path.extend(scene, choice, now, u, strategy, derivative, control)
+    def add(sums, depth, now, weight):
         value = lax.optimization_barrier(weight * now.L)
-        sums = lax.cond(now.alive, lambda: sums, lambda: add_compensated(sums, value))
-        return number + jnp.where(now.alive, 0, 1).astype(number.dtype), now, weight, sums
+        return lax.cond(now.alive, lambda: sums, lambda: add_compensated(sums, value))
 
     zero = jnp.zeros((3,), scene.camera.origin.dtype)
-    start = first_sample, *no_path(scene, **how), (zero, zero)
-    *_, (total, _) = lax.while_loop(lambda state: state[0] != first_sample + spp, step, start)
+    start = {"points": points, "split_depth": split_depth, "controlled": control is not None}
+    extend = {"strategy": strategy, "derivative": derivative, "control": control}
+    total, _ = over_vertices(work, scene, choice, add, (zero, zero), start, extend)
+    _, _, spp, _ = work
     return total / spp.astype(total.dtype)
+
+
+def over_vertices(work, scene, choice, add, sums, start, extend):
+    """Sums over all vertices of a pixel's samples: one loop, so that no lane waits for the longest path of another.
+
+    Args:
+        work: the pixel () int32, and its `numbers`.
+        add: (sums, depth () int32 of the path before the vertex, Path after it, weight () of the sample) -> sums.
+        start, extend: keywords of `camera_path` and of `path.extend`.
+    """
+    pixel, first_sample, spp, seed = work
+    stream = sampler.pixel_stream(seed, pixel)
+    points = start.get("points", "lattice")
+
+    def step(state):
+        number, now, weight, sums = state
+        now, weight = lax.cond(
+            now.alive, lambda: (now, weight), lambda: camera_path(scene, pixel, stream, number, **start)
+        )
+        now, weight = lax.optimization_barrier((now, weight))
+        depth = now.depth
+        now = path.extend(scene, choice, now, path.bounce_numbers(scene, stream, number, depth, points), **extend)
+        sums = add(sums, depth, now, weight)
+        return number + jnp.where(now.alive, 0, 1).astype(number.dtype), now, weight, sums
+
+    state = first_sample, *no_path(scene, **start), sums
+    return lax.while_loop(lambda state: state[0] != first_sample + spp, step, state)[-1]
 
 
 def add_compensated(state, term):

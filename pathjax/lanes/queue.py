@@ -51,6 +51,7 @@ def from_queue(machine: Lanes, program, xs, shared, place, flags):
     kept = [*own, *loop.outvars]
     differing = [True] * len(own) + flags(loop.outvars)
     shapes = [v.aval.shape for v in kept]
+    dtypes = [v.aval.dtype for v in kept]
 
     def part(values, atoms):
         return [machine.read(values, v) for v in atoms]
@@ -78,7 +79,8 @@ def from_queue(machine: Lanes, program, xs, shared, place, flags):
 
         def serve_one(state):
             lane, (following, item, packed, results) = state
-            ended = common | dict(zip(kept, map(partial(of_lane, lane), packed, differing, shapes), strict=True))
+            mine = map(partial(of_lane, lane), packed, differing, shapes, dtypes)
+            ended = common | dict(zip(kept, mine, strict=True))
             machine.run_equations(after, ended)
             # A lane without an item writes what its next one overwrites.
             row = jnp.minimum(at(item, lane), following)
@@ -110,11 +112,11 @@ def from_queue(machine: Lanes, program, xs, shared, place, flags):
     return results
 
 
-def of_lane(lane, columns, differs, shape):
+def of_lane(lane, columns, differs, shape, dtype):
     """A packed value, as one lane has it."""
     if not differs:
         return columns
-    return jnp.stack([at(column, lane) for column in columns]).reshape(shape) if columns else jnp.zeros(shape)
+    return jnp.stack([at(column, lane) for column in columns]).reshape(shape) if columns else jnp.zeros(shape, dtype)
 
 
 def put(column, x, lane):

@@ -10,7 +10,7 @@ import pytest
 import pathjax as pj
 from pathjax import transport
 from pathjax.integrators import pixel
-from pathjax.render import _render_pixels
+from pathjax.render import pixel_means
 from pathjax.scene import UNBOUNDED
 
 BALL = """<shape type="sphere"><boolean name="flip_normals" value="true"/><bsdf type="diffuse">
@@ -112,7 +112,7 @@ def test_nothing_of_it_is_compiled_without(box):
     pixels = jnp.arange(144, dtype=jnp.int32)
     work = replace(scene, about=None), pixels, *pixel.numbers(pixels, 0, 4, 1)
     texts = [
-        _render_pixels.lower(*work, control, strategy="mis", form="loop").as_text(debug_info=True)
+        pixel_means.lower(*work, control, strategy="mis", form="loop").as_text(debug_info=True)
         for control in (None, op.control(L))
     ]
     assert ["/transport/control.py" in text for text in texts] == [False, True]
