@@ -86,7 +86,8 @@ def sample_ray(camera: Camera, position, u_lens) -> Ray:
     def to_world(v):
         return v[0] * right + v[1] * up + v[2] * forward
 
-    v, start = lax.optimization_barrier((to_world(local), start))
+    local, start = lax.optimization_barrier((local, start))
+    v = lax.optimization_barrier(to_world(local))
     length = jnp.sqrt(dot(v, v))
     d = v / length
     along = length / local[2]

@@ -48,7 +48,7 @@ def sample(lights: AreaLights, shapes: Geometry, row, ref, u, u_triangle) -> Emi
 
         def by_direction():
             place = at(lights.first, row)
-            d, distance, n, pdf = sphere.sample_direction(table, place, ref, u)
+            d, distance, n, pdf = lax.optimization_barrier(sphere.sample_direction(table, place, ref, u))
             return _facing(d, distance, n, pdf, Le, place + start)
 
         def by_area():
@@ -59,11 +59,12 @@ def sample(lights: AreaLights, shapes: Geometry, row, ref, u, u_triangle) -> Emi
             else:
                 p, n, margin = planar.sample(table, place, u)
             # The far end of a shadow ray stays clear of what touches the light, as its near end does.
-            p = p + n * jnp.copysign(margin, dot(n, ref - p))
+            p = lax.optimization_barrier(p + n * jnp.copysign(margin, dot(n, ref - p)))
             to_p = p - ref
             squared = dot(to_p, to_p)
             distance = safe_sqrt(squared)
             d = to_p * safe_divide(1, distance)
+            d, distance = lax.optimization_barrier((d, distance))
             pdf = safe_divide(squared, jnp.abs(dot(n, d)) * n_lights)
             return _facing(d, distance, n, pdf, Le, place + start)
 
