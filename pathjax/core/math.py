@@ -87,7 +87,7 @@ def cos_sin_octant(x):
     terms = range(5 if x.dtype == jnp.float32 else 9)
     squared = x * x
     cos, sin = ([(-1) ** k / math.factorial(2 * k + first) for k in terms] for first in (0, 1))
-    return _series(squared, cos), x * _series(squared, sin)
+    return lax.optimization_barrier((_series(squared, cos), x * _series(squared, sin)))
 
 
 def cos_sin_turns(u):

@@ -116,7 +116,8 @@ def sample_direction(table: Spheres, row, ref, u):
     to_center = center - ref
     axis = normalize(to_center)
     frame = frame_from_normal(axis)
-    d = lax.optimization_barrier(to_world(frame, square_to_cone(u, one_minus_cos)))
+    local = lax.optimization_barrier(square_to_cone(u, one_minus_cos))
+    d = lax.optimization_barrier(to_world(frame, local))
     b = dot(to_center, d)
     closest = b * d - to_center
     distance = larger(b - safe_sqrt(radius * radius - dot(closest, closest)), jnp.zeros_like(b))
