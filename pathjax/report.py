@@ -7,7 +7,7 @@ import numpy as np
 from pathjax import bounces, bsdfs, film
 from pathjax.named import parameters
 from pathjax.scene import UNBOUNDED, Scene
-from pathjax.shapes import geometry
+from pathjax.shapes import bvh, geometry
 from pathjax.shapes.planar import Planar
 
 _SAMPLER = "randomly shifted lattice, hashing for roulette"
@@ -18,6 +18,7 @@ def facts(scene: Scene) -> dict:
     about = scene.about
     description = about.description
     max_depth = int(scene.max_depth)
+    parts = [part for table in scene.geometry.tables for part in geometry.searched(table)]
     height, width = film.image_shape(scene.film)
     return {
         "file": description.file,
@@ -30,9 +31,9 @@ def facts(scene: Scene) -> dict:
         },
         "sampler": {"file": description.sampler, "used": _SAMPLER},
         "shapes": len(description.shapes),
-        "primitives": {_kind(table): _primitives(table) for table in scene.geometry.tables},
+        "primitives": {_kind(part): _primitives(part) for part in parts},
         "compiled": {
-            "shapes": [_kind(table) + (" (tree)" if table.tree else " (flat)") for table in scene.geometry.tables],
+            "shapes": [_kind(part) + (" (tree)" if part.tree else " (flat)") for part in parts],
             "bsdfs": [type(table).__name__.removesuffix("Table").lower() for table in scene.materials.tables],
             "light sampling": bsdfs.any_smooth(scene.materials) and scene.emitters.area is not None,
             "emitters": [name for name in ("area", "constant") if getattr(scene.emitters, name) is not None],
@@ -97,14 +98,14 @@ def _bounds(about, name):
     return [low, None if high == np.inf else high]
 
 
-def _primitives(table) -> int:
-    return int((geometry.rows_of(table.leaves) >= 0).sum())
+def _primitives(part) -> int:
+    return int((bvh.rows_of(part.leaves) >= 0).sum())
 
 
-def _kind(table) -> str:
-    if isinstance(table, Planar):
-        return "disks" if table.disk else "rectangles"
-    return type(table).__name__.lower()
+def _kind(part) -> str:
+    if isinstance(part, Planar):
+        return "disks" if part.disk else "rectangles"
+    return type(part).__name__.lower()
 
 
 def text(facts: dict) -> str:

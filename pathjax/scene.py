@@ -21,7 +21,8 @@ from pathjax.errors import InputError
 from pathjax.film import Film
 from pathjax.named import About, Parameter
 from pathjax.shapes import geometry as geometry_module
-from pathjax.shapes import planar, sphere, triangle
+from pathjax.shapes import box, planar, sphere, triangle
+from pathjax.shapes.box import Boxes
 from pathjax.shapes.bvh_build import RULES
 from pathjax.shapes.geometry import Geometry
 from pathjax.shapes.planar import Planar
@@ -192,15 +193,15 @@ def _dielectric(bsdfs, dtype, parameters, path) -> DielectricTable:
 
 # ---- shapes and lights --------------------------------------------------------------------------------------------
 
-# Faces of the cube [-1, 1]^3: centre, directions of u and v, normal; uv as Mitsuba's cube has it.
+# Faces of the cube [-1, 1]^3 in the order of `Boxes`: centre, directions of u and v, normal; uv as in Mitsuba's cube.
 _CUBE = np.array(
     [
+        [[-1, 0, 0], [0, 1, 0], [0, 0, 1], [-1, 0, 0]],
+        [[1, 0, 0], [0, 1, 0], [0, 0, -1], [1, 0, 0]],
         [[0, -1, 0], [0, 0, 1], [1, 0, 0], [0, -1, 0]],
         [[0, 1, 0], [-1, 0, 0], [0, 0, -1], [0, 1, 0]],
-        [[1, 0, 0], [0, 1, 0], [0, 0, -1], [1, 0, 0]],
-        [[0, 0, 1], [0, 1, 0], [1, 0, 0], [0, 0, 1]],
-        [[-1, 0, 0], [0, 1, 0], [0, 0, 1], [-1, 0, 0]],
         [[0, 0, -1], [0, -1, 0], [1, 0, 0], [0, 0, -1]],
+        [[0, 0, 1], [0, 1, 0], [1, 0, 0], [0, 0, 1]],
     ],
     float,
 )
@@ -237,7 +238,9 @@ def _build_shapes(description, dtype, parameters, split_rule):
     kinds = {name: _Kind() for name in ("sphere", "rectangle", "disk", "triangle")}
     radiance, lights = [], []  # lights: emitter, area, kind, first row, count
 
-    for number, shape in enumerate(description.shapes):
+    # Faces of cubes come after the other rectangles: `Planar` finds the last of its rectangles by boxes.
+    numbered = sorted(enumerate(description.shapes), key=lambda item: isinstance(item[1].geometry, desc.Cube))
+    for number, shape in numbered:
         match shape.geometry:
             case desc.Sphere() as ball:
                 name, part = "sphere", [(ball, shape.flip_normals)]
@@ -273,7 +276,8 @@ def _build_shapes(description, dtype, parameters, split_rule):
     tables, trees, names = [], {}, []
     for name, make in (("sphere", _spheres), ("rectangle", _planars), ("disk", _planars), ("triangle", _triangles)):
         if kinds[name].shape:
-            table, trees[name] = make(kinds[name].parts, name, dtype, split_rule)
+            table, built = make(kinds[name].parts, name, dtype, split_rule)
+            trees |= built
             tables.append(table)
             names.append(name)
     geometry = Geometry(
@@ -319,15 +323,22 @@ def _spheres(parts, name, dtype, rule):
     leaves, tree, built = geometry_module.leaves_of(numbers, *bounds, dtype, rule)
     to_local = np.swapaxes(rotation, 1, 2)
     arrays = (np.asarray(x, dtype) for x in (balls, to_local, sign))
-    return Spheres(leaves, tree, *arrays), built
+    return Spheres(leaves, tree, *arrays), {name: built}
 
 
 def _planars(parts, name, dtype, rule):
-    frames = np.concatenate(parts)
-    disk = name == "disk"
-    bounds = planar.bounds(frames, disk)
-    leaves, tree, built = geometry_module.leaves_of(planar.leaf_numbers(frames), *bounds, dtype, rule)
-    return Planar(leaves, tree, np.asarray(frames, dtype), disk), built
+    frames, disk = np.concatenate(parts), name == "disk"
+    single = sum(len(part) == 1 for part in parts)
+    alone, faces = frames[:single], frames[single:]
+    numbers, bounds = planar.leaf_numbers(alone), planar.bounds(alone, disk)
+    leaves, tree, built = geometry_module.leaves_of(numbers, *bounds, dtype, rule)
+    boxes, built_of_boxes = None, None
+    if len(faces):
+        numbers, bounds = box.leaf_numbers(faces), box.bounds(faces)
+        place = {"first": single, "step": box.FACES}
+        *found, built_of_boxes = geometry_module.leaves_of(numbers, *bounds, dtype, rule, **place)
+        boxes = Boxes(*found)
+    return Planar(leaves, tree, np.asarray(frames, dtype), boxes, disk), {name: built, "box": built_of_boxes}
 
 
 def _triangles(parts, name, dtype, rule):
@@ -343,4 +354,4 @@ def _triangles(parts, name, dtype, rule):
     uv = optional(2, lambda v: np.broadcast_to(np.array([[0, 0], [1, 0], [0, 1]], float), (len(v), 3, 2)))
     bounds = triangle.bounds(vertices)
     leaves, tree, built = geometry_module.leaves_of(triangle.leaf_numbers(vertices), *bounds, dtype, rule)
-    return Triangles(leaves, tree, np.asarray(vertices, dtype), normals, uv), built
+    return Triangles(leaves, tree, np.asarray(vertices, dtype), normals, uv), {name: built}

@@ -16,7 +16,8 @@ from jax import lax
 from pathjax.core.math import at, integer_like, smaller
 from pathjax.core.types import Hit, Ray, Surface
 from pathjax.lanes import one_by_one
-from pathjax.shapes import bvh, bvh_build, planar, sphere, triangle
+from pathjax.shapes import box, bvh, bvh_build, planar, sphere, triangle
+from pathjax.shapes.box import Boxes
 from pathjax.shapes.planar import Planar
 from pathjax.shapes.sphere import Spheres
 from pathjax.shapes.triangle import Triangles
@@ -27,7 +28,7 @@ NO_HIT = np.int32(0x7FFFFFFF)
 FLAT_LIMIT = 32
 LEAF_WIDTH = 8
 
-_MODULES = {Triangles: triangle, Planar: planar, Spheres: sphere}
+_MODULES = {Triangles: triangle, Planar: planar, Boxes: box, Spheres: sphere}
 
 
 @jax.tree_util.register_dataclass
@@ -38,12 +39,13 @@ class Geometry:
     light: jax.Array  # (P,) int32 row in the table of lights; -1: emits nothing
 
 
-def leaves_of(numbers, lo, hi, dtype, rule="sah"):
+def leaves_of(numbers, lo, hi, dtype, rule="sah", first=0, step=1):
     """Pack primitives for intersection.
 
     Args:
         numbers: (P, K) what the intersection wants to know of each primitive.
         lo, hi: (P, 3) bounds.
+        first, step: primitive i is row first + step i of its table.
     Returns:
         leaves (L, K + 1, W), tree (None for a few primitives, each a leaf of its own), built tree for reports or None.
         The last numbers of a leaf are the bits of its rows: one block, so that a visit misses the cache once.
@@ -60,14 +62,9 @@ def leaves_of(numbers, lo, hi, dtype, rule="sah"):
         tree = bvh.pack(built, dtype)
     padded = np.concatenate([numbers, np.full((1, numbers.shape[1]), np.nan)])
     leaves = np.moveaxis(padded[rows], 1, 2).astype(dtype)  # row -1 is the padding
+    rows = np.where(rows < 0, rows, first + step * rows)
     bits = rows.astype(integer_like(leaves.dtype)).view(leaves.dtype)
     return jnp.asarray(np.concatenate([leaves, bits[:, None]], 1)), tree, built
-
-
-def rows_of(leaf):
-    """Rows (..., W) of the primitives of a leaf (..., K + 1, W), ascending; -1 in empty lanes."""
-    bits = leaf[..., -1, :]
-    return lax.bitcast_convert_type(bits, integer_like(bits.dtype)).astype(jnp.int32)
 
 
 def firsts(geometry: Geometry) -> list[int]:
@@ -84,9 +81,9 @@ def closest_hit(geometry: Geometry, ray: Ray) -> Hit:
 
     def leaf_test(distances, primitives, t, primitive):
         if len(distances) == 1:
-            (distance,) = lax.optimization_barrier(distances)
+            (distance,), (candidate,) = lax.optimization_barrier((distances, primitives))
             nearer = (distance > 0) & ((distance < t) | ((distance == t) & (primitive == none)))
-            return jnp.where(nearer, distance, t), jnp.where(nearer, primitives[0], primitive)
+            return jnp.where(nearer, distance, t), jnp.where(nearer, candidate, primitive)
         # Positive floats order as integers, and integer minima vectorise. A miss is the bits of infinity or more.
         bits = jnp.where((distances > 0) & (distances <= t), _bits(distances), beyond)
         bits = lax.optimization_barrier(bits)
@@ -151,18 +148,23 @@ def switch_by_range(number, first: list[int], branches):
 def _visit(geometry: Geometry, ray: Ray, leaf_test, t, primitive):
     """Give every leaf that the ray may meet to `leaf_test(distances (W,), primitives (W,), t, primitive)`."""
     for table, first in zip(geometry.tables, firsts(geometry), strict=True):
-        t, primitive = _visit_table(table, first, ray, leaf_test, t, primitive)
+        for part in searched(table):
+            t, primitive = _visit_table(part, first, ray, leaf_test, t, primitive)
     return t, primitive
+
+
+def searched(table):
+    """What of a table is searched, each with leaves and a tree of its own."""
+    parts = [table, table.boxes] if isinstance(table, Planar) else [table]
+    return [part for part in parts if part is not None and len(part.leaves)]
 
 
 def _visit_table(table, first, ray, leaf_test, t, primitive):
     module = _MODULES[type(table)]
 
     def leaf(prepared, exclude, number, t, primitive):
-        rows = rows_of(at(table.leaves, number))
-        primitives = rows + first  # of empty lanes: nonsense, but these are never hit
-        distances = module.intersect(table, number, prepared, primitives == exclude)
-        return leaf_test(distances, primitives, t, primitive)
+        distances, rows = module.intersect(table, number, prepared, exclude - first)
+        return leaf_test(distances, rows + first, t, primitive)
 
     # A search goes its own way for each ray; what it starts from is made for all of them.
     @one_by_one
@@ -174,7 +176,9 @@ def _visit_table(table, first, ray, leaf_test, t, primitive):
     if table.tree is not None:
         return search(bvh.prepare(ray.o, ray.d), prepared, ray.exclude, t, primitive)
     of_ray = partial(leaf, prepared, ray.exclude)
-    return lax.fori_loop(0, len(table.leaves), lambda number, state: of_ray(number, *state), (t, primitive))
+    found = lax.fori_loop(0, len(table.leaves), lambda number, state: of_ray(number, *state), (t, primitive))
+    # XLA dissolves a loop of one trip, and would test again for each consumer.
+    return lax.optimization_barrier(found)
 
 
 def _least(x):

@@ -16,7 +16,8 @@ import numpy as np
 from pathjax.core.math import at, dot, larger, safe_atan2, safe_divide, safe_sqrt
 from pathjax.core.types import Surface
 from pathjax.core.warp import square_to_disk
-from pathjax.shapes.bvh import Tree
+from pathjax.shapes.box import Boxes
+from pathjax.shapes.bvh import Tree, rows_of
 
 
 @jax.tree_util.register_dataclass
@@ -25,6 +26,7 @@ class Planar:
     leaves: jax.Array  # (L, 15, W) of `leaf_numbers`, NaN in empty lanes; row of each lane
     tree: Tree | None  # None: L = 1, every ray tests all
     frames: jax.Array  # (P, 4, 3): c, a, b, unit normal
+    boxes: Boxes | None  # which find the last of the rectangles, in place of the leaves
     disk: bool = field(metadata={"static": True})
 
 
@@ -34,7 +36,7 @@ def leaf_numbers(frames):
     normal = np.cross(a, b)
     squared = (normal**2).sum(-1, keepdims=True)
     dual_a, dual_b = np.cross(b, normal) / squared, np.cross(normal, a) / squared
-    # A coordinate is computed from o - c and t d, whose lengths differ by at most the radius: its error is bounded by
+    # A coordinate is computed from c - o and t d, whose lengths differ by at most the radius: its error is bounded by
     # |dual| (2 t + radius) roundings.
     radius = np.sqrt((a**2).sum(-1) + (b**2).sum(-1))
     slope_a, slope_b = np.sqrt((dual_a**2).sum(-1)), np.sqrt((dual_b**2).sum(-1))
@@ -53,22 +55,27 @@ def prepare(o, d):
     return o, d
 
 
-def intersect(table: Planar, leaf, prepared, on_it):
-    """Distances to the W of a leaf: (W,), NaN or inf where missed, possibly negative where behind.
+def intersect(table: Planar, leaf, prepared, start):
+    """Of the W shapes of a leaf.
 
-    on_it: (W,) bool, the ray starts on this primitive, which is flat and not hit again.
+    Args:
+        start: () int32 row of the shape that the ray starts on, which is flat and not hit again, or of nothing here.
+    Returns:
+        distances (W,), NaN or inf where missed, possibly negative where behind; rows (W,).
     The border is inclusive by the rounding error of the coordinate, so faces that share an edge leave no gap.
     """
     o, d = prepared
     leaf = at(table.leaves, leaf)
     c, n, dual_a, dual_b, error = leaf[0:3], leaf[3:6], leaf[6:9], leaf[9:12], leaf[12:14]
-    from_c = [o[axis] - c[axis] for axis in range(3)]
-    t = -dot(n, from_c) / dot(n, d)
-    x = dot(dual_a, from_c) + t * dot(dual_a, d)
-    y = dot(dual_b, from_c) + t * dot(dual_b, d)
-    reach = 1 + (4 * np.finfo(leaf.dtype).eps) * (error[0] + t * error[1])
+    to_c = [c[axis] - o[axis] for axis in range(3)]
+    t = dot(n, to_c) / dot(n, d)
+    p = [t * d[axis] - to_c[axis] for axis in range(3)]
+    x, y = dot(dual_a, p), dot(dual_b, p)
+    error = error * (4 * np.finfo(leaf.dtype).eps)
+    reach = (1 + error[0]) + t * error[1]
     inside = x * x + y * y <= reach * reach if table.disk else larger(jnp.abs(x), jnp.abs(y)) <= reach
-    return jnp.where(inside & ~on_it, t, jnp.inf)
+    rows = rows_of(leaf)
+    return jnp.where(inside & (rows != start), t, jnp.inf), rows
 
 
 def count(table: Planar) -> int:

@@ -23,7 +23,7 @@ from pathjax.core.math import (
 )
 from pathjax.core.types import Surface
 from pathjax.core.warp import SPHERE_PDF, cone_pdf, square_to_cone, square_to_sphere
-from pathjax.shapes.bvh import Tree
+from pathjax.shapes.bvh import Tree, rows_of
 
 
 @jax.tree_util.register_dataclass
@@ -49,11 +49,13 @@ def prepare(o, d):
     return o, d
 
 
-def intersect(table: Spheres, leaf, prepared, on_it):
-    """Distances to the W spheres of a leaf: (W,), NaN where missed, negative where behind.
+def intersect(table: Spheres, leaf, prepared, start):
+    """Of the W spheres of a leaf.
 
     Args:
-        on_it: (W,) bool, the ray starts on this sphere: its root at the origin is exactly 0 and does not count.
+        start: () int32 row of the sphere that the ray starts on, whose root there is exactly 0, or of nothing here.
+    Returns:
+        distances (W,), NaN where missed, negative where behind; rows (W,).
 
     Discriminant from the vector of closest approach, roots without cancellation (Haines, Gunther, Akenine-Moller 2019,
     "Precision improvements for ray/sphere intersection").
@@ -66,11 +68,12 @@ def intersect(table: Spheres, leaf, prepared, on_it):
     closest = [f[axis] + b * d[axis] for axis in range(3)]
     half_chord = jnp.sqrt(radius * radius - dot(closest, closest))  # NaN: a miss, and every comparison drops it
     f_length = jnp.sqrt(dot(f, f))
-    c = jnp.where(on_it, 0, (f_length - radius) * (f_length + radius))
+    rows = rows_of(leaf)
+    c = jnp.where(rows == start, 0, (f_length - radius) * (f_length + radius))
     q = b + jnp.copysign(half_chord, b)
     other = c / q
     near, far = jnp.where(q < other, q, other), jnp.where(q < other, other, q)
-    return jnp.where(near > 0, near, far)
+    return jnp.where(near > 0, near, far), rows
 
 
 def count(table: Spheres) -> int:

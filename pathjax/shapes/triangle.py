@@ -12,7 +12,7 @@ from jax import lax
 from pathjax.core.math import at, cross, dot, normalize, rescale, safe_divide
 from pathjax.core.types import Surface
 from pathjax.core.warp import square_to_triangle
-from pathjax.shapes.bvh import Tree
+from pathjax.shapes.bvh import Tree, rows_of
 
 
 @jax.tree_util.register_dataclass
@@ -51,10 +51,13 @@ def prepare(o, d):
     return jnp.stack([x, y, z]), jnp.stack([at(o, x), at(o, y), at(o, z), *shear])
 
 
-def intersect(table: Triangles, leaf, prepared, on_it):
-    """Distances to the W triangles of a leaf: (W,), NaN or inf where missed, possibly negative where behind.
+def intersect(table: Triangles, leaf, prepared, start):
+    """Of the W triangles of a leaf.
 
-    on_it: (W,) bool, the ray starts on this triangle, which is flat and not hit again.
+    Args:
+        start: () int32 row of the triangle that the ray starts on, which is flat and not hit again, or of nothing here.
+    Returns:
+        distances (W,), NaN or inf where missed, possibly negative where behind; rows (W,).
     Watertight: edges are inclusive by the rounding error of their edge function. (Contraction to fused multiply-adds
     leaves the plain functions of two triangles that share an edge with different signs.)
     """
@@ -83,7 +86,8 @@ def intersect(table: Triangles, leaf, prepared, on_it):
     t = (u * z[0] + v * z[1] + w * z[2]) * ray[5] / det
     # Seen edge-on, or tiny and far from the ray, all three errors rule and every edge is inclusive.
     sound = jnp.abs(det) > u_error + v_error + w_error
-    return jnp.where((front | back) & sound & ~on_it, t, jnp.inf)
+    rows = rows_of(at(table.leaves, leaf))
+    return jnp.where((front | back) & sound & (rows != start), t, jnp.inf), rows
 
 
 def count(table: Triangles) -> int:

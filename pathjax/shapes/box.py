@@ -1,0 +1,86 @@
+"""Boxes (parallelepipeds where sheared): six rectangles that one test finds.
+
+Only the search is here; what is found are rectangles of a `Planar` table, which holds the boxes. A ray that starts
+outside a box meets one of them first, one that starts inside or on it leaves through one: its edges have no gaps.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from pathjax.core.math import at, dot, larger, smaller
+from pathjax.shapes.bvh import Tree, rows_of
+
+FACES = 6
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Boxes:
+    """The face of a box where its coordinate `axis` is -1 or 1 is its rectangle number 2 axis + 0 or 1."""
+
+    leaves: jax.Array  # (L, 13, W) of `leaf_numbers`, NaN in empty lanes; row of the first rectangle of each lane
+    tree: Tree | None  # None: every ray tests all
+
+
+def leaf_numbers(frames):
+    """(6 B, 4, 3) float64 -> (B, 12): center, and the three vectors whose products with p - center are coordinates."""
+    center, axes = _axes(frames)
+    return np.concatenate([center, np.linalg.inv(axes).swapaxes(1, 2).reshape(-1, 9)], -1)
+
+
+def bounds(frames):
+    """(6 B, 4, 3) -> two (B, 3)."""
+    center, axes = _axes(frames)
+    reach = np.abs(axes).sum(1)
+    return center - reach, center + reach
+
+
+def _axes(frames):
+    """Centers (B, 3) and half axes (B, 3, 3) by row."""
+    centers = frames[:, 0].reshape(-1, 3, 2, 3)  # box, axis, end, xyz
+    return centers.mean((1, 2)), (centers[:, :, 1] - centers[:, :, 0]) / 2
+
+
+def prepare(o, d):
+    return o, d
+
+
+def intersect(table: Boxes, leaf, prepared, start):
+    """Of each of the W boxes of a leaf the face that a ray meets first, by the slabs between opposite faces.
+
+    Args:
+        start: () int32 row of the face that the ray starts on, or of nothing here.
+    Returns:
+        distances (W,), inf or NaN where missed, possibly negative where behind; rows (W,) of the faces.
+    """
+    o, d = prepared
+    leaf = at(table.leaves, leaf)
+    first = rows_of(leaf)
+    from_c = [o[axis] - leaf[axis] for axis in range(3)]
+    started = start - first
+    x, inverse = [], []
+    for axis in range(3):
+        dual = leaf[3 + 3 * axis : 6 + 3 * axis]
+        # On the face where the ray starts its coordinate is known exactly, so the distance to that is exactly 0.
+        exact = (2 * (started & 1) - 1).astype(leaf.dtype)
+        x.append(jnp.where(started >> 1 == axis, exact, dot(dual, from_c)))
+        inverse.append(1 / dot(dual, d))
+    x, inverse = lax.optimization_barrier((x, inverse))
+    end = [jnp.copysign(jnp.ones_like(i), i) for i in inverse]  # of each slab where the ray leaves it
+    near = [(-end[axis] - x[axis]) * inverse[axis] for axis in range(3)]
+    far = [(end[axis] - x[axis]) * inverse[axis] for axis in range(3)]
+    enter = larger(larger(near[0], near[1]), near[2])
+    leave = smaller(smaller(far[0], far[1]), far[2])
+    # A box is convex: a ray that starts on it does not enter it from outside.
+    outside = (enter > 0) & ((started < 0) | (started >= FACES))
+    t = jnp.where(outside, enter, leave)
+    by = [jnp.where(outside, near[axis], far[axis]) == t for axis in range(2)]
+    leaves_by = [2 * axis + (inverse[axis] > 0).astype(jnp.int32) for axis in range(3)]
+    face = jnp.where(by[0], leaves_by[0], jnp.where(by[1], leaves_by[1], leaves_by[2])) ^ outside.astype(jnp.int32)
+    return jnp.where(enter <= leave, t, jnp.inf), first + face
