@@ -13,7 +13,11 @@ from jax.extend import core
 
 from pathjax.lanes.flow import callee, eqn_flow, read_by, scan_parts, variables, while_parts
 from pathjax.lanes.rules import RULES
-from pathjax.lanes.values import components, differs, fits, join, objects, split
+from pathjax.lanes.values import components, differs, entries, fits, join, objects, split
+
+
+# Rows of a table from which lanes select what they want; gathering is faster from more.
+_FEW_ROWS = 8
 
 
 def one_by_one(f: Callable) -> Callable:
@@ -102,6 +106,15 @@ class Lanes:
             x[0] if all(other is x[0] for other in x) else self.number(lax.select_n, which, *x) for x in columns
         ]
         return objects(np.shape(cases[0]), items)
+
+    def entries(self, column, numbers):
+        """(W,) of a column (N,) that lanes share: selected from a few, which stay in registers, gathered from many."""
+        if len(column) > _FEW_ROWS:
+            return entries(column, numbers)
+        found = jnp.broadcast_to(column[0], numbers.shape)
+        for k in range(1, len(column)):
+            found = lax.select(numbers >= k, jnp.broadcast_to(column[k], numbers.shape), found)
+        return found
 
     def once(self, values):
         """The values, of which every consumer reads one result: outcomes of a branch that is always taken."""
