@@ -7,7 +7,8 @@ import numpy as np
 from pathjax import bounces, bsdfs, film
 from pathjax.named import parameters
 from pathjax.scene import UNBOUNDED, Scene
-from pathjax.shapes import bvh, geometry
+from pathjax.shapes import geometry
+from pathjax.shapes.leaves import rows_of
 from pathjax.shapes.planar import Planar
 
 _SAMPLER = "randomly shifted lattice, hashing for roulette"
@@ -99,7 +100,7 @@ def _bounds(about, name):
 
 
 def _primitives(part) -> int:
-    return int((bvh.rows_of(part.leaves) >= 0).sum())
+    return int((rows_of(part.leaves) >= 0).sum())
 
 
 def _kind(part) -> str:

@@ -20,8 +20,7 @@ from pathjax.emitters.constant import Constant
 from pathjax.errors import InputError
 from pathjax.film import Film
 from pathjax.named import About, Parameter
-from pathjax.shapes import geometry as geometry_module
-from pathjax.shapes import box, planar, sphere, triangle
+from pathjax.shapes import box, leaves, planar, sphere, triangle
 from pathjax.shapes.box import Boxes
 from pathjax.shapes.bvh_build import RULES
 from pathjax.shapes.geometry import Geometry
@@ -320,10 +319,10 @@ def _spheres(parts, name, dtype, rule):
     rotation = linear / np.linalg.norm(linear, axis=1, keepdims=True)
     sign = np.array([-1.0 if flip else 1.0 for part in parts for _, flip in part])
     numbers, bounds = sphere.leaf_numbers(balls), sphere.bounds(balls)
-    leaves, tree, built = geometry_module.leaves_of(numbers, *bounds, dtype, rule)
+    packed, tree, built = leaves.pack(numbers, *bounds, dtype, rule)
     to_local = np.swapaxes(rotation, 1, 2)
     arrays = (np.asarray(x, dtype) for x in (balls, to_local, sign))
-    return Spheres(leaves, tree, *arrays), {name: built}
+    return Spheres(packed, tree, *arrays), {name: built}
 
 
 def _planars(parts, name, dtype, rule):
@@ -331,14 +330,14 @@ def _planars(parts, name, dtype, rule):
     single = sum(len(part) == 1 for part in parts)
     alone, faces = frames[:single], frames[single:]
     numbers, bounds = planar.leaf_numbers(alone), planar.bounds(alone, disk)
-    leaves, tree, built = geometry_module.leaves_of(numbers, *bounds, dtype, rule)
+    packed, tree, built = leaves.pack(numbers, *bounds, dtype, rule)
     boxes, built_of_boxes = None, None
     if len(faces):
         numbers, bounds = box.leaf_numbers(faces), box.bounds(faces)
         place = {"first": single, "step": box.FACES}
-        *found, built_of_boxes = geometry_module.leaves_of(numbers, *bounds, dtype, rule, **place)
+        *found, built_of_boxes = leaves.pack(numbers, *bounds, dtype, rule, **place)
         boxes = Boxes(*found)
-    return Planar(leaves, tree, np.asarray(frames, dtype), boxes, disk), {name: built, "box": built_of_boxes}
+    return Planar(packed, tree, np.asarray(frames, dtype), boxes, disk), {name: built, "box": built_of_boxes}
 
 
 def _triangles(parts, name, dtype, rule):
@@ -353,5 +352,5 @@ def _triangles(parts, name, dtype, rule):
     normals = optional(1, triangle.face_normals)
     uv = optional(2, lambda v: np.broadcast_to(np.array([[0, 0], [1, 0], [0, 1]], float), (len(v), 3, 2)))
     bounds = triangle.bounds(vertices)
-    leaves, tree, built = geometry_module.leaves_of(triangle.leaf_numbers(vertices), *bounds, dtype, rule)
-    return Triangles(leaves, tree, np.asarray(vertices, dtype), normals, uv), {name: built}
+    packed, tree, built = leaves.pack(triangle.leaf_numbers(vertices), *bounds, dtype, rule)
+    return Triangles(packed, tree, np.asarray(vertices, dtype), normals, uv), {name: built}

@@ -130,6 +130,7 @@ OPTIONAL = {
     "sphere.py": {"glass_and_mirror", "glass_in_glass"},
     "triangle.py": {"mesh"},
     "bvh.py": {"mesh"},
+    "box.py": {"cornell_box", "glass_and_mirror", "glass_in_glass"},
     "planar.py": {"cornell_box", "glass_and_mirror", "glass_in_glass", "mesh"},
     "constant.py": set(),  # its radiance is read by the dispatch; only strategy "light" samples it
     "area.py": {"cornell_box", "glass_and_mirror", "glass_in_glass", "mesh"},

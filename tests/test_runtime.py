@@ -55,6 +55,12 @@ def test_users_flags_are_kept(python):
     assert native
 
 
+def test_users_vector_width_is_kept(python):
+    (flags, _, native), _ = python(FLAGS_AND_DEVICES, XLA_FLAGS="--xla_cpu_prefer_vector_width=128")
+    assert flags.count("prefer_vector_width") == 1
+    assert native
+
+
 def test_users_own_threshold_is_kept(python):
     mine = f"--xla_backend_extra_options={OPTION}=2048"
     (flags, _, _), _ = python(FLAGS_AND_DEVICES, XLA_FLAGS=mine)

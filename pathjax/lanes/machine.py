@@ -15,7 +15,6 @@ from pathjax.lanes.flow import callee, eqn_flow, read_by, scan_parts, variables,
 from pathjax.lanes.rules import RULES
 from pathjax.lanes.values import components, differs, entries, fits, join, objects, split
 
-
 # Rows of a table from which lanes select what they want; gathering is faster from more.
 _FEW_ROWS = 8
 
@@ -102,9 +101,7 @@ class Lanes:
     def select(self, which, *cases):
         """By the number `which`, components of one of the cases; what is the same in all stays as it is."""
         columns = zip(*(components(case).flat for case in cases), strict=True)
-        items = [
-            x[0] if all(other is x[0] for other in x) else self.number(lax.select_n, which, *x) for x in columns
-        ]
+        items = [x[0] if all(other is x[0] for other in x) else self.number(lax.select_n, which, *x) for x in columns]
         return objects(np.shape(cases[0]), items)
 
     def entries(self, column, numbers):

@@ -14,7 +14,8 @@ import numpy as np
 from jax import lax
 
 from pathjax.core.math import at, dot, larger, smaller
-from pathjax.shapes.bvh import Tree, rows_of
+from pathjax.shapes.bvh import Tree
+from pathjax.shapes.leaves import rows_of
 
 FACES = 6
 

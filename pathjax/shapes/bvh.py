@@ -33,12 +33,6 @@ def pack(built, dtype) -> Tree:
     return Tree(jnp.asarray(nodes), built.depth)
 
 
-def rows_of(leaf):
-    """Rows (..., W) of the primitives of a leaf (..., K + 1, W), ascending; -1 in empty lanes."""
-    bits = leaf[..., -1, :]
-    return lax.bitcast_convert_type(bits, integer_like(bits.dtype)).astype(jnp.int32)
-
-
 def prepare(o, d):
     """Constants of a ray from o (3,) in the unit direction d (3,): (9,) reciprocal of d and slabs, () int32 octant."""
     eps = np.finfo(d.dtype).eps

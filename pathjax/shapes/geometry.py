@@ -16,7 +16,7 @@ from jax import lax
 from pathjax.core.math import at, integer_like, smaller
 from pathjax.core.types import Hit, Ray, Surface
 from pathjax.lanes import one_by_one
-from pathjax.shapes import box, bvh, bvh_build, planar, sphere, triangle
+from pathjax.shapes import box, bvh, planar, sphere, triangle
 from pathjax.shapes.box import Boxes
 from pathjax.shapes.planar import Planar
 from pathjax.shapes.sphere import Spheres
@@ -24,9 +24,6 @@ from pathjax.shapes.triangle import Triangles
 
 # As a primitive: none. As the bits of a float32 distance: beyond infinity.
 NO_HIT = np.int32(0x7FFFFFFF)
-# Up to here every ray tests all primitives of a kind, one after another; above, a tree pays.
-FLAT_LIMIT = 32
-LEAF_WIDTH = 8
 
 _MODULES = {Triangles: triangle, Planar: planar, Boxes: box, Spheres: sphere}
 
@@ -37,34 +34,6 @@ class Geometry:
     tables: tuple  # one entry per kind of shape present; primitives are numbered through all of them in this order
     shape: jax.Array  # (P,) int32 of each primitive, its place in the scene file
     light: jax.Array  # (P,) int32 row in the table of lights; -1: emits nothing
-
-
-def leaves_of(numbers, lo, hi, dtype, rule="sah", first=0, step=1):
-    """Pack primitives for intersection.
-
-    Args:
-        numbers: (P, K) what the intersection wants to know of each primitive.
-        lo, hi: (P, 3) bounds.
-        first, step: primitive i is row first + step i of its table.
-    Returns:
-        leaves (L, K + 1, W), tree (None for a few primitives, each a leaf of its own), built tree for reports or None.
-        The last numbers of a leaf are the bits of its rows: one block, so that a visit misses the cache once.
-    """
-    count = len(numbers)
-    if count <= FLAT_LIMIT:
-        built, tree = None, None
-        rows = np.arange(count, dtype=np.int32)[:, None]
-    else:
-        built = bvh_build.build(lo, hi, rule=rule, leaf_size=LEAF_WIDTH)
-        lane = np.arange(LEAF_WIDTH)
-        place = built.leaf_first[:, None] + lane
-        rows = np.where(lane < built.leaf_count[:, None], built.order[np.minimum(place, count - 1)], -1)
-        tree = bvh.pack(built, dtype)
-    padded = np.concatenate([numbers, np.full((1, numbers.shape[1]), np.nan)])
-    leaves = np.moveaxis(padded[rows], 1, 2).astype(dtype)  # row -1 is the padding
-    rows = np.where(rows < 0, rows, first + step * rows)
-    bits = rows.astype(integer_like(leaves.dtype)).view(leaves.dtype)
-    return jnp.asarray(np.concatenate([leaves, bits[:, None]], 1)), tree, built
 
 
 def firsts(geometry: Geometry) -> list[int]:

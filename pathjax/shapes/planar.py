@@ -17,7 +17,8 @@ from pathjax.core.math import at, dot, larger, safe_atan2, safe_divide, safe_sqr
 from pathjax.core.types import Surface
 from pathjax.core.warp import square_to_disk
 from pathjax.shapes.box import Boxes
-from pathjax.shapes.bvh import Tree, rows_of
+from pathjax.shapes.bvh import Tree
+from pathjax.shapes.leaves import rows_of
 
 
 @jax.tree_util.register_dataclass
@@ -117,4 +118,3 @@ def sample(table: Planar, row, u):
 def area(frames, disk):
     """(P, 4, 3) -> (P,)."""
     return np.linalg.norm(np.cross(frames[:, 1], frames[:, 2]), axis=-1) * (math.pi if disk else 4)
-

@@ -23,7 +23,8 @@ from pathjax.core.math import (
 )
 from pathjax.core.types import Surface
 from pathjax.core.warp import SPHERE_PDF, cone_pdf, square_to_cone, square_to_sphere
-from pathjax.shapes.bvh import Tree, rows_of
+from pathjax.shapes.bvh import Tree
+from pathjax.shapes.leaves import rows_of
 
 
 @jax.tree_util.register_dataclass

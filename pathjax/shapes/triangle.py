@@ -12,7 +12,8 @@ from jax import lax
 from pathjax.core.math import at, cross, dot, normalize, rescale, safe_divide
 from pathjax.core.types import Surface
 from pathjax.core.warp import square_to_triangle
-from pathjax.shapes.bvh import Tree, rows_of
+from pathjax.shapes.bvh import Tree
+from pathjax.shapes.leaves import rows_of
 
 
 @jax.tree_util.register_dataclass

@@ -11,7 +11,8 @@ from pathjax.core.math import normalize, spawn_ray
 from pathjax.core.types import Ray
 from pathjax.runtime import native_map
 from pathjax.scene import build
-from pathjax.shapes import bvh, geometry, triangle
+from pathjax.shapes import geometry, triangle
+from pathjax.shapes.leaves import rows_of
 
 GREY = desc.Diffuse("grey", np.full(3, 0.5))
 # Rounding of a coordinate relative to the distances it was computed from; hits closer to a border may go either way.
@@ -475,7 +476,7 @@ def test_the_target_does_not_shadow_itself():
 def test_padded_lanes_are_never_hit():
     for name in ("400 triangles", "100 rectangles"):
         shapes = scene_of(*SCENES[name])
-        rows = np.asarray(bvh.rows_of(shapes.tables[0].leaves))
+        rows = np.asarray(rows_of(shapes.tables[0].leaves))
         assert (rows < 0).any()
         assert np.isnan(np.moveaxis(np.asarray(shapes.tables[0].leaves), 1, 2)[rows < 0]).all()
         # Through the origin, where zero padding would lie.
