@@ -426,7 +426,7 @@ def test_info_tells_of_the_sampler_and_the_tree(run):
 
 
 def test_info_suggests_a_depth_for_a_tail(run):
-    """The furnace's largest albedo is 0.8: 0.8^30 > 0.001 > 0.8^31. An error of 0.3 % in it shifts this by half a step."""
+    """The furnace's largest albedo is 0.8: 0.8^30 > 0.001 > 0.8^31. An error of 0.3 % in it is half a step."""
     _, out, _ = run("info", FURNACE, *SMALL, "--tail", 0.001, "--json")
     facts = json.loads(out)["tail"]
     assert 30 <= facts["max_depth"] <= 32
