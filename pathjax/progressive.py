@@ -11,9 +11,9 @@ from pathjax import film, replicates
 from pathjax.render import pixel_means
 from pathjax.scene import Scene
 
-# Paths in one call of the kernel: large enough that the call costs nothing, small enough that an interrupt is heard
+# Pixels in one call of the kernel: large enough that the call costs little, small enough that an interrupt is heard
 # at once. The schedule is fixed, not timed, so that the same command gives the same image.
-CHUNK_PIXELS = (1 << 14) // replicates.COUNT
+CHUNK_PIXELS = 1 << 13
 MAX_PASS_SPP = 32 * replicates.COUNT
 
 
