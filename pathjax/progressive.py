@@ -13,8 +13,8 @@ from pathjax.scene import Scene
 
 # Pixels in one call of the kernel: large enough that the call costs little, small enough that an interrupt is heard
 # at once. The schedule is fixed, not timed, so that the same command gives the same image.
-CHUNK_PIXELS = 1 << 13
-MAX_PASS_SPP = 32 * replicates.COUNT
+CHUNK_PIXELS = 1 << 14
+MAX_PASS_SPP = 16 * replicates.COUNT
 
 
 @dataclass
