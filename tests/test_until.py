@@ -131,7 +131,7 @@ def test_signals_end_a_render_with_what_is_done(cornell, after_calls, number):
     after_calls(3, lambda: signal.raise_signal(number))
     result = pj.render_until(cornell, spp=10**6)
     assert result.reason == "interrupted"
-    assert result.spp == 192  # portions of 4, 12, 48 and 128
+    assert result.spp == 128  # portions of 4, 12, 48 and 64
     assert signal.getsignal(number) == earlier
 
 
