@@ -8,6 +8,7 @@ from pathjax import bounces, bsdfs, film
 from pathjax.named import parameters
 from pathjax.scene import UNBOUNDED, Scene
 from pathjax.shapes import geometry
+from pathjax.shapes.box import Boxes
 from pathjax.shapes.leaves import rows_of
 from pathjax.shapes.planar import Planar
 
@@ -106,6 +107,8 @@ def _primitives(part) -> int:
 def _kind(part) -> str:
     if isinstance(part, Planar):
         return "disks" if part.disk else "rectangles"
+    if isinstance(part, Boxes):
+        return "cubes"
     return type(part).__name__.lower()
 
 

@@ -337,7 +337,7 @@ def _planars(parts, name, dtype, rule):
         place = {"first": single, "step": box.FACES}
         *found, built_of_boxes = leaves.pack(numbers, *bounds, dtype, rule, **place)
         boxes = Boxes(*found)
-    return Planar(packed, tree, np.asarray(frames, dtype), boxes, disk), {name: built, "box": built_of_boxes}
+    return Planar(packed, tree, np.asarray(frames, dtype), boxes, disk), {name: built, "cube": built_of_boxes}
 
 
 def _triangles(parts, name, dtype, rule):

@@ -239,6 +239,8 @@ SCENES = {
     "10 spheres": spheres(10),
     "100 spheres": spheres(100, size=0.1),
     "cubes": planars(desc.Cube, 5, size=0.2),
+    "100 cubes": planars(desc.Cube, 100, size=0.1),
+    "cubes before rectangles": [*planars(desc.Cube, 4, size=0.2), *planars(desc.Rectangle, 5, seed=4)],
     "mixed": [
         triangles(60, size=0.1),
         *planars(desc.Rectangle, 9),
