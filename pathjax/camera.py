@@ -80,13 +80,12 @@ def sample_ray(camera: Camera, position, u_lens) -> Ray:
     if camera.lens is not None:
         aperture = camera.lens.radius * square_to_disk(u_lens)
         start = jnp.stack([aperture[0], aperture[1], jnp.zeros_like(xy[0])])
-        local = local * camera.lens.focus_distance - start
+        local, start = lax.optimization_barrier((local * camera.lens.focus_distance - start, start))
     right, up, forward = camera.axes
 
     def to_world(v):
         return v[0] * right + v[1] * up + v[2] * forward
 
-    local, start = lax.optimization_barrier((local, start))
     v = lax.optimization_barrier(to_world(local))
     length = jnp.sqrt(dot(v, v))
     d = v / length

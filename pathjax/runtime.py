@@ -70,7 +70,7 @@ def _set_up() -> None:
             warnings.warn(
                 "JAX's backend was started before pathjax was imported, so renders will be about 20 times slower. "
                 "Import pathjax before the first JAX array or jax.devices(), or set in the environment "
-                f"XLA_FLAGS={_FLAG}",
+                f"XLA_FLAGS='{_FLAG} {_WIDTH_FLAG}'",
                 stacklevel=3,
             )
 

@@ -327,17 +327,17 @@ def _spheres(parts, name, dtype, rule):
 
 def _planars(parts, name, dtype, rule):
     frames, disk = np.concatenate(parts), name == "disk"
-    single = sum(len(part) == 1 for part in parts)
+    single = sum(len(part) for part in parts if len(part) < box.FACES)  # then come the faces of cubes
     alone, faces = frames[:single], frames[single:]
     numbers, bounds = planar.leaf_numbers(alone), planar.bounds(alone, disk)
     packed, tree, built = leaves.pack(numbers, *bounds, dtype, rule)
-    boxes, built_of_boxes = None, None
+    boxes, trees = None, {name: built}
     if len(faces):
         numbers, bounds = box.leaf_numbers(faces), box.bounds(faces)
         place = {"first": single, "step": box.FACES}
-        *found, built_of_boxes = leaves.pack(numbers, *bounds, dtype, rule, **place)
+        *found, trees["cube"] = leaves.pack(numbers, *bounds, dtype, rule, **place)
         boxes = Boxes(*found)
-    return Planar(packed, tree, np.asarray(frames, dtype), boxes, disk), {name: built, "cube": built_of_boxes}
+    return Planar(packed, tree, np.asarray(frames, dtype), boxes, disk), trees
 
 
 def _triangles(parts, name, dtype, rule):

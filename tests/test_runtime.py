@@ -89,13 +89,13 @@ STARTED = "import jax; jax.devices()\n"
 def test_import_after_the_backend_warns_once_with_the_remedy(python, number):
     (flags, _, native), err = python(STARTED + "import pathjax" + FLAGS_AND_DEVICES, **number)
     assert err.count("UserWarning") == 1
-    assert "before" in err and "XLA_FLAGS=--xla_backend_extra_options" in err
+    assert "before" in err and f"XLA_FLAGS='{runtime._FLAG} {runtime._WIDTH_FLAG}'" in err
     assert OPTION not in flags
     assert not native
 
 
 def test_import_after_the_backend_is_silent_where_the_user_set_the_option(python):
-    remedy = f"--xla_backend_extra_options={OPTION}=1000000000000"
+    remedy = f"{runtime._FLAG} {runtime._WIDTH_FLAG}"
     (_, _, native), err = python(STARTED + FLAGS_AND_DEVICES, XLA_FLAGS=remedy)
     assert native
     assert "Warning" not in err

@@ -170,6 +170,13 @@ def test_unknown_names_get_near_ones(zoo, name, offers):
     assert offers in str(caught.value)
 
 
+def test_trees_of_all_kinds_are_kept(make_scene):
+    """Of cubes too, which a table of rectangles holds, beside the table of disks."""
+    place = '<transform name="to_world"><scale value="0.1"/><translate x="{}"/></transform>'
+    cubes = "".join(f'<shape type="cube">{place.format(i)}</shape>' for i in range(40))
+    assert list(make_scene(cubes + '<shape type="disk"/>').about.trees) == ["cube"]
+
+
 def test_a_scene_without_parameters_says_so(make_scene):
     with pytest.raises(pj.InputError, match="none"):
         pj.with_parameters(make_scene(""), {"a.b": 1})

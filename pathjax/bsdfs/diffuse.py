@@ -44,6 +44,6 @@ def evaluate(table: DiffuseTable, row, uv, wi, wo):
 
 def sample(table: DiffuseTable, row, uv, wi, u) -> BSDFSample:
     """Cosine-distributed `wo`; the weight is the albedo. u: (2,)."""
-    wo = jax.lax.optimization_barrier(square_to_cosine_hemisphere(u))
+    wo = square_to_cosine_hemisphere(u)
     one = jnp.ones_like(wo[2])
     return BSDFSample(wo, reflectance(table, row, uv), square_to_cosine_hemisphere_pdf(wo), jnp.bool_(False), one)

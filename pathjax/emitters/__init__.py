@@ -60,9 +60,7 @@ def sample(emitters: Emitters, shapes: Geometry, chosen: Choice, ref, u, u_trian
     if count == 1:
         row, pdf = jnp.int32(0), jnp.ones_like(u[0])
     else:
-        # Comparing with a few is faster than halving, which loads an entry of its own for each lane.
-        method = "compare_all" if count <= 32 else "scan"
-        row = jnp.searchsorted(chosen.cdf, u[0], side="right", method=method).astype(jnp.int32)
+        row = jnp.searchsorted(chosen.cdf, u[0], side="right").astype(jnp.int32)
         row = jnp.minimum(row, count - 1)
         pdf = at(chosen.pdf, row)
         below = at(chosen.cdf, row) - pdf

@@ -58,7 +58,6 @@ def sample(lights: AreaLights, shapes: Geometry, row, ref, u, u_triangle) -> Emi
                 p, n, margin = triangle.sample(table, place, u)
             else:
                 p, n, margin = planar.sample(table, place, u)
-            p, margin = lax.optimization_barrier((p, margin))
             # The far end of a shadow ray stays clear of what touches the light, as its near end does.
             p = lax.optimization_barrier(p + n * jnp.copysign(margin, dot(n, ref - p)))
             to_p = p - ref

@@ -104,7 +104,7 @@ class Lanes:
         items = [x[0] if all(other is x[0] for other in x) else self.number(lax.select_n, which, *x) for x in columns]
         return objects(np.shape(cases[0]), items)
 
-    def entries(self, column, numbers):
+    def picked(self, column, numbers):
         """(W,) of a column (N,) that lanes share: selected from a few, which stay in registers, gathered from many."""
         if len(column) > _FEW_ROWS:
             return entries(column, numbers)

@@ -83,7 +83,7 @@ def _dynamic_slice(lanes, inputs, params, shape):
         for axis, extent, offset in zip(picked, extents, offsets, strict=True):
             index = index * extent + (starts[axis].astype(jnp.int32) + offset)
         # One column at a time: gathered from a reshaped table, every index would be divided and multiplied again.
-        blocks.append([lanes.entries(columns[:, k], index) for k in range(columns.shape[1])])
+        blocks.append([lanes.picked(columns[:, k], index) for k in range(columns.shape[1])])
     rest = [size for axis, size in enumerate(shape) if axis not in picked]
     block = objects([*(shape[axis] for axis in picked), *rest], [item for items in blocks for item in items])
     return np.moveaxis(block, range(len(picked)), picked)

@@ -47,12 +47,6 @@ def fits(shape, whole) -> bool:
     return shape == () or len(shape) == len(whole) and all(a in (1, b) for a, b in zip(shape, whole, strict=True))
 
 
-def rows(x, numbers) -> np.ndarray:
-    """Rows of x (N, ...) as components; numbers: (W,)."""
-    columns = x.reshape(len(x), -1)
-    return objects(x.shape[1:], [entries(columns[:, k], numbers) for k in range(columns.shape[1])])
-
-
 def entries(column, numbers):
     """(W,) of a column (N,)."""
     dimensions = lax.GatherDimensionNumbers(offset_dims=(), collapsed_slice_dims=(0,), start_index_map=(0,))

@@ -1,7 +1,7 @@
 """Boxes (parallelepipeds where sheared): six rectangles that one test finds.
 
 Only the search is here; what is found are rectangles of a `Planar` table, which holds the boxes. A ray that starts
-outside a box meets one of them first, one that starts inside or on it leaves through one: its edges have no gaps.
+outside a box enters through one of them, one that starts inside or on it leaves through one: its edges have no gaps.
 """
 
 from __future__ import annotations
@@ -76,8 +76,10 @@ def intersect(table: Boxes, leaf, prepared, start):
     end = [jnp.copysign(jnp.ones_like(i), i) for i in inverse]  # of each slab where the ray leaves it
     near = [(-end[axis] - x[axis]) * inverse[axis] for axis in range(3)]
     far = [(end[axis] - x[axis]) * inverse[axis] for axis in range(3)]
-    enter = larger(larger(near[0], near[1]), near[2])
-    leave = smaller(smaller(far[0], far[1]), far[2])
+    # Of a slab in whose border the ray lies one distance is 0 / 0: as a first argument it drops out.
+    enter, leave = jnp.full_like(near[0], -jnp.inf), jnp.full_like(far[0], jnp.inf)
+    for axis in range(3):
+        enter, leave = larger(near[axis], enter), smaller(far[axis], leave)
     # A box is convex: a ray that starts on it does not enter it from outside.
     outside = (enter > 0) & ((started < 0) | (started >= FACES))
     t = jnp.where(outside, enter, leave)

@@ -586,6 +586,20 @@ def test_a_box_of_rectangles_does_not_leak():
         assert np.isfinite(hit.t).all()
 
 
+@pytest.mark.parametrize("axis", range(3))
+@pytest.mark.parametrize("side", [-1, 1])
+@pytest.mark.parametrize("sign", [-1, 1])
+def test_rays_in_the_plane_of_a_face_hit_the_cube_where_they_meet_that_face(axis, side, sign):
+    """A slab that the ray lies in the border of has one distance 0 / 0, and the other slabs decide alone."""
+    o = np.roll([[side, -5, -5], [side, -5, -5], [side, -5, 0]], axis, axis=1) * 1.0
+    d = np.roll([[0, 0.8, 0.2], [0, 0.2, 0.8], [0, 1, 0]], axis, axis=1) * 1.0
+    o, d = (np.where(np.arange(3) == axis, x, sign * x) for x in (o, d))
+    d[:, axis] = np.copysign(0.0, sign)
+    d /= np.linalg.norm(d, axis=1, keepdims=True)
+    hit = closest(scene_of(desc.Cube(np.eye(4))), np.float32(o), np.float32(d))
+    np.testing.assert_allclose(hit.t, [np.inf, np.inf, 4], rtol=1e-6)
+
+
 def planes_of_box(n):
     """150 rectangles: enough for a tree."""
     g = (np.arange(n) + 0.5) / n * 2 - 1
