@@ -59,7 +59,7 @@ def sample(lights: AreaLights, shapes: Geometry, row, ref, u, u_triangle) -> Emi
             else:
                 p, n, margin = planar.sample(table, place, u)
             # The far end of a shadow ray stays clear of what touches the light, as its near end does.
-            p = lax.optimization_barrier(p + n * jnp.copysign(margin, dot(n, ref - p)))
+            p = p + n * jnp.copysign(margin, dot(n, ref - p))
             to_p = p - ref
             squared = dot(to_p, to_p)
             distance = safe_sqrt(squared)

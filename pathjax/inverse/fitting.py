@@ -18,7 +18,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -26,12 +25,12 @@ import optimistix as optx
 from scipy import ndimage
 
 from pathjax.errors import InputError
-from pathjax.gradient import ior_at, is_glass, jacobian
-from pathjax.inverse import problem, uncertainty
+from pathjax.gradient import ior_at, is_glass
+from pathjax.inverse import losses, problem, uncertainty
 from pathjax.inverse.problem import Problem
+from pathjax.inverse.programs import Stepper, kept
 from pathjax.inverse.uncertainty import Evidence
 from pathjax.named import with_parameters
-from pathjax.render import render
 from pathjax.scene import Scene
 
 # Samples per pixel of the approach. Newton's method begins with a part of the samples that `fit` is given.
@@ -141,125 +140,6 @@ def _tell(entry: dict) -> None:
     print(step_text(entry), file=sys.stderr)
 
 
-# ---- what is compiled ----------------------------------------------------------------------------------------------
-
-
-def _residuals(x, arguments, coordinates):
-    """Weighted residuals of all views, and half their sum of squares; x: unbounded coordinates (n,)."""
-    groups, weights, spp, seed, draw = arguments
-    values = coordinates.unpack(coordinates.bounded(x))
-    parts = []
-    for views, weight in zip(groups, weights, strict=True):
-        images = views.map(partial(_image, views=views, values=values, spp=spp), views.seeds(seed, draw, 0))
-        parts.append(((images - views.targets) * jnp.sqrt(weight)).ravel())
-    r = jnp.concatenate(parts)
-    return r, jnp.sum(r * r) / 2
-
-
-def _loss(x, arguments, coordinates):
-    _, loss = _residuals(x, arguments, coordinates)
-    return loss, loss
-
-
-def _score(z, arguments, coordinates):
-    """Root function, and the evidence that it comes from; z: steps from `base` in units of `scale`."""
-    base, scale, projector, groups, weights, spp, seed, draw = arguments
-    rest = jnp.eye(len(scale), dtype=scale.dtype) - projector
-
-    def evaluate(z):
-        evidence = _evidence(base + scale * z, groups, spp, seed, draw, coordinates)
-        flat = jnp.concatenate([weight.reshape(-1, 3) for weight in weights])
-        g = scale * jnp.sum(evidence.scores(flat), 0)
-        matrix = projector @ (scale[:, None] * evidence.matrix(flat) * scale) @ projector
-        # What is not determined stays where it is, by rows of the same size as the others.
-        size = jnp.maximum(jnp.max(jnp.abs(matrix)), jnp.finfo(z.dtype).tiny)
-        return (projector @ g / size + rest @ z, evidence), matrix / size + rest
-
-    @jax.custom_jvp
-    def score(z):
-        return evaluate(z)[0]
-
-    @score.defjvp
-    def score_jvp(primals, tangents):
-        (g, evidence), matrix = evaluate(*primals)
-        return (g, evidence), (matrix @ tangents[0], jax.tree.map(jnp.zeros_like, evidence))
-
-    return score(z)
-
-
-def _evidence(v, groups, spp, seed, draw, coordinates) -> Evidence:
-    """Two independent renders of all views, and their Jacobians; v: values (n,)."""
-    values = coordinates.unpack(v)
-    parts = []
-    for views in groups:
-
-        def image_and_columns(scene, seed, views=views):
-            image, J = jacobian(views.with_values(scene, values), views.names, spp, seed)
-            return image, coordinates.columns(J, image.shape)
-
-        seeds = jnp.stack([views.seeds(seed, draw, half) for half in (0, 1)])
-        images, columns = jax.vmap(partial(views.map, image_and_columns))(seeds)
-        parts.append(((images - views.targets).reshape(2, -1, 3), columns.reshape(2, -1, *columns.shape[-2:])))
-    residuals, jacobians = (jnp.concatenate(part, axis=1) for part in zip(*parts, strict=True))
-    return Evidence(residuals, jacobians)
-
-
-def _misfits(candidates, arguments, coordinates):
-    """(K,) of candidate values (K, n)."""
-    groups, weights, spp, seed, draw = arguments
-
-    def misfit(v):
-        values = coordinates.unpack(v)
-        total = 0.0
-        for views, weight in zip(groups, weights, strict=True):
-            images = views.map(partial(_image, views=views, values=values, spp=spp), views.seeds(seed, draw, 0))
-            total = total + jnp.sum(weight * (images - views.targets) ** 2)
-        return total
-
-    return jax.vmap(misfit)(candidates)
-
-
-def _image(scene, seed, views, values, spp):
-    return render(views.with_values(scene, values), spp, seed)
-
-
-# ---- the run -------------------------------------------------------------------------------------------------------
-
-
-class _Stepper:
-    """An optimistix solver taken step by step."""
-
-    def __init__(self, solver, fn, y, arguments):
-        def begin(y, arguments):
-            f, aux = jax.eval_shape(fn, y, arguments)
-            return solver.init(fn, y, arguments, {}, f, aux, frozenset())
-
-        def step(y, state, arguments):
-            y, state, aux = solver.step(fn, y, arguments, {}, state, frozenset())
-            done, _ = solver.terminate(fn, y, arguments, {}, state, frozenset())
-            return y, state, aux, done
-
-        self.begin = eqx.filter_jit(begin).lower(y, arguments).compile()
-        self.step = eqx.filter_jit(step).lower(y, self.begin(y, arguments), arguments).compile()
-
-
-# Of one process, so that fits of the same problem compile once: the latest, by solver, parameters, and shapes.
-_programs: dict = {}
-_MAX_PROGRAMS = 12
-
-
-def _program(key, make, *arguments):
-    """make(*arguments), or what it made for arguments of the same structure and shapes before; and its seconds."""
-    leaves, tree = jax.tree.flatten(arguments)
-    key = key, tree, tuple((leaf.shape, leaf.dtype) for leaf in leaves)
-    started = time.perf_counter()
-    if key not in _programs:
-        if len(_programs) >= _MAX_PROGRAMS:
-            del _programs[next(iter(_programs))]
-        _programs[key] = make(*arguments)
-    return _programs[key], time.perf_counter() - started
-
-
 class _Run:
     def __init__(self, problem: Problem, spp: int, seed: int, solver, progress):
         self.problem, self.spp, self.solver, self.progress = problem, spp, solver, progress
@@ -313,9 +193,9 @@ class _Run:
         arguments = self.groups, weights, jnp.uint32(spp), self.seed, self._next_draw()
         if self._approach is None:
             least_squares = isinstance(self.solver, optx.AbstractLeastSquaresSolver)
-            fn = self._bind(_residuals if least_squares else _loss)
-            key = _residuals if least_squares else _loss, repr(self.solver)
-            self._approach = self._compiled(key, partial(_Stepper, self.solver, fn), x, arguments)
+            fn = self._bind(losses.residuals if least_squares else losses.loss)
+            key = losses.residuals if least_squares else losses.loss, repr(self.solver)
+            self._approach = self._compiled(key, partial(Stepper, self.solver, fn), x, arguments)
         state = self._approach.begin(x, arguments)
         lowest, rejected = np.inf, 0
         for _ in range(MAX_STEPS):
@@ -385,8 +265,8 @@ class _Run:
         z, base, scale, projector = (jnp.asarray(a, self.dtype) for a in (z, base, scale, projector))
         arguments = base, scale, projector, self.groups, self.weights, jnp.uint32(spp), self.seed, draw
         if self._refine is None:
-            fn, newton = self._bind(_score), optx.Newton(rtol=1e-6, atol=1e-6)
-            self._refine = self._compiled(_score, partial(_Stepper, newton, fn), z, arguments)
+            fn, newton = self._bind(losses.score), optx.Newton(rtol=1e-6, atol=1e-6)
+            self._refine = self._compiled(losses.score, partial(Stepper, newton, fn), z, arguments)
         moved, _, evidence, _ = self._refine.step(z, self._refine.begin(z, arguments), arguments)
         self.evidence = jax.tree.map(np.asarray, evidence)
         return np.asarray(moved, float)
@@ -432,8 +312,8 @@ class _Run:
         # All candidates see the same noise.
         arguments = self.groups, self.weights, jnp.uint32(SCAN_SPP), self.seed, jnp.uint32(0)
         if self._scan is None:
-            f = jax.jit(self._bind(_misfits))
-            self._scan = self._compiled(_misfits, lambda *a: f.lower(*a).compile(), candidates, arguments)
+            f = jax.jit(self._bind(losses.misfits))
+            self._scan = self._compiled(losses.misfits, lambda *a: f.lower(*a).compile(), candidates, arguments)
         return np.asarray(self._scan(candidates, arguments))
 
     def _at_ratio(self, name, ratio):
@@ -455,7 +335,7 @@ class _Run:
         return partial(f, coordinates=self.coordinates)
 
     def _compiled(self, key, make, *arguments):
-        program, seconds = _program((key, self.coordinates), make, *arguments)
+        program, seconds = kept((key, self.coordinates), make, *arguments)
         self.compile_seconds += seconds
         return program
 

@@ -90,7 +90,7 @@ def surface(table: Spheres, row, o, d, t) -> Surface:
     closest = f + b * d
     half_chord = safe_sqrt(radius * radius - dot(closest, closest))
     # t says which of the two roots was found.
-    outward = lax.optimization_barrier(normalize(closest + jnp.copysign(half_chord, t - b) * d))
+    outward = normalize(closest + jnp.copysign(half_chord, t - b) * d)
     local = at(table.to_local, row) @ outward
     phi = safe_atan2(local[1], local[0]) / (2 * math.pi)
     theta = safe_atan2(safe_sqrt(local[0] * local[0] + local[1] * local[1]), local[2]) / math.pi
@@ -120,14 +120,14 @@ def sample_direction(table: Spheres, row, ref, u):
     to_center = center - ref
     axis = normalize(to_center)
     frame = frame_from_normal(axis)
-    local = lax.optimization_barrier(square_to_cone(u, one_minus_cos))
-    d = lax.optimization_barrier(to_world(frame, local))
+    # Read by five results: without the barrier each computes it again.
+    d = lax.optimization_barrier(to_world(frame, square_to_cone(u, one_minus_cos)))
     b = dot(to_center, d)
     closest = b * d - to_center
     distance = larger(b - safe_sqrt(radius * radius - dot(closest, closest)), jnp.zeros_like(b))
     outward = normalize(ref + distance * d - center)
 
-    from_inside = lax.optimization_barrier(square_to_sphere(u))
+    from_inside = square_to_sphere(u)
     to_p = center + radius * from_inside - ref
     d_inside = normalize(to_p)
     distance_inside = jnp.sqrt(dot(to_p, to_p))

@@ -1,0 +1,42 @@
+"""Solvers as compiled programs, kept for the next fit of the same problem."""
+
+from __future__ import annotations
+
+import time
+
+import equinox as eqx
+import jax
+
+
+class Stepper:
+    """An optimistix solver taken step by step."""
+
+    def __init__(self, solver, fn, y, arguments):
+        def begin(y, arguments):
+            f, aux = jax.eval_shape(fn, y, arguments)
+            return solver.init(fn, y, arguments, {}, f, aux, frozenset())
+
+        def step(y, state, arguments):
+            y, state, aux = solver.step(fn, y, arguments, {}, state, frozenset())
+            done, _ = solver.terminate(fn, y, arguments, {}, state, frozenset())
+            return y, state, aux, done
+
+        self.begin = eqx.filter_jit(begin).lower(y, arguments).compile()
+        self.step = eqx.filter_jit(step).lower(y, self.begin(y, arguments), arguments).compile()
+
+
+# Of one process, so that fits of the same problem compile once: the latest, by solver, parameters, and shapes.
+_programs: dict = {}
+_MAX_PROGRAMS = 12
+
+
+def kept(key, make, *arguments):
+    """make(*arguments), or what it made for arguments of the same structure and shapes before; and its seconds."""
+    leaves, tree = jax.tree.flatten(arguments)
+    key = key, tree, tuple((leaf.shape, leaf.dtype) for leaf in leaves)
+    started = time.perf_counter()
+    if key not in _programs:
+        if len(_programs) >= _MAX_PROGRAMS:
+            del _programs[next(iter(_programs))]
+        _programs[key] = make(*arguments)
+    return _programs[key], time.perf_counter() - started
