@@ -20,14 +20,14 @@ SMALL = {
     "choices": ["--res", "16", "--spp", "4,16", "--seeds", "2", "--reference-spp", "256"],
     "original_results": ["--res", "32", "--spp", "8"],
 }
-QUICK = ("cornell_albedos", "own_loss")
 
 
 def test_every_example_is_run_here():
     assert {path.stem for path in ROOT.glob("examples/*.py")} == SMALL.keys()
 
 
-@pytest.mark.parametrize("name", [pytest.param(n, marks=() if n in QUICK else pytest.mark.slow) for n in SMALL])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SMALL)
 def test_example_runs_and_writes_its_picture(name, tmp_path):
     if name == "choices":
         pytest.importorskip("matplotlib")

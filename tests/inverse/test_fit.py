@@ -175,7 +175,7 @@ def ball_target(ball):
     return np.asarray(pj.render(ball, 512, seed=1))
 
 
-@pytest.mark.parametrize("start", [1.05, 1.2, pytest.param(2.5, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("start", [1.2, *(pytest.param(far, marks=pytest.mark.slow) for far in (1.05, 2.5))])
 def test_ior_is_recovered_from_far(ball, ball_target, start):
     fit = pj.fit(ball, ball_target, ["glass.int_ior"], start={"glass.int_ior": start}, spp=32)
     assert fit.converged
