@@ -12,12 +12,13 @@ import numpy as np
 from pathjax import film, replicates
 from pathjax.errors import InputError
 from pathjax.integrators import aov, path, pixel
-from pathjax.progressive import CHUNK_PIXELS
 from pathjax.runtime import native_map
 from pathjax.scene import Scene
 
 NAMES = aov.FirstHit._fields
 MAX_SPP = 16
+# Pixels in one call of the kernel, whose memory they bound.
+CHUNK_PIXELS = 1 << 14
 
 
 def render_aovs(scene: Scene, names: Sequence[str], spp: int = MAX_SPP, seed: int = 0) -> dict[str, np.ndarray]:

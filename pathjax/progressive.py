@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 
+import jax
 import numpy as np
 
-from pathjax import film, replicates
+from pathjax import film, replicates, runtime
 from pathjax.render import pixel_means
 from pathjax.scene import Scene
 
-# Pixels in one call of the kernel: large enough that the call costs little, small enough that an interrupt is heard
-# at once. The schedule is fixed, not timed, so that the same command gives the same image.
-CHUNK_PIXELS = 1 << 14
-MAX_PASS_SPP = 16 * replicates.COUNT
+# Pixels in one call of the kernel and samples that it adds to each at most: so many that the call costs little, so few
+# that an interrupt is heard at once. The schedule is fixed, not timed, so that the same command gives the same image.
+CHUNK_PIXELS = 1 << 12
+MAX_PASS_SPP = 64 * replicates.COUNT
+# Samples of the first pass over the image, so that there is soon a whole picture: after the lower number where more of
+# them than the higher one are not planned.
+_FIRST_SPP = replicates.COUNT, 4 * replicates.COUNT
+# A call of few items is another program, whose last bits may differ.
+_LEAST_CHUNK = -(-runtime.MANY_ITEMS // replicates.COUNT)
 
 
 @dataclass
@@ -51,49 +58,67 @@ def plan(state: State, spp: int) -> None:
 def extend(scene: Scene, state: State, seed: int, strategy: str) -> Iterator[None]:
     """Render what is missing of the round; yields after every call of the kernel, when the state is whole.
 
-    The samples of a pixel are added in portions that depend on its own count alone, so that a state which was saved
-    between two calls leads to the same bits.
+    The samples of a pixel are added in portions that depend on its own count and goal alone, so that a state which was
+    saved between two calls leads to the same bits.
     """
+    kernel, chunk = compile(scene, strategy), _chunk(scene)
     seeds = replicates.seeds(seed)
-    chunk = _chunk(state)
-    while (missing := np.flatnonzero(state.count < state.goal)).size:
+
+    def means(portion):
+        """(R, n, 3) of the samples of a portion; 0 where a replicate gets none."""
+        pixels, first_sample, spp = portion
+        lacking = chunk - len(pixels)
+
+        def padded(x, dtype, **how):
+            x = x.astype(dtype)
+            return (np.pad(x, ((0, 0), (0, lacking)), **how) if lacking else x).ravel()
+
+        tiled = padded(np.tile(pixels, (replicates.COUNT, 1)), np.int32, mode="edge")
+        numbers = padded(first_sample, np.uint32), padded(spp, np.uint32), np.repeat(seeds, chunk)
+        of_chunk = np.asarray(kernel(tiled, *numbers), np.float32)
+        return of_chunk.reshape(replicates.COUNT, chunk, 3)[:, : len(pixels)]
+
+    for (pixels, first_sample, spp), added in runtime.concurrently(means, _portions(state, chunk)):
+        share = (spp / np.maximum(first_sample + spp, 1)).astype(np.float32)[..., None]
+        # Pixels that follow each other are a slice, which is many times faster.
+        follow = pixels[-1] - pixels[0] == len(pixels) - 1
+        here = slice(pixels[0], pixels[-1] + 1) if follow else pixels
+        with np.errstate(invalid="ignore"):  # a pixel that met a sample that is not finite
+            change = added - state.means[:, here]
+            change *= share
+            state.means[:, here] += change
+        state.count[here] += spp.sum(0, dtype=np.int32)
+        yield
+
+
+def _portions(state: State, chunk: int) -> Iterator[tuple]:
+    """What lies between the state and its goal, portion by portion: pixels (n,), n <= chunk, and of each replicate its
+    first sample and the number of samples, (R, n) each."""
+    planned = state.count.copy()
+    while (missing := np.flatnonzero(planned < state.goal)).size:
         for first in range(0, missing.size, chunk):
             pixels = missing[first : first + chunk]
-            before = state.count[pixels]
-            portion = np.clip(3 * before, replicates.COUNT, MAX_PASS_SPP)
-            after = before + np.minimum(portion, state.goal[pixels] - before)
+            before, goal = planned[pixels], state.goal[pixels]
+            portion = np.clip(3 * before, np.where(goal > max(_FIRST_SPP), *_FIRST_SPP[::-1]), MAX_PASS_SPP)
+            planned[pixels] = after = np.minimum(before + portion, goal)
             first_sample = replicates.shares(before)
-            spp = replicates.shares(after) - first_sample
-            means = _call(scene, chunk, pixels, first_sample, spp, seeds, strategy)
-            share = (spp / np.maximum(first_sample + spp, 1)).astype(np.float32)[..., None]
-            with np.errstate(invalid="ignore"):  # a pixel that met a sample that is not finite
-                change = np.where(share > 0, (means - state.means[:, pixels]) * share, 0)
-            state.means[:, pixels] += change
-            state.count[pixels] = after
-            yield
+            yield pixels, first_sample, replicates.shares(after) - first_sample
 
 
-def compile(scene: Scene, strategy: str = "mis") -> None:
-    """Have the kernel of `extend` compiled, by a call for no samples."""
-    state = start(scene)
-    none = np.zeros((replicates.COUNT, 1), np.int32)
-    _call(scene, _chunk(state), np.zeros(1, int), none, none, replicates.seeds(0), strategy)
-
-
-def _chunk(state: State) -> int:
-    """All calls have one shape, so one kernel; a small image is one call."""
-    return min(CHUNK_PIXELS, len(state.count))
-
-
-def _call(scene, chunk, pixels, first_sample, spp, seeds, strategy):
-    """(R, n, 3) means of n <= chunk pixels, all replicates in one call; nan where spp is 0."""
-    lacking = chunk - len(pixels)
-
-    def padded(x, **how):
-        return np.pad(x, ((0, 0), (0, lacking)), **how).ravel()
-
-    tiled = padded(np.tile(pixels.astype(np.int32), (replicates.COUNT, 1)), mode="edge")
-    numbers = (x.astype(np.uint32) for x in (padded(first_sample), padded(spp), np.repeat(seeds, chunk)))
+def compile(scene: Scene, strategy: str = "mis") -> Callable:
+    """The kernel of `extend`: (pixels, first_sample, spp, seed), (R chunk,) each, -> means (R chunk, 3)."""
     # Without the derivatives of `render_pixels`, whose machinery takes longer than a call of few samples.
-    means = pixel_means(replace(scene, about=None), tiled, *numbers, strategy=strategy)
-    return np.asarray(means, np.float32).reshape(replicates.COUNT, chunk, 3)[:, : len(pixels)]
+    scene = replace(scene, about=None)
+    count = replicates.COUNT * _chunk(scene)
+    numbers = [jax.ShapeDtypeStruct((count,), dtype) for dtype in (np.int32, *3 * (np.uint32,))]
+    # JAX keeps what it has compiled. A compiled kernel, unlike a jitted function, does not ask for the calling thread's
+    # contexts, such as `jax.enable_x64`.
+    kernel = pixel_means.lower(scene, *numbers, strategy=strategy, devices=runtime.devices_of_a_call()).compile()
+    return partial(kernel, scene)
+
+
+def _chunk(scene: Scene) -> int:
+    """Pixels of a call: all calls have one shape, so one kernel, and each of those that run at once gets as many."""
+    count, at_once = film.pixel_count(scene.film), runtime.calls_at_once()
+    calls = at_once * -(-count // (at_once * CHUNK_PIXELS))
+    return min(count, max(-(-count // calls), _LEAST_CHUNK))

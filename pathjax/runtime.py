@@ -17,7 +17,9 @@ import os
 import platform
 import sys
 import warnings
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 
@@ -38,7 +40,8 @@ _WIDTH_FLAG = f"--{_WIDTH_OPTION}=512"
 _DEVICE_FLAG = "xla_force_host_platform_device_count"
 # Items that a native loop takes at once: enough that loops over them vectorise and their overheads vanish, few enough
 # that what they keep stays in the first cache. Few items would leave most of the lanes idle.
-_LANES, _FEW_LANES = 64, 16
+_LANES, _FEW_LANES = 128, 64
+MANY_ITEMS = 2 * _LANES
 # Bytes of live values that one lane of a vmapped path keeps; sizes the chunks on an accelerator.
 _BYTES_PER_LANE = 4096
 _CHUNK_BYTES = 1 << 30
@@ -125,6 +128,40 @@ def native() -> bool:
     return jax.default_backend() == "cpu" and _OPTION in os.environ.get("XLA_FLAGS", "")
 
 
+def calls_at_once() -> int:
+    """How many calls of one kernel run at a time: on CPUs, where a call keeps its thread, one for each device."""
+    return len(jax.local_devices()) if jax.default_backend() == "cpu" else 1
+
+
+def devices_of_a_call() -> int | None:
+    """`devices` of `native_map` in a kernel for `concurrently`: one of a CPU runs on the thread that calls it."""
+    return 1 if jax.default_backend() == "cpu" else None
+
+
+def concurrently(f: Callable, items: Iterable) -> Iterator[tuple]:
+    """Pairs (item, f(item)) in the order of the items, `calls_at_once` of them at a time, each in a thread of its own.
+
+    So no device waits for another, nor for what is done with the results. Of the items, a few more are taken than
+    results are given. Closed early, it waits for the calls that run.
+    """
+    workers = calls_at_once()
+    waiting = deque()
+    with ThreadPoolExecutor(workers) as pool:
+        try:
+            for item in items:
+                waiting.append((item, pool.submit(f, item)))
+                # One that is ready for each thread, and one whose result is being used.
+                if len(waiting) > 2 * workers:
+                    done, result = waiting.popleft()
+                    yield done, result.result()
+            while waiting:
+                done, result = waiting.popleft()
+                yield done, result.result()
+        finally:
+            for _, result in waiting:
+                result.cancel()
+
+
 def native_map(f: Callable, xs, *shared, form: str | None = None, devices: int | None = None):
     """`f(x, *shared)` for every x of `xs`, on all local devices.
 
@@ -176,7 +213,7 @@ def _map(f, xs, shared, form, devices):
     each = -(-count // len(devices))
     run = {
         # By the items of all devices, so that their number does not change the program.
-        "lanes": partial(_lanes, width=_LANES if count >= 2 * _LANES else _FEW_LANES),
+        "lanes": partial(_lanes, width=_LANES if count >= MANY_ITEMS else _FEW_LANES),
         "loop": _loop,
         "vmap": partial(_vmap_chunks, chunk=_CHUNK_BYTES // _BYTES_PER_LANE),
     }[form]

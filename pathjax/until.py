@@ -107,17 +107,21 @@ class Render:
 
     def run(self, progress: bool = False) -> RenderResult:
         with _Interrupts() as interrupts, _bar(progress) as show:
-            reason = self._run(interrupts, show)
+            reason, found = self._run(interrupts, show)
             if self.checkpoint is not None:
                 self.checkpoint.save(self.state)
-        return self._result(reason)
+        return self._result(reason, found or self._evaluate())
 
-    def _run(self, interrupts, show) -> str:
-        """Extend the state until there is a reason to stop. What it becomes depends on itself alone, not on time."""
+    def _run(self, interrupts, show) -> tuple[str, tuple | None]:
+        """Extend the state until there is a reason to stop. What it becomes depends on itself alone, not on time.
+
+        Returns:
+            the reason, and what `_evaluate` gives where it is known.
+        """
         state, error = self.state, UNKNOWN
         earlier, started = state.seconds, time.perf_counter()
         if self._out_of_time():
-            return "time limit"
+            return "time limit", None
         while True:
             for _ in progressive.extend(self.scene, state, self.seed, self.strategy):
                 state.seconds = earlier + time.perf_counter() - started
@@ -125,15 +129,14 @@ class Render:
                     self.checkpoint.save_if_due(state)
                 show(self, error)
                 if interrupts.heard:
-                    return "interrupted"
+                    return "interrupted", None
                 if self._out_of_time():
-                    return "time limit"
-            image, variance = self._estimates()
-            error = estimate.image_error(image, variance)
+                    return "time limit", None
+            image, variance, error = found = self._evaluate()
             if self._on_target(error):
-                return "target error"
+                return "target error", found
             if state.spp >= self.spp:
-                return "spp"
+                return "spp", found
             if state.spp == PILOT_SPP:
                 state.weights = estimate.sample_weights(image, variance).ravel()
             progressive.plan(state, min(_next_spp(state.spp, error, self.target_error), self.spp))
@@ -144,16 +147,17 @@ class Render:
     def _on_target(self, error: estimate.ImageError) -> bool:
         return self.target_error is not None and error.bound <= self.target_error
 
-    def _estimates(self) -> tuple[np.ndarray, np.ndarray]:
-        """Image and its variance, (H, W, 3) each."""
+    def _evaluate(self) -> tuple[np.ndarray, np.ndarray, estimate.ImageError]:
+        """Image and its variance, (H, W, 3) each, and its error."""
         shape = (*film.image_shape(self.scene.film), 3)
-        return tuple(x.reshape(shape) for x in self.state.moments())
-
-    def _result(self, reason) -> RenderResult:
-        image, variance = self._estimates()
-        count = self.state.count.reshape(image.shape[:2])
+        image, variance = (x.reshape(shape) for x in self.state.moments())
         # While some pixels know nothing of their error, neither does the image.
-        error = UNKNOWN if count.min() < 2 else estimate.image_error(image, variance)
+        known = self.state.count.min() >= 2
+        return image, variance, estimate.image_error(image, variance) if known else UNKNOWN
+
+    def _result(self, reason, found) -> RenderResult:
+        image, variance, error = found
+        count = self.state.count.reshape(image.shape[:2])
         if reason == "time limit" and self._on_target(error):
             reason = "target error"
         standard_error = estimate.standard_error(image, variance, count)

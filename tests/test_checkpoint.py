@@ -134,8 +134,7 @@ def test_a_finished_render_is_not_done_again(cornell, undisturbed, tmp_path, mon
     first = pj.render_until(cornell, **how)
     same(first, undisturbed)
     state_before = (tmp_path / "run.npz").read_bytes()
-    monkeypatch.setattr(progressive, "_call", lambda scene, chunk, pixels, first, spp, *_: 1 / spp.any() - 1)
-    monkeypatch.setattr(progressive, "compile", lambda *_: None)
+    monkeypatch.setattr(progressive, "compile", lambda *_: lambda *_: pytest.fail("it rendered"))
     again = pj.render_until(cornell, **how)
     same(again, first)
     assert again.run_seconds == first.run_seconds
@@ -232,7 +231,7 @@ def test_foreign_files(cornell, made, what):
 
 
 def test_unwritable_places_are_noticed_before_rendering(cornell, tmp_path, monkeypatch):
-    monkeypatch.setattr(progressive, "_call", lambda *_: pytest.fail("it rendered"))
+    monkeypatch.setattr(progressive, "compile", lambda *_: pytest.fail("it compiled"))
     (tmp_path / "folder.npz").mkdir()
     with pytest.raises(pj.InputError, match="there is no folder"):
         pj.render_until(cornell, spp=4, checkpoint=tmp_path / "none" / "run.npz")

@@ -484,7 +484,7 @@ def load(*arguments, plain=mesh.load, **keywords):
 
 def compile(*arguments, plain=progressive.compile):
     tell("kernel compiles")
-    plain(*arguments)
+    return plain(*arguments)
 
 def extend(*arguments, plain=progressive.extend):
     for number, _ in enumerate(plain(*arguments)):

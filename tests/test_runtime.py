@@ -4,6 +4,8 @@ import json
 import os
 import subprocess
 import sys
+import threading
+import time
 
 import jax
 import jax.numpy as jnp
@@ -219,3 +221,41 @@ def test_map_passes_tangents():
     primal, tangent = jax.jvp(lambda s: native_map(lambda x, s: jnp.sin(s * x), xs, s), (2.0,), (1.0,))
     np.testing.assert_allclose(primal, np.sin(2 * xs), rtol=1e-6)
     np.testing.assert_allclose(tangent, xs * np.cos(2 * xs), rtol=1e-6)
+
+
+# ---- calls at a time ------------------------------------------------------------------------------------------------
+
+
+def test_concurrent_calls_overlap_and_keep_their_order():
+    together = threading.Barrier(runtime.calls_at_once())
+
+    def square(x):
+        together.wait(timeout=20)  # fails unless all threads are at it
+        time.sleep(0.01 * (x % 2))
+        return x * x
+
+    items = range(6 * runtime.calls_at_once())
+    assert list(runtime.concurrently(square, items)) == [(x, x * x) for x in items]
+
+
+def test_concurrent_calls_take_few_items_ahead_and_end_when_closed():
+    taken, begun, ended = [], [], []
+
+    def call(x):
+        begun.append(x)
+        time.sleep(0.02)
+        ended.append(x)
+
+    results = runtime.concurrently(call, (taken.append(x) or x for x in range(1000)))
+    next(results)
+    results.close()
+    assert len(taken) == 2 * runtime.calls_at_once() + 1
+    assert sorted(begun) == sorted(ended)
+
+
+def test_an_error_in_a_concurrent_call_is_raised_in_its_place():
+    done = []
+    with pytest.raises(ZeroDivisionError):
+        for item, _ in runtime.concurrently(lambda x: 1 / (x - 3), range(10)):
+            done.append(item)
+    assert done == [0, 1, 2]

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import pathjax as pj
-from pathjax import estimate, progressive, until
+from pathjax import estimate, progressive, runtime, until
 from pathjax.compare import rel_mse
 
 
@@ -128,10 +128,10 @@ def after_calls(monkeypatch):
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_signals_end_a_render_with_what_is_done(cornell, after_calls, number):
     earlier = signal.getsignal(number)
-    after_calls(3, lambda: signal.raise_signal(number))
+    after_calls(3 * runtime.calls_at_once() - 1, lambda: signal.raise_signal(number))
     result = pj.render_until(cornell, spp=10**6)
     assert result.reason == "interrupted"
-    assert result.spp == 128  # portions of 4, 12, 48 and 64
+    assert result.spp == 256  # portions of 16, 48 and 192, each by one call of every thread
     assert signal.getsignal(number) == earlier
 
 
@@ -175,6 +175,14 @@ def test_a_state_left_after_any_call_leads_to_the_same_bits(cornell, monkeypatch
         parts = rendered(leave_after)
         np.testing.assert_array_equal(whole.means, parts.means)
         np.testing.assert_array_equal(whole.count, parts.count)
+
+
+def test_float64_within_a_context(shipped, x64, cornell):
+    """The calls run in other threads, which do not have it."""
+    with x64():
+        double = shipped("cornell_box", np.float64, res=24)
+        image = pj.render_until(double, spp=64, seed=4).image
+    np.testing.assert_allclose(image.mean(), pj.render_until(cornell, spp=64, seed=4).image.mean(), rtol=1e-3)
 
 
 def test_image_is_the_mean_of_the_replicates(cornell):

@@ -37,7 +37,7 @@ def no_path(scene, **how):
 
 
 def mean(work, scene, choice, control=None, *, strategy, derivative=False, split_depth=0, points="lattice"):
-    """(3,) mean of a pixel's samples.
+    """(3,) mean of a pixel's samples; 0 of none.
 
     Args:
         work: the pixel () int32, and its `numbers`.
@@ -53,7 +53,7 @@ def mean(work, scene, choice, control=None, *, strategy, derivative=False, split
     extend = {"strategy": strategy, "derivative": derivative, "control": control}
     total, _ = over_vertices(work, scene, choice, add, (zero, zero), start, extend)
     _, _, spp, _ = work
-    return total / spp.astype(total.dtype)
+    return total / jnp.maximum(spp, 1).astype(total.dtype)
 
 
 def over_vertices(work, scene, choice, add, sums, start, extend):
