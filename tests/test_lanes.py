@@ -145,6 +145,39 @@ def test_one_lane_after_another(vectors, rows):
     agrees(search, vectors[0], rows)
 
 
+def test_only_lanes_in_a_branch_or_a_loop_have_their_turn():
+    """Half of the items enter the branch, a third of those make a trip of the loop in it."""
+    seen = []
+
+    def count(k):
+        seen.append(int(k))
+        return np.int32(1)
+
+    def called(k):
+        return one_by_one(lambda: jax.pure_callback(count, jax.ShapeDtypeStruct((), jnp.int32), k))()
+
+    def f(k, table):
+        def branch():
+            return lax.while_loop(lambda x: x < jnp.where(k % 3 == 0, 1, 0), lambda x: x + called(k), called(k) - 1)
+
+        return lax.cond(k % 2 == 0, branch, lambda: jnp.int32(7))
+
+    items = np.arange(2 * WIDTH, dtype=np.int32)
+    result = lanes(f, WIDTH)(jnp.asarray(items), jnp.asarray(TABLE))
+    np.testing.assert_array_equal(result, np.where(items % 2, 7, items % 3 == 0))
+    assert sorted(seen) == sorted([*range(0, 2 * WIDTH, 2), *range(0, 2 * WIDTH, 6)])
+
+
+def test_what_other_lanes_lack_keeps_no_loop_from_its_end():
+    """A step that only lanes in the branch have; in the others it is 0, with which their loop would not end."""
+
+    def f(n, table):
+        step = one_by_one(lambda: 1 + n * n)
+        return lax.cond(n > 2, lambda: lax.while_loop(lambda x: x < 50, lambda x: x + step(), n), lambda: n)
+
+    agrees(f, np.arange(2 * WIDTH, dtype=np.int32))
+
+
 def test_barriers_and_calls(vectors):
     def f(a, b, table):
         a, table = lax.optimization_barrier((a, table))

@@ -11,6 +11,7 @@ import numpy as np
 from jax import lax
 from jax.extend import core
 
+from pathjax.core.math import at
 from pathjax.lanes.flow import callee, eqn_flow, read_by, scan_parts, variables, while_parts
 from pathjax.lanes.rules import RULES
 from pathjax.lanes.values import components, differs, entries, fits, join, objects, split
@@ -20,7 +21,7 @@ _FEW_ROWS = 8
 
 
 def one_by_one(f: Callable) -> Callable:
-    """f, which `lanes` runs for one lane after another."""
+    """f, which `lanes` runs for one lane after another: those that are in the branch, or the loop, where it stands."""
 
     def one_by_one(*args):
         return f(*args)
@@ -28,17 +29,53 @@ def one_by_one(f: Callable) -> Callable:
     return jax.jit(one_by_one)
 
 
+def in_turn(waits, act: Callable, state):
+    """act(lane, state) -> state, for one after another of the lanes (W,) that wait."""
+    width = len(waits)
+    waits = jnp.concatenate([waits, jnp.array([True])])
+
+    def seek(lane):
+        return lax.while_loop(lambda k: ~at(waits, k), lambda k: k + 1, lane)
+
+    def step(state):
+        lane, state = state
+        return seek(lane + 1), act(lane, state)
+
+    return lax.while_loop(lambda state: state[0] < width, step, (seek(jnp.int32(0)), state))[1]
+
+
+def of_lane(lane, columns, differs, shape, dtype):
+    """A packed value, as one lane has it."""
+    if not differs:
+        return columns
+    return jnp.stack([at(column, lane) for column in columns]).reshape(shape) if columns else jnp.zeros(shape, dtype)
+
+
+def put(column, x, lane):
+    return lax.dynamic_update_index_in_dim(column, x, lane, 0, allow_negative_indices=False)
+
+
 class Lanes:
     """Runs programs on values of `width` lanes."""
 
     def __init__(self, width: int, always):
         self.width, self.always = width, always
+        self.active = None  # (W,) bool lanes whose results are read; None: all. In the others they may be anything.
 
     def run(self, program: core.ClosedJaxpr, inputs) -> list:
         jaxpr = program.jaxpr
         values = self.environment(program, inputs)
         self.run_equations(jaxpr.eqns, values, read_by(jaxpr.eqns) | variables(jaxpr.outvars))
         return [self.read(values, v) for v in jaxpr.outvars]
+
+    def run_for(self, lanes, program: core.ClosedJaxpr, inputs) -> list:
+        """`run` where only some lanes (W,) bool, of the active ones, read the results."""
+        outer = self.active
+        self.active = lanes if outer is None else outer & lanes
+        try:
+            return self.run(program, inputs)
+        finally:
+            self.active = outer
 
     @staticmethod
     def environment(program: core.ClosedJaxpr, inputs) -> dict:
@@ -130,11 +167,15 @@ class Lanes:
         return [split(y) for y in (outputs if eqn.primitive.multiple_results else [outputs])]
 
     def one_by_one(self, program, inputs):
-        def of_lane(mine):
-            mine = iter(mine)
-            return core.jaxpr_as_fun(program)(*[next(mine) if differs(x) else x for x in inputs])
+        rows = [join(x, self.width) if differs(x) else x for x in inputs]
+        active = jnp.ones((self.width,), bool) if self.active is None else self.active
 
-        return [split(y) for y in lax.map(of_lane, [join(x, self.width) for x in inputs if differs(x)])]
+        def act(lane, results):
+            mine = [at(row, lane) if differs(x) else x for row, x in zip(rows, inputs, strict=True)]
+            return list(map(partial(put, lane=lane), results, core.jaxpr_as_fun(program)(*mine)))
+
+        results = [jnp.zeros((self.width, *aval.shape), aval.dtype) for aval in program.out_avals]
+        return list(map(split, in_turn(active, act, results)))
 
     # ---- control flow -----------------------------------------------------------------------------------------------
 
@@ -163,16 +204,20 @@ class Lanes:
 
         def goes_on(packed):
             (result,) = self.run(test, [*test_consts, *self.unpack(packed, differing, shapes)])
-            return result.item() if differs(result) else result
+            if not differs(result):
+                return result
+            return result.item() if self.active is None else result.item() & self.active
 
         def advance(packed):
             carry = self.unpack(packed, differing, shapes)
-            new = self.run(body, [*body_consts, *carry])
             on = goes_on(packed)
             if jnp.ndim(on):
                 on = self.once([objects((), [on])])[0].item()
+                new = self.run_for(on, body, [*body_consts, *carry])
                 pairs = zip(carry, new, kept, strict=True)
                 new = [self.select(on, old, value) if keep else value for old, value, keep in pairs]
+            else:
+                new = self.run(body, [*body_consts, *carry])
             return self.pack(new, differing)
 
         packed = lax.while_loop(lambda packed: jnp.any(goes_on(packed)), advance, self.pack(init, differing))
@@ -213,7 +258,7 @@ class Lanes:
         if differs(which):
             which = self.once([which])[0].item()
             which = which != 0 if len(branches) == 2 else jnp.clip(which, 0, len(branches) - 1)
-            results = [self.run(branch, operands) for branch in branches]
+            results = [self.run_for(which == k, branch, operands) for k, branch in enumerate(branches)]
             return [self.select(which, *cases) for cases in zip(*results, strict=True)]
         differing = eqn_flow(eqn, list(map(differs, inputs)))
         calls = [lambda branch=branch: self.pack(self.run(branch, operands), differing) for branch in branches]

@@ -9,7 +9,7 @@ from jax import lax
 
 from pathjax.core.math import at
 from pathjax.lanes.flow import read_by, variables, while_parts
-from pathjax.lanes.machine import Lanes
+from pathjax.lanes.machine import Lanes, in_turn, of_lane, put
 from pathjax.lanes.values import join, split
 
 
@@ -71,14 +71,8 @@ def from_queue(machine: Lanes, program, xs, shared, place, flags):
 
     def serve(state):
         """Put results away and begin other items, lane by lane."""
-        waits = jnp.concatenate([awaits(state), jnp.array([True])])
-
-        def seek(lane):
-            """The next that waits; W: none."""
-            return lax.while_loop(lambda k: ~at(waits, k), lambda k: k + 1, lane)
-
-        def serve_one(state):
-            lane, (following, item, packed, results) = state
+        def serve_one(lane, state):
+            following, item, packed, results = state
             mine = map(partial(of_lane, lane), packed, differing, shapes, dtypes)
             ended = common | dict(zip(kept, mine, strict=True))
             machine.run_equations(after, ended)
@@ -91,9 +85,9 @@ def from_queue(machine: Lanes, program, xs, shared, place, flags):
                 [put(column, x, lane) for column, x in zip(columns, jnp.ravel(begun[v]), strict=True)] if d else columns
                 for v, columns, d in zip(kept, packed, differing, strict=True)
             ]
-            return seek(lane + 1), (following + 1, put(item, following, lane), packed, results)
+            return following + 1, put(item, following, lane), packed, results
 
-        return lax.while_loop(lambda state: state[0] < width, serve_one, (seek(jnp.int32(0)), state))[1]
+        return in_turn(awaits(state), serve_one, state)
 
     def trip(state):
         following, item, packed, results = lax.while_loop(lambda state: jnp.any(awaits(state)), serve, state)
@@ -111,13 +105,3 @@ def from_queue(machine: Lanes, program, xs, shared, place, flags):
     *_, results = lax.while_loop(lambda s: (s[0] < count) | jnp.any(s[1] < count), trip, state)
     return results
 
-
-def of_lane(lane, columns, differs, shape, dtype):
-    """A packed value, as one lane has it."""
-    if not differs:
-        return columns
-    return jnp.stack([at(column, lane) for column in columns]).reshape(shape) if columns else jnp.zeros(shape, dtype)
-
-
-def put(column, x, lane):
-    return lax.dynamic_update_index_in_dim(column, x, lane, 0, allow_negative_indices=False)

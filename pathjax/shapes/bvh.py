@@ -46,12 +46,18 @@ def prepare(o, d):
     return jnp.concatenate([inv, start + slack, start - slack]), octant
 
 
-def traverse(tree: Tree, leaf, prepared, t, primitive):
+def enter(tree: Tree, prepared, t):
+    """() int32: the first entry of `traverse`; 0 if the ray meets no child of the root at 0 <= s <= t."""
+    ray, octant = prepared
+    return hit_children(tree, jnp.int32(0), ray, _weights(octant), t)
+
+
+def traverse(tree: Tree, leaf, prepared, entry, t, primitive):
     """Visit the leaves that the ray o + s d, 0 <= s <= t, may hit, near ones first.
 
     Args:
         leaf: (number of the leaf, t, primitive) -> (t, primitive) after testing it; a negative t ends the search.
-        prepared: of `prepare`.
+        prepared: of `prepare`; entry: of `enter`.
         t: () the farthest distance of interest; shrinks as hits are found.
         primitive: () int32, carried along.
     Returns:
@@ -64,21 +70,7 @@ def traverse(tree: Tree, leaf, prepared, t, primitive):
     travel in one array.
     """
     ray, octant = prepared
-    eps = np.finfo(ray.dtype).eps
-    lane = jnp.arange(WIDTH, dtype=jnp.int32)
-    weights = jnp.left_shift(jnp.int32(1), lane ^ octant)
-    ray, octant, weights = lax.optimization_barrier((ray, octant, weights))
-
-    def hit_children(node, t):
-        box = lax.bitcast_convert_type(at(tree.nodes, node), ray.dtype)  # the last row is not used
-        low = [box[axis] * ray[axis] for axis in range(3)]
-        high = [box[3 + axis] * ray[axis] for axis in range(3)]
-        near = [smaller(low[axis], high[axis]) - ray[3 + axis] for axis in range(3)]
-        far = [larger(low[axis], high[axis]) - ray[6 + axis] for axis in range(3)]
-        # The NaN of an empty slot gets through as the last argument.
-        enter = larger(larger(larger(jnp.zeros_like(t), near[2]), near[1]), near[0])
-        leave = smaller(smaller(far[0], far[1]), smaller(far[2], t))
-        return jnp.sum(jnp.where(enter <= leave * (1 + 5 * eps), weights, 0), dtype=jnp.int32)
+    ray, octant, weights = lax.optimization_barrier((ray, octant, _weights(octant)))
 
     def visit_next(state):
         free, entry, stack, t, primitive = state
@@ -90,7 +82,7 @@ def traverse(tree: Tree, leaf, prepared, t, primitive):
             return *leaf(~child, t, primitive), jnp.int32(0)
 
         def open_node():
-            return t, primitive, hit_children(child, t)
+            return t, primitive, hit_children(tree, child, ray, weights, t)
 
         t, primitive, below = lax.cond(child < 0, test_leaf, open_node)
         # Push the rest, unless it is empty; then go below, or pop.
@@ -106,5 +98,23 @@ def traverse(tree: Tree, leaf, prepared, t, primitive):
         return (entry != 0) & (t >= 0)
 
     stack = jnp.zeros((tree.depth + 1,), jnp.int32)
-    start = (jnp.int32(1), hit_children(jnp.int32(0), t), stack, t, primitive)
-    return lax.while_loop(more, visit_next, start)[3:]
+    return lax.while_loop(more, visit_next, (jnp.int32(1), entry, stack, t, primitive))[3:]
+
+
+def _weights(octant):
+    """(8,) int32: the bit of each slot in an entry."""
+    return jnp.left_shift(jnp.int32(1), jnp.arange(WIDTH, dtype=jnp.int32) ^ octant)
+
+
+def hit_children(tree: Tree, node, ray, weights, t):
+    """() int32 mask of the children of a node that a ray meets at 0 <= s <= t."""
+    box = lax.bitcast_convert_type(at(tree.nodes, node), ray.dtype)  # the last row is not used
+    low = [box[axis] * ray[axis] for axis in range(3)]
+    high = [box[3 + axis] * ray[axis] for axis in range(3)]
+    near = [smaller(low[axis], high[axis]) - ray[3 + axis] for axis in range(3)]
+    far = [larger(low[axis], high[axis]) - ray[6 + axis] for axis in range(3)]
+    # The NaN of an empty slot gets through as the last argument.
+    enter = larger(larger(larger(jnp.zeros_like(t), near[2]), near[1]), near[0])
+    leave = smaller(smaller(far[0], far[1]), smaller(far[2], t))
+    eps = np.finfo(ray.dtype).eps
+    return jnp.sum(jnp.where(enter <= leave * (1 + 5 * eps), weights, 0), dtype=jnp.int32)

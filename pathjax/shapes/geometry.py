@@ -137,13 +137,20 @@ def _visit_table(table, first, ray, leaf_test, t, primitive):
 
     # A search goes its own way for each ray; what it starts from is made for all of them.
     @one_by_one
-    def search(slabs, prepared, exclude, t, primitive):
+    def search(slabs, entry, prepared, exclude, t, primitive):
         of_ray = partial(leaf, lax.optimization_barrier(prepared), exclude)
-        return bvh.traverse(table.tree, of_ray, slabs, t, primitive)
+        return bvh.traverse(table.tree, of_ray, slabs, entry, t, primitive)
 
     prepared = lax.optimization_barrier(module.prepare(ray.o, ray.d))
     if table.tree is not None:
-        return search(bvh.prepare(ray.o, ray.d), prepared, ray.exclude, t, primitive)
+        slabs = lax.optimization_barrier(bvh.prepare(ray.o, ray.d))
+        entry = lax.optimization_barrier(bvh.enter(table.tree, slabs, t))
+        # Most rays miss the mesh, and many its root's children.
+        return lax.cond(
+            entry != 0,
+            lambda: search(slabs, entry, prepared, ray.exclude, t, primitive),
+            lambda: (t, primitive),
+        )
     of_ray = partial(leaf, prepared, ray.exclude)
     found = lax.fori_loop(0, len(table.leaves), lambda number, state: of_ray(number, *state), (t, primitive))
     # XLA dissolves a loop of one trip, and would test again for each consumer.

@@ -113,7 +113,8 @@ def test_leaves_and_triangles_are_those_of_the_renderers_traversal(root, rule):
             nearest = jnp.min(jnp.where(inside, distance, jnp.inf))
             return jnp.minimum(t, nearest), (leaves + 1, triangles + counts[number])
 
-        t, carried = bvh.traverse(table.tree, leaf, bvh.prepare(o, d), jnp.float32(1e30), (jnp.int32(0),) * 2)
+        slabs, far = bvh.prepare(o, d), jnp.float32(1e30)
+        t, carried = bvh.traverse(table.tree, leaf, slabs, bvh.enter(table.tree, slabs, far), far, (jnp.int32(0),) * 2)
         return t, *carried
 
     _, leaves, tested = jax.jit(lambda o, d: jax.lax.map(lambda ray: one(*ray), (o, d)))(o, d)
