@@ -48,26 +48,26 @@ def closest_hit(geometry: Geometry, ray: Ray) -> Hit:
     beyond = _bits(jnp.full_like(ray.t_max, jnp.inf))
     ray = jax.tree.map(lax.stop_gradient, ray)
 
-    def leaf_test(distances, primitives, t, primitive):
+    def leaf_test(distances, rows, first, t, primitive):
         if len(distances) == 1:
-            (distance,), (candidate,) = lax.optimization_barrier((distances, primitives))
+            (distance,), (candidate,) = lax.optimization_barrier((distances, rows + first))
             nearer = (distance > 0) & ((distance < t) | ((distance == t) & (primitive == none)))
             return jnp.where(nearer, distance, t), jnp.where(nearer, candidate, primitive)
-        # Positive floats order as integers, and integer minima vectorise. A miss is the bits of infinity or more.
-        bits = jnp.where((distances > 0) & (distances <= t), _bits(distances), beyond)
-        bits = lax.optimization_barrier(bits)
-        nearest = lax.optimization_barrier(_least(bits))
+        hit, distances = lax.optimization_barrier(((distances > 0) & (distances <= t), distances))
 
         def update():
+            # Positive floats order as integers, and integer minima vectorise.
+            bits = lax.optimization_barrier(jnp.where(hit, _bits(distances), beyond))
+            nearest = lax.optimization_barrier(_least(bits))
             found = lax.bitcast_convert_type(nearest, distances.dtype)
             # The lowest of those that tie is the first: primitives ascend with the lanes.
             lanes = jnp.left_shift(jnp.int32(1), jnp.arange(len(bits), dtype=jnp.int32))
             tied = jnp.sum(jnp.where(bits == nearest, lanes, 0), dtype=jnp.int32)
-            candidate = at(primitives, lax.population_count(~tied & (tied - 1)))
+            candidate = at(rows, lax.population_count(~tied & (tied - 1))) + first
             better = (found < t) | (candidate < primitive)
             return jnp.where(better, found, t), jnp.where(better, candidate, primitive)
 
-        return lax.cond(nearest < beyond, update, lambda: (t, primitive))
+        return lax.cond(jnp.any(hit), update, lambda: (t, primitive))
 
     # A miss is infinitely far, and no bound may equal that.
     farthest = smaller(ray.t_max, jnp.full_like(ray.t_max, jnp.finfo(ray.t_max.dtype).max))
@@ -80,8 +80,8 @@ def closest_hit(geometry: Geometry, ray: Ray) -> Hit:
 def occluded(geometry: Geometry, ray: Ray, target):
     """() bool: whether anything but the primitive `target` lies at 0 < t < ray.t_max."""
 
-    def leaf_test(distances, primitives, t, primitive):
-        blocked = jnp.any((distances > 0) & (distances < t) & (primitives != target))
+    def leaf_test(distances, rows, first, t, primitive):
+        blocked = jnp.any((distances > 0) & (distances < t) & (rows != target - first))
         return jnp.where(blocked, -1, t), primitive
 
     ray = jax.tree.map(lax.stop_gradient, ray)
@@ -115,7 +115,8 @@ def switch_by_range(number, first: list[int], branches):
 
 
 def _visit(geometry: Geometry, ray: Ray, leaf_test, t, primitive):
-    """Give every leaf that the ray may meet to `leaf_test(distances (W,), primitives (W,), t, primitive)`."""
+    """Give every leaf that the ray may meet to `leaf_test(distances (W,), rows (W,), first, t, primitive)`, which
+    returns t, primitive. The primitives are first + rows: W sums that only a hit wants."""
     for table, first in zip(geometry.tables, firsts(geometry), strict=True):
         for part in searched(table):
             t, primitive = _visit_table(part, first, ray, leaf_test, t, primitive)
@@ -133,7 +134,7 @@ def _visit_table(table, first, ray, leaf_test, t, primitive):
 
     def leaf(prepared, exclude, number, t, primitive):
         distances, rows = module.intersect(table, number, prepared, exclude - first)
-        return leaf_test(distances, rows + first, t, primitive)
+        return leaf_test(distances, rows, first, t, primitive)
 
     # A search goes its own way for each ray; what it starts from is made for all of them.
     @one_by_one

@@ -67,14 +67,15 @@ def intersect(table: Triangles, leaf, prepared, start):
 
     def coordinates(axis):
         start = [jnp.asarray(i, jnp.uint32) for i in (leaf, 3 * axis, 0)]
-        return lax.dynamic_slice(table.leaves, start, (1, 3, width), allow_negative_indices=False)[0]
+        return list(lax.dynamic_slice(table.leaves, start, (1, 3, width), allow_negative_indices=False)[0])
 
-    z = coordinates(axes[2]) - ray[2]
-    x = coordinates(axes[0]) - ray[0] - ray[3] * z
-    y = coordinates(axes[1]) - ray[1] - ray[4] * z
+    # Vertex by vertex: XLA does not vectorise loops over (3, W).
+    z = [c - ray[2] for c in coordinates(axes[2])]
+    x = [c - ray[0] - ray[3] * z for c, z in zip(coordinates(axes[0]), z, strict=True)]
+    y = [c - ray[1] - ray[4] * z for c, z in zip(coordinates(axes[1]), z, strict=True)]
     # Several results share these; without the barrier each computes them again. (z is cheaper computed twice.)
     x, y = lax.optimization_barrier((x, y))
-    tolerance = 2 * np.finfo(x.dtype).eps
+    tolerance = 2 * np.finfo(ray.dtype).eps
 
     def edge(i, j):
         a, b = x[i] * y[j], y[i] * x[j]
