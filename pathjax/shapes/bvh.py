@@ -72,33 +72,50 @@ def traverse(tree: Tree, leaf, prepared, entry, t, primitive):
     ray, octant = prepared
     ray, octant, weights = lax.optimization_barrier((ray, octant, _weights(octant)))
 
-    def visit_next(state):
-        free, entry, stack, t, primitive = state
+    def first_child(entry):
+        """Of those to visit: < 0 a leaf, > 0 a node."""
+        slot = (lax.population_count(~entry & (entry - 1)) ^ octant) & (WIDTH - 1)
+        return at(tree.nodes, entry >> WIDTH, 6, slot).astype(jnp.int32)
+
+    def rest_of(entry):
+        """The entry without its first child, and whether any is left."""
         rest = entry & (entry - 1)
-        slot = (lax.population_count(~entry & (entry - 1)) ^ octant) & (WIDTH - 1)  # of the lowest bit
-        child = at(tree.nodes, entry >> WIDTH, 6, slot).astype(jnp.int32)
+        return rest, rest & ((1 << WIDTH) - 1) != 0
 
-        def test_leaf():
-            return *leaf(~child, t, primitive), jnp.int32(0)
+    def descend(free, entry, stack, t):
+        """Open nodes until a leaf comes next, or nothing."""
 
-        def open_node():
-            return t, primitive, hit_children(tree, child, ray, weights, t)
+        def open_node(state):
+            free, entry, child, stack = state
+            below = hit_children(tree, child, ray, weights, t)
+            rest, some = rest_of(entry)
+            # Push the rest, unless it is empty; then go below, or pop.
+            place = free.astype(jnp.uint32)
+            stack = lax.dynamic_update_slice(stack, rest[None], (place,), allow_negative_indices=False)
+            free = free + some.astype(jnp.int32) - (below == 0).astype(jnp.int32)
+            entry = jnp.where(below != 0, child << WIDTH | below, at(stack, free))
+            return free, entry, first_child(entry), stack
 
-        t, primitive, below = lax.cond(child < 0, test_leaf, open_node)
-        # Push the rest, unless it is empty; then go below, or pop.
-        place = free.astype(jnp.uint32)
-        stack = lax.dynamic_update_slice(stack, rest[None], (place,), allow_negative_indices=False)
-        some = rest & ((1 << WIDTH) - 1) != 0
-        free = free + some.astype(jnp.int32) - (below == 0).astype(jnp.int32)
-        entry = jnp.where(below != 0, child << WIDTH | below, at(stack, free))
-        return free, entry, stack, t, primitive
+        free, entry, child, stack = lax.while_loop(
+            lambda state: (state[1] != 0) & (state[2] > 0), open_node, (free, entry, first_child(entry), stack)
+        )
+        return free, entry, child, stack
+
+    def visit_leaf(state):
+        free, entry, child, stack, t, primitive = state
+        t, primitive = leaf(~child, t, primitive)
+        rest, some = rest_of(entry)
+        free = free - (~some).astype(jnp.int32)
+        entry = jnp.where(some, rest, at(stack, free))
+        return *descend(free, entry, stack, t), t, primitive
 
     def more(state):
-        _, entry, _, t, _ = state
+        _, entry, _, _, t, _ = state
         return (entry != 0) & (t >= 0)
 
     stack = jnp.zeros((tree.depth + 1,), jnp.int32)
-    return lax.while_loop(more, visit_next, (jnp.int32(1), entry, stack, t, primitive))[3:]
+    start = *descend(jnp.int32(1), entry, stack, t), t, primitive
+    return lax.while_loop(more, visit_leaf, start)[4:]
 
 
 def _weights(octant):
