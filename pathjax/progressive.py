@@ -17,9 +17,9 @@ from pathjax.scene import Scene
 # that an interrupt is heard at once. The schedule is fixed, not timed, so that the same command gives the same image.
 CHUNK_PIXELS = 1 << 12
 MAX_PASS_SPP = 64 * replicates.COUNT
-# Samples of the first pass over the image, so that there is soon a whole picture: after the lower number where more of
-# them than the higher one are not planned.
-_FIRST_SPP = replicates.COUNT, 4 * replicates.COUNT
+# Samples of the first pass over the image, so that there is soon a whole picture, and where no more than so many are
+# planned, as in a pilot that shall end in time.
+_FIRST_SPP, _FIRST_OF_FEW = 4 * replicates.COUNT, replicates.COUNT
 # A call of few items is another program, whose last bits may differ.
 _LEAST_CHUNK = -(-runtime.MANY_ITEMS // replicates.COUNT)
 
@@ -99,7 +99,8 @@ def _portions(state: State, chunk: int) -> Iterator[tuple]:
         for first in range(0, missing.size, chunk):
             pixels = missing[first : first + chunk]
             before, goal = planned[pixels], state.goal[pixels]
-            portion = np.clip(3 * before, np.where(goal > max(_FIRST_SPP), *_FIRST_SPP[::-1]), MAX_PASS_SPP)
+            least = np.where(goal > _FIRST_SPP, _FIRST_SPP, _FIRST_OF_FEW)
+            portion = np.clip(3 * before, least, MAX_PASS_SPP)
             planned[pixels] = after = np.minimum(before + portion, goal)
             first_sample = replicates.shares(before)
             yield pixels, first_sample, replicates.shares(after) - first_sample

@@ -6,7 +6,8 @@ array (W,) over the lanes. Structure (stack, slice, reshape) then costs nothing,
 and what all lanes share stays shared. Branches become selections; a loop goes on until its last lane is done, but lanes
 leave the loop that an item's own work consists of one by one, each for the next item.
 
-- `one_by_one(f)` is run for each lane in turn: a search whose lanes would go different ways.
+- `one_by_one(f)` is run for one lane after another, of those that are in the branch or the loop where it stands: a
+  search whose lanes would go different ways.
 - `optimization_barrier(x)` is computed once. (XLA's own barrier is gone before fusion, which computes a value again for
   each of its consumers.)
 """

@@ -146,7 +146,7 @@ def _visit_table(table, first, ray, leaf_test, t, primitive):
     if table.tree is not None:
         slabs = lax.optimization_barrier(bvh.prepare(ray.o, ray.d))
         entry = lax.optimization_barrier(bvh.enter(table.tree, slabs, t))
-        # Most rays miss the mesh, and many its root's children.
+        # Many rays meet no child of the root.
         return lax.cond(
             entry != 0,
             lambda: search(slabs, entry, prepared, ray.exclude, t, primitive),
