@@ -115,7 +115,9 @@ def test_views_share_parameters_and_know_more_together(write_scene, room, target
     both = pj.fit([room, other], [target, np.asarray(pj.render(other, 1024, seed=2))], NAMES, start=START, spp=32)
     assert both.converged and len(both.images) == len(both.scenes) == 2
     assert np.abs(z_scores(both, pj.parameters(room))).max() < 4.5
-    assert np.linalg.det(both.covariance) < np.linalg.det(fitted.covariance)
+    # In the mean, and well: one pixel at an edge may dominate a stated error, or the determinant of all.
+    ratios = np.log([both.standard_errors[n] / fitted.standard_errors[n] for n in NAMES])
+    assert np.exp(ratios.mean()) < 0.95
 
 
 @pytest.mark.parametrize(
