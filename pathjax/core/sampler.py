@@ -17,11 +17,11 @@ from pathjax.core.math import at
 # Generating vector of an extensible lattice sequence for a path tracer, up to 2^20 points. Rows are the four dimensions
 # of a vertex: film and lens, then light sample and bsdf sample. The light sample of a vertex is never multiplied with
 # another's, nor with the bsdf samples of its own and later vertices; so each pair was chosen, component by component
-# (Dick, Kuo and Sloan, section 5), for the least shift-averaged error of the terms that hold it: film, lens, bsdf
-# samples of the vertices before, and one light or bsdf sample. A dimension weighs 0.3, and 0.7 as much at each further
-# vertex. Twelve bits serve 2^3 to 2^12 points together, each further one twice as many. Some sixty vectors within a
-# tenth of the least error, by several weights, were tried on four scenes; this is among the best, and did as well on
-# six others. Deeper vertices use the rows again, under other shifts: still unbiased.
+# (Dick, Kuo and Sloan), for the least shift-averaged error of the terms that hold it: film, lens, bsdf samples of the
+# vertices before, and one light or bsdf sample. A dimension weighs 0.3, and 0.7 as much at each further vertex. The
+# lowest twelve bits serve 2^3 to 2^12 points together, each further bit twice as many. Some sixty vectors of nearly the
+# least error, by several weights, were tried on four scenes; this is among the best, and did as well on six others.
+# Deeper vertices use the rows again, under other shifts: still unbiased.
 _GENERATORS = np.array(
     [
         [1, 273965, 177595, 892119], [574107, 988125, 412389, 873177], [1006923, 598441, 1007947, 797155],

@@ -71,6 +71,7 @@ def from_queue(machine: Lanes, program, xs, shared, place, flags):
 
     def serve(state):
         """Put results away and begin other items, lane by lane."""
+
         def serve_one(lane, state):
             following, item, packed, results = state
             mine = map(partial(of_lane, lane), packed, differing, shapes, dtypes)
@@ -104,4 +105,3 @@ def from_queue(machine: Lanes, program, xs, shared, place, flags):
     state = jnp.int32(0), jnp.full((width,), count, jnp.int32), packed, results
     *_, results = lax.while_loop(lambda s: (s[0] < count) | jnp.any(s[1] < count), trip, state)
     return results
-

@@ -49,7 +49,7 @@ def prepare(o, d):
 def enter(tree: Tree, prepared, t):
     """() int32: the first entry of `traverse`; 0 if the ray meets no child of the root at 0 <= s <= t."""
     ray, octant = prepared
-    return hit_children(tree, jnp.int32(0), ray, _weights(octant), t)
+    return _hit_children(tree, jnp.int32(0), ray, _weights(octant), t)
 
 
 def traverse(tree: Tree, leaf, prepared, entry, t, primitive):
@@ -88,7 +88,7 @@ def traverse(tree: Tree, leaf, prepared, entry, t, primitive):
 
         def open_node(state):
             free, entry, child, stack = state
-            below = hit_children(tree, child, ray, weights, t)
+            below = _hit_children(tree, child, ray, weights, t)
             rest, some = rest_of(entry)
             # Push the rest, unless it is empty; then go below, or pop.
             place = free.astype(jnp.uint32)
@@ -125,7 +125,7 @@ def _weights(octant):
     return jnp.left_shift(jnp.int32(1), jnp.arange(WIDTH, dtype=jnp.int32) ^ octant)
 
 
-def hit_children(tree: Tree, node, ray, weights, t):
+def _hit_children(tree: Tree, node, ray, weights, t):
     """() int32 mask of the children of a node that a ray meets at 0 <= s <= t."""
     box = lax.bitcast_convert_type(at(tree.nodes, node), ray.dtype)  # the last row is not used
     low = [box[axis] * ray[axis] for axis in range(3)]

@@ -131,7 +131,7 @@ def test_pairs_of_dimensions_are_stratified_jointly():
 def error_of_terms(generators, count):
     """Squared shift-averaged errors of the terms up to vertex 6, added, each with weights 1/2 by vertex.
 
-    For functions whose Fourier coefficients fall like 1 / h, as they do across edges (Dick, Kuo and Sloan, section 5).
+    For functions whose Fourier coefficients fall like 1 / h, as they do across edges (Dick, Kuo and Sloan 2013).
     """
     x = np.arange(count)[:, None, None] * generators % count / count
     factors = 6 * (x * x - x + 1 / 6)
