@@ -18,6 +18,8 @@ from pathjax.lanes.values import components, differs, entries, fits, join, objec
 
 # Rows of a table from which lanes select what they want; gathering is faster from more.
 _FEW_ROWS = 8
+# Flags in a word.
+_WORD = 32
 
 
 def one_by_one(f: Callable) -> Callable:
@@ -31,17 +33,19 @@ def one_by_one(f: Callable) -> Callable:
 
 def in_turn(waits, act: Callable, state):
     """act(lane, state) -> state, for one after another of the lanes (W,) that wait."""
-    width = len(waits)
-    waits = jnp.concatenate([waits, jnp.array([True])])
+    words = -(-len(waits) // _WORD)
+    bits = jnp.pad(waits, (0, words * _WORD - len(waits))).reshape(words, _WORD)
+    bits = (bits.astype(jnp.uint32) << jnp.arange(_WORD, dtype=jnp.uint32)).sum(1, dtype=jnp.uint32)
 
-    def seek(lane):
-        return lax.while_loop(lambda k: ~at(waits, k), lambda k: k + 1, lane)
+    def act_for(k, state):
+        def step(state):
+            waiting, state = state
+            lowest = lax.population_count((waiting & -waiting) - 1).astype(jnp.int32)
+            return waiting & (waiting - 1), act(_WORD * k + lowest, state)
 
-    def step(state):
-        lane, state = state
-        return seek(lane + 1), act(lane, state)
+        return lax.while_loop(lambda state: state[0] != 0, step, (at(bits, k), state))[1]
 
-    return lax.while_loop(lambda state: state[0] < width, step, (seek(jnp.int32(0)), state))[1]
+    return lax.fori_loop(0, words, act_for, state)
 
 
 def of_lane(lane, columns, differs, shape, dtype):
