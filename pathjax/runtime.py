@@ -40,7 +40,7 @@ _WIDTH_FLAG = f"--{_WIDTH_OPTION}=512"
 _DEVICE_FLAG = "xla_force_host_platform_device_count"
 # Items that a native loop takes at once: enough that loops over them vectorise and their overheads vanish, few enough
 # that what they keep stays in the nearest caches. Few items would leave most of the lanes idle.
-_LANES, _FEW_LANES = 128, 64
+_LANES, _FEW_LANES = 256, 64
 MANY_ITEMS = 2 * _LANES
 # Bytes of live values that one lane of a vmapped path keeps; sizes the chunks on an accelerator.
 _BYTES_PER_LANE = 4096

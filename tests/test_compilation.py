@@ -1,5 +1,6 @@
 """What is compiled, and how often: one native kernel for a render or a query, without what the scene lacks."""
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -45,6 +46,15 @@ def assert_one_native_kernel(compiled):
 @pytest.mark.parametrize("name", SCENES)
 def test_every_scene_renders_in_one_native_kernel(kernel_of, name):
     assert_one_native_kernel(kernel_of(name).compiled)
+
+
+@pytest.mark.parametrize("name", ["cornell_box", "glass_and_mirror", "mesh"])
+def test_columns_of_lanes_are_seldom_copied(kernel_of, name):
+    """XLA copies what it believes to be overwritten while it is read: once two columns for each that was computed."""
+    text = kernel_of(name).compiled.as_text()
+    copied, computed = (len(re.findall(rf"= \w+\[64\]\S* {what}\(", text)) for what in ("copy", "fusion"))
+    assert computed > 50
+    assert copied < computed / 2
 
 
 @pytest.mark.parametrize("strategy, devices", [("mis", 1), ("light", 1), ("bsdf", None)])

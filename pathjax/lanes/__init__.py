@@ -38,9 +38,9 @@ def lanes(f: Callable, width: int) -> Callable:
         one = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), xs)
         program, out = jax.make_jaxpr(f, return_shape=True)(one, *shared)
         xs, shared = jax.tree.leaves(xs), jax.tree.leaves(shared)
-        # True, and no pass over HLO knows it.
-        always = lax.population_count(xs[0].ravel()[0].astype(jnp.int32)) >= 0
-        machine = Lanes(width, always)
+        # False, and no pass over HLO knows it.
+        never = lax.population_count(xs[0].ravel()[0].astype(jnp.int32)) < 0
+        machine = Lanes(width, never)
         flags = flags_of(program, [True] * len(xs) + [False] * len(shared))
         place = own_loop(program, flags)
         if place is None:

@@ -62,8 +62,9 @@ def put(column, x, lane):
 class Lanes:
     """Runs programs on values of `width` lanes."""
 
-    def __init__(self, width: int, always):
-        self.width, self.always = width, always
+    def __init__(self, width: int, never):
+        self.width, self.never = width, never
+        self.computed = {}  # by id: what has been made to be computed once
         self.active = None  # (W,) bool lanes whose results are read; None: all. In the others they may be anything.
 
     def run(self, program: core.ClosedJaxpr, inputs) -> list:
@@ -155,11 +156,26 @@ class Lanes:
         return found
 
     def once(self, values):
-        """The values, of which every consumer reads one result: outcomes of a branch that is always taken."""
-        items = [item for value in values for item in (value.flat if differs(value) else [value])]
-        results = iter(lax.cond(self.always, lambda *x: x, lambda *x: tuple(map(jnp.zeros_like, x)), *items))
+        """The values, of which every consumer reads one result: what is carried through a loop that never runs.
+
+        Its body changes them, or XLA would remove it. A branch that is always taken does the same, but copies them all.
+        """
+        items = {id(item): item for value in values for item in (value.flat if differs(value) else [value])}
+        # Tangents of integers are float0, of which nothing is computed.
+        there = [item for item in items.values() if jax.typeof(item).dtype != jax.dtypes.float0]
+        new = [item for item in there if id(item) not in self.computed]
+        if not new:
+            return values
+
+        def change(state):
+            _, *items = state
+            return False, *(~x if x.dtype == bool else -x for x in items)
+
+        _, *results = lax.while_loop(lambda state: state[0], change, (self.never, *new))
+        items |= zip(map(id, new), results, strict=True)
+        self.computed |= {id(item): item for item in results}
         return [
-            objects(value.shape, [next(results) for _ in value.flat]) if differs(value) else next(results)
+            objects(value.shape, [items[id(item)] for item in value.flat]) if differs(value) else items[id(value)]
             for value in values
         ]
 

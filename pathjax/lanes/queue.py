@@ -70,31 +70,38 @@ def from_queue(machine: Lanes, program, xs, shared, place, flags):
         return jnp.where(item < count, ~goes_on.item(), following < count)
 
     def serve(state):
-        """Put results away and begin other items, lane by lane: in two rounds, since columns that a loop both reads and
-        writes are copied on every trip."""
+        """Put results away, then begin other items, lane by lane.
+
+        In two rounds, as XLA copies columns that a loop both reads and writes, on every trip. The second counts down
+        what the first has counted up: so it comes second, and nothing is copied between them either.
+        """
         following, item, packed, results = state
 
-        def put_away(lane, results):
+        def put_away(lane, state):
+            following, results = state
             mine = map(partial(of_lane, lane), packed, differing, shapes, dtypes)
             ended = common | dict(zip(kept, mine, strict=True))
             machine.run_equations(after, ended)
-            # A lane without an item writes what the first one overwrites.
+            # A lane without an item writes what its next one, or the last, overwrites.
             row = jnp.minimum(at(item, lane), following)
             outputs = zip(results, part(ended, jaxpr.outvars), strict=True)
-            return [lax.dynamic_update_index_in_dim(result, value, row, 0) for result, value in outputs]
+            results = [lax.dynamic_update_index_in_dim(result, value, row, 0) for result, value in outputs]
+            return following + 1, results
 
         def take_next(lane, state):
             following, item, packed = state
-            begun = begin(jnp.minimum(following, count - 1), common)
+            number = following - 1
+            begun = begin(jnp.minimum(number, count - 1), common)
             packed = [
                 [put(column, x, lane) for column, x in zip(columns, jnp.ravel(begun[v]), strict=True)] if d else columns
                 for v, columns, d in zip(kept, packed, differing, strict=True)
             ]
-            return following + 1, put(item, following, lane), packed
+            return number, put(item, number, lane), packed
 
         waiting = awaits(state)
-        results = in_turn(waiting, put_away, results)
-        return *in_turn(waiting, take_next, (following, item, packed)), results
+        following, results = in_turn(waiting, put_away, (following, results))
+        _, item, packed = in_turn(waiting, take_next, (following, item, packed))
+        return following, item, packed, results
 
     def trip(state):
         following, item, packed, results = lax.while_loop(lambda state: jnp.any(awaits(state)), serve, state)

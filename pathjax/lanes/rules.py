@@ -119,6 +119,7 @@ RULES = {
     "squeeze": lambda lanes, x, params, shape: x[0].reshape(shape),
     "expand_dims": lambda lanes, x, params, shape: x[0].reshape(shape),
     "transpose": lambda lanes, x, params, shape: x[0].transpose(params["permutation"]),
+    "stop_gradient": lambda lanes, x, params, shape: x[0],
     "rev": lambda lanes, x, params, shape: np.flip(x[0], params["dimensions"]),
     "slice": _slice,
     "concatenate": lambda lanes, x, params, shape: np.concatenate(list(map(components, x)), params["dimension"]),
