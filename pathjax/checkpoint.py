@@ -21,7 +21,9 @@ from pathjax.progressive import State
 from pathjax.scene import Scene
 
 # Saving costs at most one in this many seconds.
-COST = 50
+COST = 200
+# What the first is thought to cost: it is made after a second.
+_FIRST_COST = 0.005
 ARRAYS = ("means", "count", "goal", "weights")
 
 
@@ -55,7 +57,7 @@ class Checkpoint:
 
     def __init__(self, path: str | Path, identity: Mapping[str, str | int]):
         self.path, self.identity = Path(path), dict(identity)
-        self._saved, self._cost = 0.0, 0.0
+        self._saved, self._cost = 0.0, _FIRST_COST
         # What a killed process left half written.
         for part in self.path.parent.glob(f".{glob.escape(self.path.name)}.*.part"):
             part.unlink(missing_ok=True)
@@ -72,7 +74,7 @@ class Checkpoint:
             with np.load(self.path, allow_pickle=False) as file:
                 facts = json.loads(str(file["facts"]))
                 identity, spp, seconds = facts["identity"], int(facts["spp"]), float(facts["seconds"])
-                arrays = {name: file[name] for name in ARRAYS}
+                arrays = {name: file[name] for name in ARRAYS} if file.files != ["facts"] else {}
         except Exception as error:  # zipfile, zlib, NumPy and json raise what they like, as the file's bytes have it
             raise self._refusal(f"is no checkpoint, or a damaged one ({error})") from None
         for name, ours in self.identity.items():
@@ -83,24 +85,27 @@ class Checkpoint:
             wanted = getattr(fresh, name)
             if (array.shape, array.dtype) != (wanted.shape, wanted.dtype):
                 raise self._refusal(f"is damaged: {name} is {array.dtype}{list(array.shape)}")
-        return State(**arrays, spp=spp, seconds=seconds)
+        return replace(fresh, **arrays, spp=spp, seconds=seconds)
 
     def save(self, state: State) -> None:
         """Raises:
         InputError: it cannot be written; the last one that was is intact.
         """
         started = time.perf_counter()
+        # Before the first sample nothing needs to be kept, only to be known to be writable.
+        arrays = {name: getattr(state, name) for name in ARRAYS} if state.count.any() else {}
         facts = json.dumps({"identity": self.identity, "spp": state.spp, "seconds": state.seconds})
 
         def write(beside: str) -> None:
             with open(beside, "wb") as file:
-                np.savez(file, facts=np.array(facts), **{name: getattr(state, name) for name in ARRAYS})
+                np.savez(file, facts=np.array(facts), **arrays)
                 file.flush()
                 os.fsync(file.fileno())
 
         write_whole(self.path, write)
         self._saved = time.perf_counter()
-        self._cost = self._saved - started
+        if arrays:
+            self._cost = self._saved - started
 
     def save_if_due(self, state: State) -> None:
         """Save, unless the last time was so lately that it would slow the render down."""

@@ -37,9 +37,12 @@ def standard_error(image: np.ndarray, variance: np.ndarray, count: np.ndarray) -
     Args:
         variance: (H, W, 3) of each pixel of the image (H, W, 3); count: (H, W) its samples.
     """
+    # By planes: loops over three neighbours in memory are slow.
+    image, variance = (np.ascontiguousarray(np.moveaxis(x, -1, 0)) for x in (image, variance))
     around = _around(variance, 1)
     pooled = np.where(np.isfinite(around), OWN_SHARE * variance + (1 - OWN_SHARE) * around, variance)
-    return np.sqrt(np.maximum(pooled, (image / (3 * np.maximum(count, 1)).astype(image.dtype)[..., None]) ** 2))
+    least = image / (3 * np.maximum(count, 1)).astype(image.dtype)
+    return np.moveaxis(np.sqrt(np.maximum(pooled, least**2)), 0, -1)
 
 
 def contributions(image: np.ndarray, variance: np.ndarray) -> np.ndarray:
@@ -50,7 +53,7 @@ def contributions(image: np.ndarray, variance: np.ndarray) -> np.ndarray:
     """
     with np.errstate(invalid="ignore", over="ignore"):
         relative = variance / (np.maximum(image**2 - variance, 0) + RELATIVE_FLOOR)
-    relative = relative.mean(-1)
+    relative = sum(np.moveaxis(relative, -1, 0)) / relative.shape[-1]  # as the mean over the last axis, but faster
     return np.where(np.isfinite(relative), relative, np.nan)
 
 
@@ -78,8 +81,8 @@ def sample_weights(image: np.ndarray, variance: np.ndarray) -> np.ndarray:
     stays unbiased.
     """
     with np.errstate(invalid="ignore", over="ignore"):
-        relative = (variance / (image**2 + RELATIVE_FLOOR)).mean(-1, keepdims=True)
-    weights = np.sqrt(_around(np.where(np.isfinite(relative), relative, np.nan), 2))[..., 0]
+        relative = (variance / (image**2 + RELATIVE_FLOOR)).mean(-1)
+    (weights,) = np.sqrt(_around(np.where(np.isfinite(relative), relative, np.nan)[None], 2))
     known = np.isfinite(weights)
     if not known.any() or not weights[known].any():
         return np.ones(weights.shape, np.float32)
@@ -89,8 +92,8 @@ def sample_weights(image: np.ndarray, variance: np.ndarray) -> np.ndarray:
 
 
 def _around(x: np.ndarray, radius: int) -> np.ndarray:
-    """(H, W, C) mean over the square around each pixel, without itself and what is not finite; nan if none is left."""
-    known = np.isfinite(x).all(-1, keepdims=True)
+    """(C, H, W) mean over the square around each pixel, without itself and what is not finite; nan if none is left."""
+    known = np.isfinite(x).all(0)
     values = np.where(known, x, 0)
     count = _box(known.astype(x.dtype), radius) - known
     total = _box(values, radius)
@@ -99,8 +102,8 @@ def _around(x: np.ndarray, radius: int) -> np.ndarray:
 
 
 def _box(x: np.ndarray, radius: int) -> np.ndarray:
-    """Sums over squares, cut off at the border."""
-    for axis in (0, 1):
+    """(..., H, W) sums over squares, cut off at the border."""
+    for axis in (-2, -1):
         total = x.copy()
         line, out = np.moveaxis(x, axis, 0), np.moveaxis(total, axis, 0)
         for shift in range(1, radius + 1):

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from pathjax import film, replicates, runtime
@@ -15,11 +16,12 @@ from pathjax.scene import Scene
 
 # Pixels in one call of the kernel and samples that it adds to each at most: so many that the call costs little, so few
 # that an interrupt is heard at once. The schedule is fixed, not timed, so that the same command gives the same image.
-CHUNK_PIXELS = 1 << 12
-MAX_PASS_SPP = 64 * replicates.COUNT
-# Samples of the first pass over the image, so that there is soon a whole picture, and where no more than so many are
-# planned, as in a pilot that shall end in time.
-_FIRST_SPP, _FIRST_OF_FEW = 4 * replicates.COUNT, replicates.COUNT
+CHUNK_PIXELS = 1 << 13
+MAX_PASS_SPP = 48 * replicates.COUNT
+# Samples of the first pass over the image, and how many must be planned for each: about a quarter of them, so that there
+# is soon a whole picture.
+_FIRST_SPP = replicates.COUNT * np.array([1, 4, 16], np.int32)
+_GOALS = np.array([17, 256])
 # A call of few items is another program, whose last bits may differ.
 _LEAST_CHUNK = -(-runtime.MANY_ITEMS // replicates.COUNT)
 
@@ -62,24 +64,15 @@ def extend(scene: Scene, state: State, seed: int, strategy: str) -> Iterator[Non
     saved between two calls leads to the same bits.
     """
     kernel, chunk = compile(scene, strategy), _chunk(scene)
-    seeds = replicates.seeds(seed)
 
-    def means(portion):
-        """(R, n, 3) of the samples of a portion; 0 where a replicate gets none."""
-        pixels, first_sample, spp = portion
-        lacking = chunk - len(pixels)
+    def rendered(portion):
+        numbers = np.zeros((3, chunk), np.int32)
+        numbers[:, : len(portion[0])] = portion
+        return np.asarray(kernel(numbers, np.uint32(seed)))[:, : len(portion[0])]
 
-        def padded(x, dtype, **how):
-            x = x.astype(dtype)
-            return (np.pad(x, ((0, 0), (0, lacking)), **how) if lacking else x).ravel()
-
-        tiled = padded(np.tile(pixels, (replicates.COUNT, 1)), np.int32, mode="edge")
-        numbers = padded(first_sample, np.uint32), padded(spp, np.uint32), np.repeat(seeds, chunk)
-        of_chunk = np.asarray(kernel(tiled, *numbers), np.float32)
-        return of_chunk.reshape(replicates.COUNT, chunk, 3)[:, : len(pixels)]
-
-    for (pixels, first_sample, spp), added in runtime.concurrently(means, _portions(state, chunk)):
-        share = (spp / np.maximum(first_sample + spp, 1)).astype(np.float32)[..., None]
+    for (pixels, before, after), added in runtime.concurrently(rendered, _portions(state, chunk)):
+        begin, end = (replicates.shares(replicates.one_if_equal(count)) for count in (before, after))
+        share = ((end - begin) / np.maximum(end, 1)).astype(np.float32)[..., None]
         # Pixels that follow each other are a slice, which is many times faster.
         follow = pixels[-1] - pixels[0] == len(pixels) - 1
         here = slice(pixels[0], pixels[-1] + 1) if follow else pixels
@@ -87,35 +80,43 @@ def extend(scene: Scene, state: State, seed: int, strategy: str) -> Iterator[Non
             change = added - state.means[:, here]
             change *= share
             state.means[:, here] += change
-        state.count[here] += spp.sum(0, dtype=np.int32)
+        state.count[here] = after
         yield
 
 
-def _portions(state: State, chunk: int) -> Iterator[tuple]:
-    """What lies between the state and its goal, portion by portion: pixels (n,), n <= chunk, and of each replicate its
-    first sample and the number of samples, (R, n) each."""
+def _portions(state: State, chunk: int) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """What lies between the state and its goal, portion by portion: pixels and their numbers of samples before and
+    after, (n,) int32 each, n <= chunk."""
     planned = state.count.copy()
-    while (missing := np.flatnonzero(planned < state.goal)).size:
+    while (missing := np.flatnonzero(planned < state.goal).astype(np.int32)).size:
         for first in range(0, missing.size, chunk):
             pixels = missing[first : first + chunk]
             before, goal = planned[pixels], state.goal[pixels]
-            least = np.where(goal > _FIRST_SPP, _FIRST_SPP, _FIRST_OF_FEW)
-            portion = np.clip(3 * before, least, MAX_PASS_SPP)
-            planned[pixels] = after = np.minimum(before + portion, goal)
-            first_sample = replicates.shares(before)
-            yield pixels, first_sample, replicates.shares(after) - first_sample
+            least = _FIRST_SPP[np.searchsorted(_GOALS, goal, side="right")]
+            planned[pixels] = after = np.minimum(before + np.clip(3 * before, least, MAX_PASS_SPP), goal)
+            yield pixels, before, after
 
 
 def compile(scene: Scene, strategy: str = "mis") -> Callable:
-    """The kernel of `extend`: (pixels, first_sample, spp, seed), (R chunk,) each, -> means (R chunk, 3)."""
+    """The kernel of `extend`: (3, n) int32 of a chunk, the pixels and their numbers of samples before and after, and a
+    seed -> means of each replicate over the samples between, 0 of none, (R, n, 3) float32."""
     # Without the derivatives of `render_pixels`, whose machinery takes longer than a call of few samples.
     scene = replace(scene, about=None)
-    count = replicates.COUNT * _chunk(scene)
-    numbers = [jax.ShapeDtypeStruct((count,), dtype) for dtype in (np.int32, *3 * (np.uint32,))]
+    numbers = jax.ShapeDtypeStruct((3, _chunk(scene)), np.int32)
     # JAX keeps what it has compiled. A compiled kernel, unlike a jitted function, does not ask for the calling thread's
     # contexts, such as `jax.enable_x64`.
-    kernel = pixel_means.lower(scene, *numbers, strategy=strategy, devices=runtime.devices_of_a_call()).compile()
-    return partial(kernel, scene)
+    return partial(_replicate_means.lower(scene, numbers, np.uint32(0), strategy=strategy).compile(), scene)
+
+
+@partial(jax.jit, static_argnames="strategy")
+def _replicate_means(scene, numbers, seed, *, strategy):
+    pixels, before, after = numbers
+    first_sample = replicates.shares(before)
+    spp = replicates.shares(after) - first_sample
+    unsigned = first_sample.ravel(), spp.ravel(), jnp.repeat(replicates.seeds(seed), len(pixels))
+    work = jnp.tile(pixels, replicates.COUNT), *(x.astype(jnp.uint32) for x in unsigned)
+    means = pixel_means(scene, *work, strategy=strategy, devices=runtime.devices_of_a_call())
+    return means.reshape(*spp.shape, 3).astype(jnp.float32)
 
 
 def _chunk(scene: Scene) -> int:

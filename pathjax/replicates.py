@@ -14,7 +14,7 @@ from pathjax.core import sampler
 
 COUNT = 4
 # Pixels that are summed up at a time, so that images need no second copy.
-_BLOCK = 1 << 16
+_BLOCK = 1 << 13
 
 
 def seeds(seed) -> np.ndarray | jax.Array:
@@ -29,6 +29,11 @@ def shares(count: np.ndarray) -> np.ndarray:
     return (count + first_come[:, None]) // COUNT
 
 
+def one_if_equal(count: np.ndarray) -> np.ndarray:
+    """(N,), or (1,) where all are equal, as mostly: NumPy spreads one number over channels far faster than many."""
+    return count[:1] if (count == count[0]).all() else count
+
+
 def moments(means: np.ndarray, count: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The image (N, 3), the mean over all samples, and an unbiased estimate of its variance (N, 3).
 
@@ -38,8 +43,8 @@ def moments(means: np.ndarray, count: np.ndarray) -> tuple[np.ndarray, np.ndarra
     image, variance = np.empty_like(means[0]), np.empty_like(means[0])
     for first in range(0, len(count), _BLOCK):
         block = slice(first, first + _BLOCK)
-        replicates, n = means[:, block], count[block].astype(means.dtype)[:, None]
-        share = shares(count[block]).astype(means.dtype)[..., None]
+        replicates, samples = means[:, block], one_if_equal(count[block])
+        n, share = (x.astype(means.dtype)[..., None] for x in (samples, shares(samples)))
         image[block] = (replicates * share).sum(0) / np.maximum(n, 1)
         freedom = np.minimum(n, COUNT) - 1
         with np.errstate(invalid="ignore"):  # a pixel that is not finite

@@ -8,6 +8,7 @@ import signal
 import threading
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -108,9 +109,12 @@ class Render:
     def run(self, progress: bool = False) -> RenderResult:
         with _Interrupts() as interrupts, _bar(progress) as show:
             reason, found = self._run(interrupts, show)
-            if self.checkpoint is not None:
-                self.checkpoint.save(self.state)
-        return self._result(reason, found or self._evaluate())
+            with ThreadPoolExecutor(1) as beside:
+                save = beside.submit(self.checkpoint.save, self.state) if self.checkpoint is not None else None
+                result = self._result(reason, found or self._evaluate())
+                if save is not None:
+                    save.result()
+        return result
 
     def _run(self, interrupts, show) -> tuple[str, tuple | None]:
         """Extend the state until there is a reason to stop. What it becomes depends on itself alone, not on time.

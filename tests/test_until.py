@@ -131,7 +131,7 @@ def test_signals_end_a_render_with_what_is_done(cornell, after_calls, number):
     after_calls(3 * runtime.calls_at_once() - 1, lambda: signal.raise_signal(number))
     result = pj.render_until(cornell, spp=10**6)
     assert result.reason == "interrupted"
-    assert result.spp == 256  # portions of 16, 48 and 192, each by one call of every thread
+    assert result.spp == 448  # portions of 64, 192 and 192, each by one call of every thread
     assert signal.getsignal(number) == earlier
 
 

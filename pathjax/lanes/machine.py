@@ -31,21 +31,32 @@ def one_by_one(f: Callable) -> Callable:
     return jax.jit(one_by_one)
 
 
+def some(flags):
+    """() bool: whether any of the flags is set. (XLA reduces booleans one by one, integers by SIMD.)"""
+    return flags.astype(jnp.int32).sum(dtype=jnp.int32) != 0
+
+
 def in_turn(waits, act: Callable, state):
     """act(lane, state) -> state, for one after another of the lanes (W,) that wait."""
-    words = -(-len(waits) // _WORD)
-    bits = jnp.pad(waits, (0, words * _WORD - len(waits))).reshape(words, _WORD)
-    bits = (bits.astype(jnp.uint32) << jnp.arange(_WORD, dtype=jnp.uint32)).sum(1, dtype=jnp.uint32)
+    count = -(-len(waits) // _WORD)
+    bits = jnp.pad(waits, (0, count * _WORD - len(waits))).reshape(count, _WORD)
+    words = (bits.astype(jnp.uint32) << jnp.arange(_WORD, dtype=jnp.uint32)).sum(1, dtype=jnp.uint32)
 
-    def act_for(k, state):
-        def step(state):
-            waiting, state = state
-            lowest = lax.population_count((waiting & -waiting) - 1).astype(jnp.int32)
-            return waiting & (waiting - 1), act(_WORD * k + lowest, state)
+    def seek(k, word):
+        """Number and flags of the next word, from this one on, that is not 0, or of the last."""
 
-        return lax.while_loop(lambda state: state[0] != 0, step, (at(bits, k), state))[1]
+        def empty(state):
+            k, word = state
+            return (word == 0) & (k < count - 1)
 
-    return lax.fori_loop(0, words, act_for, state)
+        return lax.while_loop(empty, lambda state: (state[0] + 1, at(words, state[0] + 1)), (k, word))
+
+    def step(state):
+        k, word, state = state
+        lowest = lax.population_count((word & -word) - 1).astype(jnp.int32)
+        return *seek(k, word & (word - 1)), act(_WORD * k + lowest, state)
+
+    return lax.while_loop(lambda state: state[1] != 0, step, (*seek(jnp.int32(0), words[0]), state))[2]
 
 
 def of_lane(lane, columns, differs, shape, dtype):
@@ -240,7 +251,7 @@ class Lanes:
                 new = self.run(body, [*body_consts, *carry])
             return self.pack(new, differing)
 
-        packed = lax.while_loop(lambda packed: jnp.any(goes_on(packed)), advance, self.pack(init, differing))
+        packed = lax.while_loop(lambda packed: some(goes_on(packed)), advance, self.pack(init, differing))
         return self.unpack(packed, differing, shapes)
 
     def scan(self, eqn, inputs):

@@ -9,7 +9,7 @@ from jax import lax
 
 from pathjax.core.math import at
 from pathjax.lanes.flow import read_by, variables, while_parts
-from pathjax.lanes.machine import Lanes, in_turn, of_lane, put
+from pathjax.lanes.machine import Lanes, in_turn, of_lane, put, some
 from pathjax.lanes.values import join, split
 
 
@@ -104,7 +104,7 @@ def from_queue(machine: Lanes, program, xs, shared, place, flags):
         return following, item, packed, results
 
     def trip(state):
-        following, item, packed, results = lax.while_loop(lambda state: jnp.any(awaits(state)), serve, state)
+        following, item, packed, results = lax.while_loop(lambda state: some(awaits(state)), serve, state)
         values = unpacked(packed)
         new = machine.run(loop.params["body_jaxpr"], part(values, [*body_consts, *loop.outvars]))
         return following, item, packed_from(values | dict(zip(loop.outvars, new, strict=True))), results
@@ -116,5 +116,5 @@ def from_queue(machine: Lanes, program, xs, shared, place, flags):
     packed = machine.pack(copies, differing)
     results = [jnp.zeros((count, *v.aval.shape), v.aval.dtype) for v in jaxpr.outvars]
     state = jnp.int32(0), jnp.full((width,), count, jnp.int32), packed, results
-    *_, results = lax.while_loop(lambda s: (s[0] < count) | jnp.any(s[1] < count), trip, state)
+    *_, results = lax.while_loop(lambda s: (s[0] < count) | some(s[1] < count), trip, state)
     return results
