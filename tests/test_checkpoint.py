@@ -177,7 +177,7 @@ def test_checkpoints_of_other_renders(cornell, shipped, made, monkeypatch):
         with pytest.raises(pj.InputError, match=f"run.npz .*{says}"):
             pj.render_until(scene, **({"spp": 4, "seed": 3, "checkpoint": made} | how))
     monkeypatch.setattr(pj, "__version__", "9.9.9")
-    with pytest.raises(pj.InputError, match=r"pathjax 0\.3\.0, this is pathjax 9.9.9"):
+    with pytest.raises(pj.InputError, match=r"pathjax 0\.3\.1, this is pathjax 9.9.9"):
         pj.render_until(cornell, spp=4, seed=3, checkpoint=made)
     assert made.read_bytes() == before
 
