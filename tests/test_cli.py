@@ -619,7 +619,7 @@ def test_the_second_run_compiles_nothing_and_gives_the_same_image(counted, tmp_p
     both = [counted(XDG_CACHE_HOME=cache) for _ in range(2)]  # at once, on an empty cache
     first, other = map(end, both)
     kept = entries(cache)
-    assert any(name.startswith("jit_pixel_means") for name in kept)
+    assert any(name.startswith("jit__replicate_means") for name in kept)
     assert all(path.relative_to(cache).parts[0] == "pathjax" for path in cache.rglob("*-cache"))
     wanted, found, image = end(counted(XDG_CACHE_HOME=cache))
     assert wanted == found > 0
