@@ -18,8 +18,8 @@ from pathjax.scene import Scene
 # that an interrupt is heard at once. The schedule is fixed, not timed, so that the same command gives the same image.
 CHUNK_PIXELS = 1 << 13
 MAX_PASS_SPP = 48 * replicates.COUNT
-# Samples of the first pass over the image, and from which goal on each is taken: a quarter of it or less, so that there
-# is soon a whole picture.
+# Samples of the first pass over the image, so that there is soon a whole picture, and the goals from which on it is the
+# second and the third of them.
 _FIRST_SPP = replicates.COUNT * np.array([1, 4, 16], np.int32)
 _GOALS = np.array([17, 256])
 # A call of few items is another program, whose last bits may differ.
