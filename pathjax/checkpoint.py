@@ -81,11 +81,13 @@ class Checkpoint:
             theirs = identity.get(name)
             if theirs != ours:
                 raise self._refusal(f"was made with {name} {theirs}, this is {name} {ours}")
+        if not arrays:
+            return fresh
         for name, array in arrays.items():
             wanted = getattr(fresh, name)
             if (array.shape, array.dtype) != (wanted.shape, wanted.dtype):
                 raise self._refusal(f"is damaged: {name} is {array.dtype}{list(array.shape)}")
-        return replace(fresh, **arrays, spp=spp, seconds=seconds)
+        return State(**arrays, spp=spp, seconds=seconds)
 
     def save(self, state: State) -> None:
         """Raises:

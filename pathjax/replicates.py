@@ -13,7 +13,7 @@ import numpy as np
 from pathjax.core import sampler
 
 COUNT = 4
-# Pixels that are summed up at a time, so that images need no second copy.
+# Pixels that are summed up at a time, so few that no array in between leaves the cache.
 _BLOCK = 1 << 13
 
 

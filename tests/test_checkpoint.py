@@ -288,7 +288,4 @@ def test_before_the_first_sample_a_checkpoint_holds_no_arrays(cornell, tmp_path)
     progressive.plan(fresh, 16)
     store.save(fresh)
     assert (tmp_path / "run.npz").stat().st_size < 1000
-    again = store.load(fresh)
-    for name in checkpoint.ARRAYS:
-        assert getattr(again, name) is getattr(fresh, name)
-    assert (again.spp, again.seconds) == (16, 0)
+    assert store.load(fresh) is fresh

@@ -186,6 +186,18 @@ def test_barriers_and_calls(vectors):
     agrees(f, *vectors)
 
 
+def test_no_tracer_outlives_its_function(vectors):
+    def f(a, table):
+        def step(state):
+            k, x = state
+            return k + 1, lax.optimization_barrier(x * a)
+
+        return lax.while_loop(lambda s: s[0] < 3, step, (0, lax.optimization_barrier(a + 1)))[1]
+
+    with jax.checking_leaks():
+        agrees(f, vectors[0])
+
+
 def test_any_other_primitive(vectors, rows):
     def f(a, row, table):
         added = a.at[row].add(1.0, mode="drop")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from weakref import WeakValueDictionary
 
 import jax
 import jax.numpy as jnp
@@ -75,7 +76,8 @@ class Lanes:
 
     def __init__(self, width: int, never):
         self.width, self.never = width, never
-        self.computed = {}  # by id: what has been made to be computed once
+        # By id: what has been made to be computed once. JAX wants no tracer to outlive its function.
+        self.computed = WeakValueDictionary()
         self.active = None  # (W,) bool lanes whose results are read; None: all. In the others they may be anything.
 
     def run(self, program: core.ClosedJaxpr, inputs) -> list:
@@ -184,7 +186,7 @@ class Lanes:
 
         _, *results = lax.while_loop(lambda state: state[0], change, (self.never, *new))
         items |= zip(map(id, new), results, strict=True)
-        self.computed |= {id(item): item for item in results}
+        self.computed.update((id(item), item) for item in results)
         return [
             objects(value.shape, [items[id(item)] for item in value.flat]) if differs(value) else items[id(value)]
             for value in values
