@@ -172,8 +172,9 @@ class Lanes:
         """The values, of which every consumer reads one result: what is carried through a loop that never runs.
 
         Its body changes them, or XLA would remove it. A branch that is always taken does the same, but copies them all.
+        What lanes share stays as it is.
         """
-        items = {id(item): item for value in values for item in (value.flat if differs(value) else [value])}
+        items = {id(item): item for value in values if differs(value) for item in value.flat}
         # Tangents of integers are float0, of which nothing is computed.
         there = [item for item in items.values() if jax.typeof(item).dtype != jax.dtypes.float0]
         new = [item for item in there if id(item) not in self.computed]
@@ -188,7 +189,7 @@ class Lanes:
         items |= zip(map(id, new), results, strict=True)
         self.computed.update((id(item), item) for item in results)
         return [
-            objects(value.shape, [items[id(item)] for item in value.flat]) if differs(value) else items[id(value)]
+            objects(value.shape, [items[id(item)] for item in value.flat]) if differs(value) else value
             for value in values
         ]
 
