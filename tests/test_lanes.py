@@ -260,6 +260,14 @@ def test_the_last_of_two_loops_is_the_own_one():
     agrees(f, np.random.default_rng(1).integers(0, 9, 23).astype(np.int32))
 
 
+@pytest.mark.parametrize("width", [1, 5, 32, 33, 64, 100])
+@pytest.mark.parametrize("count", [0, 1, 64, 300])
+def test_any_number_of_items_in_any_number_of_lanes(count, width):
+    trips = jnp.asarray(np.random.default_rng(count).integers(0, 9, count, np.int32))
+    found = jax.jit(lanes(lambda n: lax.while_loop(lambda k: k < n, lambda k: k + 1, jnp.int32(0)), width))(trips)
+    np.testing.assert_array_equal(found, trips)
+
+
 def test_items_are_worked_on_without_waiting_for_the_slowest():
     """Trips of the loop over all items: as many as the longest item takes, not the longest of each group."""
     trips = np.ones(64 * WIDTH, np.int32)

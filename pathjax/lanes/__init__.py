@@ -38,6 +38,8 @@ def lanes(f: Callable, width: int) -> Callable:
         one = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), xs)
         program, out = jax.make_jaxpr(f, return_shape=True)(one, *shared)
         xs, shared = jax.tree.leaves(xs), jax.tree.leaves(shared)
+        if not len(xs[0]):
+            return jax.tree.map(lambda y: jnp.zeros((0, *y.shape), y.dtype), out)
         # False, and no pass over HLO knows it.
         never = lax.population_count(xs[0].ravel()[0].astype(jnp.int32)) < 0
         machine = Lanes(width, never)

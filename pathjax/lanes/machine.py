@@ -32,16 +32,27 @@ def one_by_one(f: Callable) -> Callable:
     return jax.jit(one_by_one)
 
 
-def some(flags):
-    """() bool: whether any of the flags is set. (XLA reduces booleans one by one, integers by SIMD.)"""
-    return flags.astype(jnp.int32).sum(dtype=jnp.int32) != 0
+def words_of(flags):
+    """Flags (W,) bool of lanes as bits of words (K,) uint32: bit b of word k is that of lane K b + k.
+
+    Halves are laid upon each other, by SIMD: XLA reduces flags one by one.
+    """
+    count = -(-len(flags) // _WORD)
+    words = jnp.pad(flags, (0, count * _WORD - len(flags))).astype(jnp.uint32)
+    while len(words) > count:
+        low, high = jnp.split(words, 2)
+        words = low | high << (len(low) // count)
+    return words
 
 
-def in_turn(waits, act: Callable, state):
-    """act(lane, state) -> state, for one after another of the lanes (W,) that wait."""
-    count = -(-len(waits) // _WORD)
-    bits = jnp.pad(waits, (0, count * _WORD - len(waits))).reshape(count, _WORD)
-    words = (bits.astype(jnp.uint32) << jnp.arange(_WORD, dtype=jnp.uint32)).sum(1, dtype=jnp.uint32)
+def some(words):
+    """() bool: whether any flag is set."""
+    return lax.reduce_or(words, (0,)) != 0
+
+
+def in_turn(words, act: Callable, state):
+    """act(lane, state) -> state, for one after another of the lanes that `words_of` flags has set."""
+    count = len(words)
 
     def seek(k, word):
         """Number and flags of the next word, from this one on, that is not 0, or of the last."""
@@ -55,7 +66,7 @@ def in_turn(waits, act: Callable, state):
     def step(state):
         k, word, state = state
         lowest = lax.population_count((word & -word) - 1).astype(jnp.int32)
-        return *seek(k, word & (word - 1)), act(_WORD * k + lowest, state)
+        return *seek(k, word & (word - 1)), act(count * lowest + k, state)
 
     return lax.while_loop(lambda state: state[1] != 0, step, (*seek(jnp.int32(0), words[0]), state))[2]
 
@@ -209,7 +220,7 @@ class Lanes:
             return list(map(partial(put, lane=lane), results, core.jaxpr_as_fun(program)(*mine)))
 
         results = [jnp.zeros((self.width, *aval.shape), aval.dtype) for aval in program.out_avals]
-        return list(map(split, in_turn(active, act, results)))
+        return list(map(split, in_turn(words_of(active), act, results)))
 
     # ---- control flow -----------------------------------------------------------------------------------------------
 
@@ -254,7 +265,11 @@ class Lanes:
                 new = self.run(body, [*body_consts, *carry])
             return self.pack(new, differing)
 
-        packed = lax.while_loop(lambda packed: some(goes_on(packed)), advance, self.pack(init, differing))
+        def any_goes_on(packed):
+            on = goes_on(packed)
+            return some(words_of(on)) if jnp.ndim(on) else on
+
+        packed = lax.while_loop(any_goes_on, advance, self.pack(init, differing))
         return self.unpack(packed, differing, shapes)
 
     def scan(self, eqn, inputs):

@@ -9,7 +9,7 @@ from jax import lax
 
 from pathjax.core.math import at
 from pathjax.lanes.flow import read_by, variables, while_parts
-from pathjax.lanes.machine import Lanes, in_turn, of_lane, put, some
+from pathjax.lanes.machine import Lanes, in_turn, of_lane, put, some, words_of
 from pathjax.lanes.values import join, split
 
 
@@ -63,11 +63,11 @@ def from_queue(machine: Lanes, program, xs, shared, place, flags):
         return machine.pack([values[v] for v in kept], differing)
 
     def awaits(state):
-        """(W,) whether a lane is done with its item, or has none while some are left."""
+        """Flags of lanes that are done with their item, or have none while some are left."""
         following, item, packed, _ = state
         values = unpacked(packed)
         (goes_on,) = machine.run(loop.params["cond_jaxpr"], part(values, [*test_consts, *loop.outvars]))
-        return jnp.where(item < count, ~goes_on.item(), following < count)
+        return words_of(jnp.where(item < count, ~goes_on.item(), following < count))
 
     def serve(state):
         """Put results away, then begin other items, lane by lane.
@@ -75,7 +75,7 @@ def from_queue(machine: Lanes, program, xs, shared, place, flags):
         In two rounds, as XLA copies columns that a loop both reads and writes, on every trip. The second counts down
         what the first has counted up: so it comes second, and nothing is copied between them either.
         """
-        following, item, packed, results = state
+        waiting, (following, item, packed, results) = state
 
         def put_away(lane, state):
             following, results = state
@@ -98,13 +98,13 @@ def from_queue(machine: Lanes, program, xs, shared, place, flags):
             ]
             return number, put(item, number, lane), packed
 
-        waiting = awaits(state)
         following, results = in_turn(waiting, put_away, (following, results))
         _, item, packed = in_turn(waiting, take_next, (following, item, packed))
-        return following, item, packed, results
+        state = following, item, packed, results
+        return awaits(state), state
 
     def trip(state):
-        following, item, packed, results = lax.while_loop(lambda state: some(awaits(state)), serve, state)
+        _, (following, item, packed, results) = lax.while_loop(lambda s: some(s[0]), serve, (awaits(state), state))
         values = unpacked(packed)
         new = machine.run(loop.params["body_jaxpr"], part(values, [*body_consts, *loop.outvars]))
         return following, item, packed_from(values | dict(zip(loop.outvars, new, strict=True))), results
@@ -116,5 +116,6 @@ def from_queue(machine: Lanes, program, xs, shared, place, flags):
     packed = machine.pack(copies, differing)
     results = [jnp.zeros((count, *v.aval.shape), v.aval.dtype) for v in jaxpr.outvars]
     state = jnp.int32(0), jnp.full((width,), count, jnp.int32), packed, results
-    *_, results = lax.while_loop(lambda s: (s[0] < count) | some(s[1] < count), trip, state)
+    # Each lane takes one number that is no item's when it has put its last item away, or at once.
+    *_, results = lax.while_loop(lambda s: s[0] < count + width, trip, state)
     return results
