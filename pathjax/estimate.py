@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pathjax.compare import RELATIVE_FLOOR
+from pathjax.replicates import blocks
 
 # Weight of a pixel's own variance; its eight neighbours share the rest.
 OWN_SHARE = 0.25
@@ -37,6 +38,15 @@ def standard_error(image: np.ndarray, variance: np.ndarray, count: np.ndarray) -
     Args:
         variance: (H, W, 3) of each pixel of the image (H, W, 3); count: (H, W) its samples.
     """
+    result = np.empty_like(image)
+    for rows in blocks(len(image), image.shape[1]):
+        near = slice(max(rows.start - 1, 0), rows.stop + 1)
+        error = _standard_error(image[near], variance[near], count[near])
+        result[rows] = error[rows.start - near.start :][: rows.stop - rows.start]
+    return result
+
+
+def _standard_error(image, variance, count):
     # By planes: loops over three neighbours in memory are slow.
     image, variance = (np.ascontiguousarray(np.moveaxis(x, -1, 0)) for x in (image, variance))
     around = _around(variance, 1)

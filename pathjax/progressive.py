@@ -71,15 +71,19 @@ def extend(scene: Scene, state: State, seed: int, strategy: str) -> Iterator[Non
         return np.asarray(kernel(numbers, np.uint32(seed)))[:, : len(portion[0])]
 
     for (pixels, before, after), added in runtime.concurrently(rendered, _portions(state, chunk)):
-        begin, end = (replicates.shares(replicates.one_if_equal(count)) for count in (before, after))
-        share = ((end - begin) / np.maximum(end, 1)).astype(np.float32)[..., None]
         # Pixels that follow each other are a slice, which is many times faster.
         follow = pixels[-1] - pixels[0] == len(pixels) - 1
         here = slice(pixels[0], pixels[-1] + 1) if follow else pixels
-        with np.errstate(invalid="ignore"):  # a pixel that met a sample that is not finite
-            change = added - state.means[:, here]
-            change *= share
-            state.means[:, here] += change
+        if before.any():
+            begin, end = (replicates.shares(replicates.one_if_equal(count)) for count in (before, after))
+            share = ((end - begin) / np.maximum(end, 1)).astype(np.float32)[..., None]
+            with np.errstate(invalid="ignore"):  # a pixel that met a sample that is not finite
+                change = added - state.means[:, here]
+                change *= share
+                state.means[:, here] += change
+        else:
+            # The same; but reading fresh memory before it is written stops all threads, page by page, at the write.
+            state.means[:, here] = added
         state.count[here] = after
         yield
 

@@ -6,6 +6,8 @@ replicate, count (N,) samples of all replicates together.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,7 +15,7 @@ import numpy as np
 from pathjax.core import sampler
 
 COUNT = 4
-# Pixels that are summed up at a time, so few that no array in between leaves the cache.
+# Pixels that are worked on at a time, so few that no array in between leaves the cache, or asks for new memory.
 _BLOCK = 1 << 13
 
 
@@ -29,6 +31,12 @@ def shares(count: np.ndarray) -> np.ndarray:
     return (count + first_come[:, None]) // COUNT
 
 
+def blocks(count: int, pixels: int = 1) -> Iterator[slice]:
+    """Of `count` things of so many pixels each, those to work on at a time."""
+    size = max(_BLOCK // pixels, 1)
+    return (slice(first, min(first + size, count)) for first in range(0, count, size))
+
+
 def one_if_equal(count: np.ndarray) -> np.ndarray:
     """(N,), or (1,) where all are equal, as mostly: NumPy spreads one number over channels far faster than many."""
     return count[:1] if (count == count[0]).all() else count
@@ -41,8 +49,7 @@ def moments(means: np.ndarray, count: np.ndarray) -> tuple[np.ndarray, np.ndarra
     of samples count as if variance fell with their number. A pixel without samples is black.
     """
     image, variance = np.empty_like(means[0]), np.empty_like(means[0])
-    for first in range(0, len(count), _BLOCK):
-        block = slice(first, first + _BLOCK)
+    for block in blocks(len(count)):
         replicates, samples = means[:, block], one_if_equal(count[block])
         n, share = (x.astype(means.dtype)[..., None] for x in (samples, shares(samples)))
         image[block] = (replicates * share).sum(0) / np.maximum(n, 1)

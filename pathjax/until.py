@@ -136,11 +136,11 @@ class Render:
                     return "interrupted", None
                 if self._out_of_time():
                     return "time limit", None
+            if state.spp >= self.spp:
+                return "spp", None
             image, variance, error = found = self._evaluate()
             if self._on_target(error):
                 return "target error", found
-            if state.spp >= self.spp:
-                return "spp", found
             if state.spp == PILOT_SPP:
                 state.weights = estimate.sample_weights(image, variance).ravel()
             progressive.plan(state, min(_next_spp(state.spp, error, self.target_error), self.spp))
@@ -162,7 +162,7 @@ class Render:
     def _result(self, reason, found) -> RenderResult:
         image, variance, error = found
         count = self.state.count.reshape(image.shape[:2])
-        if reason == "time limit" and self._on_target(error):
+        if reason != "interrupted" and self._on_target(error):
             reason = "target error"
         standard_error = estimate.standard_error(image, variance, count)
         seconds = self.compile_seconds, self.state.seconds
