@@ -50,10 +50,11 @@ def start(scene: Scene) -> State:
 
 def plan(state: State, spp: int) -> None:
     """Begin a round that ends with `spp` samples a pixel, on average; what a pixel has already it keeps."""
-    goal = state.weights.astype(float) * spp
-    if (state.weights != 1).any():
+    weights = replicates.one_if_equal(state.weights).astype(float)
+    goal = weights * spp
+    if len(weights) > 1:
         goal = np.rint(goal / replicates.COUNT) * replicates.COUNT
-    state.goal = np.maximum(state.count, np.minimum(goal, np.iinfo(np.int32).max)).astype(np.int32)
+    state.goal = np.maximum(state.count, np.minimum(goal, np.iinfo(np.int32).max).astype(np.int32))
     state.spp = spp
 
 
@@ -96,7 +97,7 @@ def _portions(state: State, chunk: int) -> Iterator[tuple[np.ndarray, np.ndarray
         for first in range(0, missing.size, chunk):
             pixels = missing[first : first + chunk]
             before, goal = planned[pixels], state.goal[pixels]
-            least = _FIRST_SPP[np.searchsorted(_GOALS, goal, side="right")]
+            least = _FIRST_SPP[np.searchsorted(_GOALS, replicates.one_if_equal(goal), side="right")]
             planned[pixels] = after = np.minimum(before + np.clip(3 * before, least, MAX_PASS_SPP), goal)
             yield pixels, before, after
 

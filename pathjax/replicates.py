@@ -37,9 +37,9 @@ def blocks(count: int, pixels: int = 1) -> Iterator[slice]:
     return (slice(first, min(first + size, count)) for first in range(0, count, size))
 
 
-def one_if_equal(count: np.ndarray) -> np.ndarray:
+def one_if_equal(x: np.ndarray) -> np.ndarray:
     """(N,), or (1,) where all are equal, as mostly: NumPy spreads one number over channels far faster than many."""
-    return count[:1] if (count == count[0]).all() else count
+    return x[:1] if (x == x[0]).all() else x
 
 
 def moments(means: np.ndarray, count: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

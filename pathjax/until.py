@@ -93,13 +93,14 @@ class Render:
         self.compile_seconds = 0.0
         adaptive = target_error is not None or time_limit is not None
         self.state, self.checkpoint = progressive.start(scene), None
-        progressive.plan(self.state, min(PILOT_SPP, self.spp))
         if checkpoint is not None:
             self.checkpoint = Checkpoint(checkpoint, identity(scene, self.seed, strategy, adaptive))
             self.state = self.checkpoint.load(self.state)
             self.checkpoint.save(self.state)
         if not adaptive or self.state.spp > self.spp:
             progressive.plan(self.state, self.spp)
+        elif not self.state.spp:
+            progressive.plan(self.state, min(PILOT_SPP, self.spp))
 
     def compile(self) -> None:
         started = time.perf_counter()
