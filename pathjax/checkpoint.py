@@ -17,14 +17,16 @@ import numpy as np
 from pathjax import film
 from pathjax.errors import InputError
 from pathjax.io.files import write_whole
-from pathjax.progressive import State
+from pathjax.progressive import State, plan
+from pathjax.replicates import one_if_equal
 from pathjax.scene import Scene
 
 # Saving costs at most one in this many seconds.
 COST = 200
 # What the first is thought to cost: it is made after a second.
 _FIRST_COST = 0.005
-ARRAYS = ("means", "count", "goal", "weights")
+# Arrays that hold one number for each pixel, or one for all.
+OF_PIXELS = ("count", "weights")
 
 
 def identity(scene: Scene, seed: int, strategy: str, adaptive: bool) -> dict[str, str | int]:
@@ -74,7 +76,7 @@ class Checkpoint:
             with np.load(self.path, allow_pickle=False) as file:
                 facts = json.loads(str(file["facts"]))
                 identity, spp, seconds = facts["identity"], int(facts["spp"]), float(facts["seconds"])
-                arrays = {name: file[name] for name in ARRAYS} if file.files != ["facts"] else {}
+                arrays = {name: file[name] for name in ("means", *OF_PIXELS)} if file.files != ["facts"] else {}
         except Exception as error:  # zipfile, zlib, NumPy and json raise what they like, as the file's bytes have it
             raise self._refusal(f"is no checkpoint, or a damaged one ({error})") from None
         for name, ours in self.identity.items():
@@ -83,11 +85,15 @@ class Checkpoint:
                 raise self._refusal(f"was made with {name} {theirs}, this is {name} {ours}")
         if not arrays:
             return fresh
+        state = replace(fresh, seconds=seconds)
         for name, array in arrays.items():
             wanted = getattr(fresh, name)
-            if (array.shape, array.dtype) != (wanted.shape, wanted.dtype):
+            shapes = (wanted.shape, (1,)) if name in OF_PIXELS else (wanted.shape,)
+            if array.dtype != wanted.dtype or array.shape not in shapes:
                 raise self._refusal(f"is damaged: {name} is {array.dtype}{list(array.shape)}")
-        return State(**arrays, spp=spp, seconds=seconds)
+            setattr(state, name, np.broadcast_to(array, wanted.shape).copy())
+        plan(state, spp)
+        return state
 
     def save(self, state: State) -> None:
         """Raises:
@@ -95,7 +101,9 @@ class Checkpoint:
         """
         started = time.perf_counter()
         # Before the first sample nothing needs to be kept, only to be known to be writable.
-        arrays = {name: getattr(state, name) for name in ARRAYS} if state.count.any() else {}
+        arrays = {}
+        if state.count.any():
+            arrays = {"means": state.means} | {name: one_if_equal(getattr(state, name)) for name in OF_PIXELS}
         facts = json.dumps({"identity": self.identity, "spp": state.spp, "seconds": state.seconds})
 
         def write(beside: str) -> None:
