@@ -289,3 +289,21 @@ def test_before_the_first_sample_a_checkpoint_holds_no_arrays(cornell, tmp_path)
     store.save(fresh)
     assert (tmp_path / "run.npz").stat().st_size < 1000
     assert store.load(fresh) is fresh
+
+
+@pytest.mark.parametrize("adaptive", [False, True])
+def test_a_state_saved_after_any_call_comes_back_as_it_was(cornell, tmp_path, monkeypatch, adaptive):
+    monkeypatch.setattr(progressive, "CHUNK_PIXELS", 100)
+    store, state = checkpoint.Checkpoint(tmp_path / "run.npz", {}), progressive.start(cornell)
+    for spp in (16, 40):
+        progressive.plan(state, spp)
+        for _ in progressive.extend(cornell, state, 5, "mis"):
+            store.save(state)
+            loaded = store.load(progressive.start(cornell))
+            for name in ("means", "count", "goal", "weights"):
+                np.testing.assert_array_equal(getattr(loaded, name), getattr(state, name), strict=True)
+            assert loaded.spp == spp
+        if adaptive:
+            state.weights = np.linspace(0.5, 1.5, len(state.count), dtype=np.float32)
+    if not adaptive:
+        assert (tmp_path / "run.npz").stat().st_size < state.means.nbytes + 2000
