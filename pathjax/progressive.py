@@ -58,35 +58,50 @@ def plan(state: State, spp: int) -> None:
     state.spp = spp
 
 
-def extend(scene: Scene, state: State, seed: int, strategy: str) -> Iterator[None]:
+def extend(
+    scene: Scene, state: State, seed: int, strategy: str, stopped: Callable[[], object] = lambda: False
+) -> Iterator[None]:
     """Render what is missing of the round; yields after every call of the kernel, when the state is whole.
 
     The samples of a pixel are added in portions that depend on its own count and goal alone, so that a state which was
     saved between two calls leads to the same bits.
+
+    Args:
+        stopped: asked by other threads before each call. Once it is true none begins; those that run are waited for.
     """
     kernel, chunk = compile(scene, strategy), _chunk(scene)
 
     def rendered(portion):
+        if stopped():
+            return None
         numbers = np.zeros((3, chunk), np.int32)
         numbers[:, : len(portion[0])] = portion
         return np.asarray(kernel(numbers, np.uint32(seed)))[:, : len(portion[0])]
 
-    for (pixels, before, after), added in runtime.concurrently(rendered, _portions(state, chunk)):
-        # Pixels that follow each other are a slice, which is many times faster.
-        follow = pixels[-1] - pixels[0] == len(pixels) - 1
-        here = slice(pixels[0], pixels[-1] + 1) if follow else pixels
-        if before.any():
-            begin, end = (replicates.shares(replicates.one_if_equal(count)) for count in (before, after))
-            share = ((end - begin) / np.maximum(end, 1)).astype(np.float32)[..., None]
-            with np.errstate(invalid="ignore"):  # a pixel that met a sample that is not finite
-                change = added - state.means[:, here]
-                change *= share
-                state.means[:, here] += change
-        else:
-            # The same; but reading fresh memory before it is written stops all threads, page by page, at the write.
-            state.means[:, here] = added
-        state.count[here] = after
+    for portion, means in runtime.concurrently(rendered, _portions(state, chunk)):
+        if means is None:
+            yield
+            return
+        _add(state, *portion, means)
         yield
+
+
+def _add(state: State, pixels, before, after, means) -> None:
+    """Means (R, n, 3) of what lies between two numbers of samples."""
+    # Pixels that follow each other are a slice, which is many times faster.
+    follow = pixels[-1] - pixels[0] == len(pixels) - 1
+    here = slice(pixels[0], pixels[-1] + 1) if follow else pixels
+    if before.any():
+        begin, end = (replicates.shares(replicates.one_if_equal(count)) for count in (before, after))
+        share = ((end - begin) / np.maximum(end, 1)).astype(np.float32)[..., None]
+        with np.errstate(invalid="ignore"):  # a pixel that met a sample that is not finite
+            change = means - state.means[:, here]
+            change *= share
+            state.means[:, here] += change
+    else:
+        # The same; but reading fresh memory before it is written stops all threads, page by page, at the write.
+        state.means[:, here] = means
+    state.count[here] = after
 
 
 def _portions(state: State, chunk: int) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:

@@ -124,19 +124,23 @@ class Render:
             the reason, and what `_evaluate` gives where it is known.
         """
         state, error = self.state, UNKNOWN
-        earlier, started = state.seconds, time.perf_counter()
-        if self._out_of_time():
-            return "time limit", None
+        started = time.perf_counter() - state.seconds
+
+        def stopped():
+            if interrupts.heard:
+                return "interrupted"
+            if self.time_limit is not None and time.perf_counter() - started >= self.time_limit:
+                return "time limit"
+            return None
+
         while True:
-            for _ in progressive.extend(self.scene, state, self.seed, self.strategy):
-                state.seconds = earlier + time.perf_counter() - started
+            for _ in progressive.extend(self.scene, state, self.seed, self.strategy, stopped):
+                state.seconds = time.perf_counter() - started
                 if self.checkpoint is not None:
                     self.checkpoint.save_if_due(state)
                 show(self, error)
-                if interrupts.heard:
-                    return "interrupted", None
-                if self._out_of_time():
-                    return "time limit", None
+                if reason := stopped():
+                    return reason, None
             if state.spp >= self.spp:
                 return "spp", None
             image, variance, error = found = self._evaluate()
@@ -145,9 +149,6 @@ class Render:
             if state.spp == PILOT_SPP:
                 state.weights = estimate.sample_weights(image, variance).ravel()
             progressive.plan(state, min(_next_spp(state.spp, error, self.target_error), self.spp))
-
-    def _out_of_time(self) -> bool:
-        return self.time_limit is not None and self.state.seconds >= self.time_limit
 
     def _on_target(self, error: estimate.ImageError) -> bool:
         return self.target_error is not None and error.bound <= self.target_error

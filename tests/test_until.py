@@ -177,6 +177,31 @@ def test_a_state_left_after_any_call_leads_to_the_same_bits(cornell, monkeypatch
         np.testing.assert_array_equal(whole.count, parts.count)
 
 
+def test_no_call_begins_once_it_is_stopped(cornell, monkeypatch):
+    monkeypatch.setattr(progressive, "CHUNK_PIXELS", 100)
+    begun, stopped, compile = [], threading.Event(), progressive.compile
+
+    def counted(*arguments):
+        kernel = compile(*arguments)
+        return lambda *numbers: begun.append(stopped.is_set()) or kernel(*numbers)
+
+    monkeypatch.setattr(progressive, "compile", counted)
+    state, whole = progressive.start(cornell), progressive.start(cornell)
+    for one in (state, whole):
+        progressive.plan(one, 1000)
+    calls = progressive.extend(cornell, state, 5, "mis", stopped.is_set)
+    next(calls)
+    stopped.set()
+    list(calls)
+    # In each thread one that had just asked.
+    assert sum(begun) <= runtime.calls_at_once()
+    assert (state.count < state.goal).any()
+    # What is left leads on to the same bits.
+    for one in (state, whole):
+        list(progressive.extend(cornell, one, 5, "mis"))
+    np.testing.assert_array_equal(state.means, whole.means)
+
+
 def test_float64_within_a_context(shipped, x64, cornell):
     """The calls run in other threads, which do not have it."""
     with x64():
