@@ -47,7 +47,7 @@ def render(
         sampler: random numbers, "lattice", or "independent" of each other, or "subpixel": independent, but with a
             quarter of the samples in each of 2 x 2 strata of the pixel's filter; spp is then a multiple of 4.
         control: a `transport.Control`, of `Operator.control`, into which paths end instead of into darkness. The mean
-            stays, whatever light it holds. It pays where paths are long, and some seconds of them: see the README.
+            stays, whatever light it holds. It pays where paths are long, and seldom: see the README.
     Raises:
         InputError: a choice is unknown or out of range, as spp or seed; differentiation in anything but named
             parameters, or with another sampler, split_depth or control than the default.
