@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import os
+import signal
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -29,6 +30,13 @@ ROOT = Path(__file__).resolve().parents[1]
 FALSE_ALARM = 1e-4
 # Relative error that float32 leaves in the mean of a pixel; what differs by less is no disagreement.
 ROUNDING = 1e-5
+
+
+@pytest.fixture(scope="session", autouse=True)
+def interrupts_are_heard():
+    """Shells make what they start in the background deaf to Ctrl-C, which some tests send."""
+    if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(scope="session")
