@@ -52,7 +52,7 @@ def plan(state: State, spp: int) -> None:
     """Begin a round that ends with `spp` samples a pixel, on average; what a pixel has already it keeps."""
     weights = replicates.one_if_equal(state.weights).astype(float)
     goal = weights * spp
-    if len(weights) > 1:
+    if (weights != 1).any():
         goal = np.rint(goal / replicates.COUNT) * replicates.COUNT
     state.goal = np.maximum(state.count, np.minimum(goal, np.iinfo(np.int32).max).astype(np.int32))
     state.spp = spp

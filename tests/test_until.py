@@ -177,6 +177,15 @@ def test_a_state_left_after_any_call_leads_to_the_same_bits(cornell, monkeypatch
         np.testing.assert_array_equal(whole.count, parts.count)
 
 
+@pytest.mark.parametrize("weight", [np.float32(1), np.nextafter(np.float32(1), np.float32(0))])
+def test_equal_weights_give_every_pixel_the_samples_asked_for(cornell, weight):
+    """Also where the division by their mean has rounded."""
+    state = progressive.start(cornell)
+    state.weights[:] = weight
+    progressive.plan(state, 32)
+    assert (state.goal == 32).all()
+
+
 def test_no_call_begins_once_it_is_stopped(cornell, monkeypatch):
     monkeypatch.setattr(progressive, "CHUNK_PIXELS", 100)
     begun, stopped, compile = [], threading.Event(), progressive.compile

@@ -116,6 +116,6 @@ def from_queue(machine: Lanes, program, xs, shared, place, flags):
     packed = machine.pack(copies, differing)
     results = [jnp.zeros((count, *v.aval.shape), v.aval.dtype) for v in jaxpr.outvars]
     state = jnp.int32(0), jnp.full((width,), count, jnp.int32), packed, results
-    # Each lane takes one number that is no item's when it has put its last item away, or at once.
+    # A number is taken by each lane at first, then for each item that is put away.
     *_, results = lax.while_loop(lambda s: s[0] < count + width, trip, state)
     return results
