@@ -129,7 +129,8 @@ class Render:
         def stopped():
             if interrupts.heard:
                 return "interrupted"
-            if self.time_limit is not None and time.perf_counter() - started >= self.time_limit:
+            # However short the time, something is rendered: it is 0 until then.
+            if self.time_limit is not None and state.seconds and time.perf_counter() - started >= self.time_limit:
                 return "time limit"
             return None
 

@@ -51,6 +51,11 @@ def test_spp_bounds_a_search_for_an_error(cornell):
     assert pj.render_until(cornell, 1e-4, spp=5).spp == 5
 
 
+def test_something_is_rendered_in_however_short_a_time(cornell):
+    result = pj.render_until(cornell, time_limit=1e-9)
+    assert result.reason == "time limit" and result.spp > 0 and result.image.any()
+
+
 def test_time_limit(cornell):
     result = pj.render_until(cornell, time_limit=0.3)
     assert result.reason == "time limit"

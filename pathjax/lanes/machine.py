@@ -46,7 +46,7 @@ def words_of(flags):
 
 
 def some(words):
-    """() bool: whether any flag is set."""
+    """() bool: whether any flag is set, of the `words_of` them."""
     return lax.reduce_or(words, (0,)) != 0
 
 
