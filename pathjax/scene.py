@@ -20,7 +20,7 @@ from pathjax.emitters.constant import Constant
 from pathjax.errors import InputError
 from pathjax.film import Film
 from pathjax.named import About, Parameter
-from pathjax.shapes import box, leaves, planar, sphere, triangle
+from pathjax.shapes import box, coincident, leaves, planar, sphere, triangle
 from pathjax.shapes.box import Boxes
 from pathjax.shapes.bvh_build import RULES
 from pathjax.shapes.geometry import Geometry
@@ -229,6 +229,7 @@ class _Kind:
     """Primitives of one kind while they are gathered: arrays by shape, and where they come from."""
 
     parts: list = field(default_factory=list)
+    numbers: list = field(default_factory=list)  # for each part, its shape
     shape: list = field(default_factory=list)  # for each primitive, its shape
     light: list = field(default_factory=list)  # for each primitive, its light or -1
 
@@ -269,13 +270,15 @@ def _build_shapes(description, dtype, parameters, split_rule):
                 light[:] = len(lights) + np.arange(count)
                 lights.extend((emitter, a, name, first + i, 1, None) for i, a in enumerate(areas))
         kind.parts.append(part)
+        kind.numbers.append(number)
         kind.shape.extend([number] * count)
         kind.light.extend(light.tolist())
 
+    margins = _part_coincident(kinds, description.shapes, dtype)
     tables, trees, names = [], {}, []
     for name, make in (("sphere", _spheres), ("rectangle", _planars), ("disk", _planars), ("triangle", _triangles)):
         if kinds[name].shape:
-            table, built = make(kinds[name].parts, name, dtype, split_rule)
+            table, built = make(kinds[name].parts, name, dtype, split_rule, margins.get(name))
             trees |= built
             tables.append(table)
             names.append(name)
@@ -313,8 +316,35 @@ def _area_lights(radiance, lights, names, dtype) -> AreaLights:
     )
 
 
-def _spheres(parts, name, dtype, rule):
-    balls = np.array([[*ball.center, ball.radius] for part in parts for ball, _ in part])
+def _part_coincident(kinds, shapes, dtype):
+    """Move faces as `coincident` has it, in place, and return margins (P,) by name, where a kind has any."""
+    margins = {name: [] for name, kind in kinds.items() if kind.parts}
+    if "sphere" in margins:
+        margins["sphere"].append(coincident.sphere_margins(_balls(kinds["sphere"].parts), dtype))
+    names, points, faces = [], [], []
+    for name in ("rectangle", "disk", "triangle"):
+        for part, number in zip(kinds[name].parts, kinds[name].numbers, strict=True):
+            glass, lamp = isinstance(shapes[number].bsdf, desc.Dielectric), shapes[number].radiance is not None
+            if name == "triangle":
+                faces.append(coincident.faces_of_mesh(part[0], glass, lamp, dtype))
+            else:
+                faces.append(coincident.faces_of_planar(part, glass, lamp))
+            points.append(part[0] if name == "triangle" else part[:, 0])
+            names.append(name)
+    for name, place, moves, found in zip(names, points, *coincident.contacts(faces, dtype), strict=True):
+        place += moves
+        margins[name].append(np.broadcast_to(found, len(place)))
+    margins = {name: np.concatenate(each) for name, each in margins.items()}
+    return {name: np.asarray(each, dtype) for name, each in margins.items() if each.any()}
+
+
+def _balls(parts):
+    """(P, 4) centers and radii."""
+    return np.array([[*ball.center, ball.radius] for part in parts for ball, _ in part])
+
+
+def _spheres(parts, name, dtype, rule, margins):
+    balls = _balls(parts)
     linear = np.stack([ball.to_world[:3, :3] for part in parts for ball, _ in part])
     rotation = linear / np.linalg.norm(linear, axis=1, keepdims=True)
     sign = np.array([-1.0 if flip else 1.0 for part in parts for _, flip in part])
@@ -322,10 +352,10 @@ def _spheres(parts, name, dtype, rule):
     packed, tree, built = leaves.pack(numbers, *bounds, dtype, rule)
     to_local = np.swapaxes(rotation, 1, 2)
     arrays = (np.asarray(x, dtype) for x in (balls, to_local, sign))
-    return Spheres(packed, tree, *arrays), {name: built}
+    return Spheres(packed, tree, *arrays, margins), {name: built}
 
 
-def _planars(parts, name, dtype, rule):
+def _planars(parts, name, dtype, rule, margins):
     frames, disk = np.concatenate(parts), name == "disk"
     single = sum(len(part) for part in parts if len(part) < box.FACES)  # then come the faces of cubes
     alone, faces = frames[:single], frames[single:]
@@ -337,10 +367,10 @@ def _planars(parts, name, dtype, rule):
         place = {"first": single, "step": box.FACES}
         *found, trees["cube"] = leaves.pack(numbers, *bounds, dtype, rule, **place)
         boxes = Boxes(*found)
-    return Planar(packed, tree, np.asarray(frames, dtype), boxes, disk), trees
+    return Planar(packed, tree, np.asarray(frames, dtype), boxes, margins, disk), trees
 
 
-def _triangles(parts, name, dtype, rule):
+def _triangles(parts, name, dtype, rule, margins):
     vertices = np.concatenate([part[0] for part in parts])
 
     def optional(place, default):
@@ -353,4 +383,4 @@ def _triangles(parts, name, dtype, rule):
     uv = optional(2, lambda v: np.broadcast_to(np.array([[0, 0], [1, 0], [0, 1]], float), (len(v), 3, 2)))
     bounds = triangle.bounds(vertices)
     packed, tree, built = leaves.pack(triangle.leaf_numbers(vertices), *bounds, dtype, rule)
-    return Triangles(packed, tree, np.asarray(vertices, dtype), normals, uv), {name: built}
+    return Triangles(packed, tree, np.asarray(vertices, dtype), normals, uv, margins), {name: built}

@@ -42,6 +42,11 @@ def bounds(frames):
     return center - reach, center + reach
 
 
+def depths(frames):
+    """(6 B, 4, 3) -> (6 B,) distance of each face from the opposite one."""
+    return np.abs(np.sum(frames[:, 3] * (frames[:, 0] - np.repeat(_axes(frames)[0], FACES, 0)), -1)) * 2
+
+
 def _axes(frames):
     """Centers (B, 3) and half axes (B, 3, 3) by row."""
     centers = frames[:, 0].reshape(-1, 3, 2, 3)  # box, axis, end, xyz

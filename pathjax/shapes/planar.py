@@ -28,6 +28,7 @@ class Planar:
     tree: Tree | None  # None: L = 1, every ray tests all
     frames: jax.Array  # (P, 4, 3): c, a, b, unit normal
     boxes: Boxes | None  # which find the last of the rectangles, in place of the leaves
+    margins: jax.Array | None  # (P,) of `coincident`; None: no other primitive lies in any of these
     disk: bool = field(metadata={"static": True})
 
 
@@ -43,6 +44,12 @@ def leaf_numbers(frames):
     slope_a, slope_b = np.sqrt((dual_a**2).sum(-1)), np.sqrt((dual_b**2).sum(-1))
     slope = np.maximum(slope_a, slope_b)
     return np.concatenate([c, n, dual_a, dual_b, np.stack([slope * radius, 2 * slope], -1)], -1)
+
+
+def corners(frames):
+    """(P, 4, 3) -> (P, 4, 3) of the rectangle, or of that around the disk."""
+    c, a, b, _ = np.moveaxis(frames, 1, 0)
+    return np.stack([c - a - b, c + a - b, c + a + b, c - a + b], 1)
 
 
 def bounds(frames, disk):
@@ -86,14 +93,20 @@ def count(table: Planar) -> int:
 def surface(table: Planar, row, o, d, t) -> Surface:
     """Differentiable in the ray; the point lies on the plane to the last bits.
 
-    No margin: the primitive is excluded by number, and its few neighbours err only within rounding of the shared edge.
-    So a sheet of glass may be as thin as the coordinates can tell.
+    No margin where nothing else lies in the plane: the primitive is excluded by number, and its few neighbours err only
+    within rounding of the shared edge. So a sheet of glass may be as thin as the coordinates can tell.
     """
     c, a, b, n = at(table.frames, row)
     from_c = o - c
     distance = -safe_divide(dot(n, from_c), dot(n, d))
     q = from_c + distance * d
-    p = c + (q - dot(n, q) * n)
+    in_plane = q - dot(n, q) * n
+    margin = jnp.zeros_like(distance)
+    if table.margins is not None:
+        # The projection rounds relative to what it took away, which here must not show: the second takes away no more.
+        in_plane = in_plane - dot(n, in_plane) * n
+        margin = at(table.margins, row)
+    p = c + in_plane
     aa, ab, bb = dot(a, a), dot(a, b), dot(b, b)
     qa, qb = dot(q, a), dot(q, b)
     scale = 1 / (aa * bb - ab * ab)
@@ -104,7 +117,7 @@ def surface(table: Planar, row, o, d, t) -> Surface:
         uv = jnp.stack([r, jnp.where(angle < 0, angle + 1, angle)])
     else:
         uv = jnp.stack([(x + 1) / 2, (y + 1) / 2])
-    return Surface(p, n, jnp.zeros_like(x), n, uv)
+    return Surface(p, n, margin, n, uv)
 
 
 def sample(table: Planar, row, u):

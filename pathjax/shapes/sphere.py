@@ -35,6 +35,7 @@ class Spheres:
     balls: jax.Array  # (P, 4) center, radius
     to_local: jax.Array  # (P, 3, 3) rotation into the frame of its uv
     sign: jax.Array  # (P,) -1 where the normal points inwards
+    margins: jax.Array | None  # (P,) of `coincident`; None: no two of these coincide
 
 
 def leaf_numbers(balls):
@@ -82,7 +83,7 @@ def count(table: Spheres) -> int:
 
 
 def surface(table: Spheres, row, o, d, t) -> Surface:
-    """Differentiable in the ray; the point is projected back onto the sphere. No margin: a sphere has no neighbours."""
+    """Differentiable in the ray; the point is projected back onto the sphere. No margin but where two coincide."""
     ball = at(table.balls, row)
     center, radius = ball[:3], ball[3]
     f = o - center
@@ -96,7 +97,8 @@ def surface(table: Spheres, row, o, d, t) -> Surface:
     theta = safe_atan2(safe_sqrt(local[0] * local[0] + local[1] * local[1]), local[2]) / math.pi
     uv = jnp.stack([jnp.where(phi < 0, phi + 1, phi), theta])
     n = outward * at(table.sign, row)
-    return Surface(center + radius * outward, n, jnp.zeros_like(radius), n, uv)
+    margin = jnp.zeros_like(radius) if table.margins is None else at(table.margins, row)
+    return Surface(center + radius * outward, n, margin, n, uv)
 
 
 def _one_minus_cos(ball, ref):

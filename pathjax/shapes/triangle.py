@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from pathjax.core.math import at, cross, dot, normalize, rescale, safe_divide
+from pathjax.core.math import at, cross, dot, larger, normalize, rescale, safe_divide
 from pathjax.core.types import Surface
 from pathjax.core.warp import square_to_triangle
 from pathjax.shapes.bvh import Tree
@@ -24,6 +24,7 @@ class Triangles:
     vertices: jax.Array  # (P, 3, 3) by row: vertex, axis
     normals: jax.Array | None  # (P, 3, 3) at the vertices; None: no triangle of the scene is smooth
     uv: jax.Array | None  # (P, 3, 2)
+    margins: jax.Array | None  # (P,) of `coincident`; None: no rectangle or disk lies in any of these
 
 
 def leaf_numbers(vertices):
@@ -84,10 +85,12 @@ def intersect(table: Triangles, leaf, prepared, start):
     (u, u_error), (v, v_error), (w, w_error) = edge(2, 1), edge(0, 2), edge(1, 0)
     front = (u >= -u_error) & (v >= -v_error) & (w >= -w_error)
     back = (u <= u_error) & (v <= v_error) & (w <= w_error)
-    det = u + v + w
-    t = (u * z[0] + v * z[1] + w * z[2]) * ray[5] / det
+    det, error = u + v + w, u_error + v_error + w_error
+    moment = u * z[0] + v * z[1] + w * z[2]
+    t = moment * ray[5] / det
+    reach = larger(larger(jnp.abs(z[0]), jnp.abs(z[1])), jnp.abs(z[2]))
     # Seen edge-on, or tiny and far from the ray, all three errors rule and every edge is inclusive.
-    sound = jnp.abs(det) > u_error + v_error + w_error
+    sound = (jnp.abs(det) > error) & (jnp.abs(moment) > reach * (error / 2))
     rows = rows_of(at(table.leaves, leaf))
     return jnp.where((front | back) & sound & (rows != start), t, jnp.inf), rows
 
@@ -116,7 +119,10 @@ def surface(table: Triangles, row, o, d, t) -> Surface:
     if table.normals is not None:
         shading_n = normalize(interpolate(at(table.normals, row)))
     uv = jnp.stack([b1, b2]) if table.uv is None else interpolate(at(table.uv, row))
-    return Surface(interpolate(vertices), n, dot(jnp.abs(n), _point_error(vertices)), shading_n, uv)
+    margin = dot(jnp.abs(n), _point_error(vertices))
+    if table.margins is not None:
+        margin = margin + at(table.margins, row)
+    return Surface(interpolate(vertices), n, margin, shading_n, uv)
 
 
 def sample(table: Triangles, row, u):
@@ -136,7 +142,7 @@ def _normal(edge1, edge2):
 
 def _point_error(vertices):
     """(3, 3) -> (3,), bound on the rounding error of an interpolated vertex."""
-    return (4 * np.finfo(vertices.dtype).eps) * jnp.max(jnp.abs(vertices), 0)
+    return (3 * np.finfo(vertices.dtype).eps) * jnp.max(jnp.abs(vertices), 0)
 
 
 def face_normals(vertices):

@@ -1,0 +1,142 @@
+"""Surfaces that lie in one another, found when a scene is built, so that rays leave all of them and see the right one.
+
+The primitive that a ray starts on is excluded by number, and a lone rectangle, disk or sphere needs no more. Where
+another one lies in the same place, the origin as it was rounded may be on the far side of that one. There, and only
+there, so that sheets may be as thin as elsewhere, origins are moved along the normal by a margin that covers the
+rounding of both.
+
+Some pairs have an order besides, and are parted by a gap that rounding cannot close: there is air between glass and
+what it touches, and a lamp that lies in a wall shines from it. A body shrinks by the gap; a sheet that shines comes
+forward. Meshes that are not flat stay as they are, and are not compared with each other.
+"""
+
+from __future__ import annotations
+
+from functools import cache, reduce
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from pathjax.shapes import box, planar, triangle
+
+# In machine epsilons of the coordinates along the normal, for each of the two primitives: an upper bound on what its
+# point, its plane and a distance from that lose by rounding (see `planar.leaf_numbers`).
+_MARGIN = 4
+# In machine epsilons of the scene's size, since rays come from anywhere in it.
+_GAP = 8
+# Triangles among which to look for a large one, whose plane is that of the mesh if it is flat.
+_SOME = 100
+
+
+class Faces(NamedTuple):
+    """The flat faces of a shape."""
+
+    corners: np.ndarray  # (F, K, 3) float64; of a disk or a flat mesh those of a rectangle around it
+    normal: np.ndarray | None  # (F, 3) unit; None: they are fixed, share corners with others and would gape if moved
+    depth: np.ndarray | None  # (F,) of the body that the face closes; inf: it is a sheet
+    glass: bool
+    lamp: bool
+
+
+def faces_of_planar(frames, glass: bool, lamp: bool) -> Faces:
+    """Of a rectangle, a disk or a cube, by its frames (1 or 6, 4, 3)."""
+    depth = box.depths(frames) if len(frames) == box.FACES else np.full(len(frames), np.inf)
+    return Faces(planar.corners(frames), frames[:, 3], depth, glass, lamp)
+
+
+def faces_of_mesh(vertices, glass: bool, lamp: bool, dtype) -> Faces:
+    """Of triangles (P, 3, 3); one face if all lie in one plane."""
+    some = vertices[:_SOME]
+    largest = some[np.argmax(triangle.area(some))]
+    corner, edge, normal = largest[0], largest[1] - largest[0], triangle.face_normals(largest[None])[0, 0]
+    from_corner = vertices - corner
+    if np.abs(from_corner @ normal).max() > 2 * _precision(dtype) * (np.abs(vertices) @ np.abs(normal)).max():
+        return Faces(vertices, None, None, glass, lamp)
+    axes = np.stack([edge, np.cross(normal, edge)]) / np.linalg.norm(edge)
+    places = from_corner @ axes.T
+    (x0, y0), (x1, y1) = places.min((0, 1)), places.max((0, 1))
+    around = corner + np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]]) @ axes
+    return Faces(around[None], normal[None], np.array([np.inf]), glass, lamp)
+
+
+def contacts(shapes: list[Faces], dtype) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """What is to be done about faces of different shapes that lie in one plane, up to rounding, and overlap.
+
+    Returns:
+        By shape the moves (F, 3) that part its faces from what they touch, (3,) zeros if they are fixed; and its
+        margins (F,), 0 for lone faces.
+    """
+    moves = [np.zeros(3 if each.normal is None else each.normal.shape) for each in shapes]
+    margins = [np.zeros(len(each.corners)) for each in shapes]
+    size = max((np.abs(each.corners).max() for each in shapes), default=0)
+    movable = [i for i, each in enumerate(shapes) if each.normal is not None]
+    fixed = [i for i, each in enumerate(shapes) if each.normal is None]
+    for others in (movable, fixed):
+        for i, row, j, partners, margin in _coplanar(shapes, movable, others, dtype):
+            mine, partner = shapes[i], shapes[j]
+            gap = min(_GAP * np.finfo(dtype).eps * size, mine.depth[row] / 4)
+            if mine.glass or (mine.lamp and not partner.lamp and not partner.glass):
+                comes_forward = not mine.glass and np.isinf(mine.depth[row])
+                moves[i][row] = mine.normal[row] * (gap if comes_forward else -gap)
+            elif partner.glass or partner.lamp != mine.lamp:
+                if partner.normal is None:
+                    moves[i][row] = triangle.face_normals(partner.corners[partners[:1]])[0, 0] * gap
+            else:
+                margins[i][row] = max(margins[i][row], margin.max())
+                margins[j][partners] = np.maximum(margins[j][partners], margin)
+    return moves, margins
+
+
+def sphere_margins(balls, dtype) -> np.ndarray:
+    """Margins (P,) of spheres (P, 4), center and radius; 0 for those that no other one coincides with."""
+    reach = np.linalg.norm(balls[:, :3], axis=1) + balls[:, 3]
+    margins = np.zeros(len(balls))
+    pairs = cKDTree(balls).query_pairs(_precision(dtype) * reach.max(initial=0), output_type="ndarray")
+    margins[pairs] = 2 * _MARGIN * np.finfo(dtype).eps * reach[pairs]
+    return margins
+
+
+def _precision(dtype):
+    """Relative difference up to which coordinates may round to the same number, after transforms have rounded them."""
+    return np.finfo(dtype).eps / 2 + 8 * np.finfo(np.float64).eps
+
+
+def _coplanar(shapes: list[Faces], movable, others, dtype):
+    """For each movable face and each of the others that it touches: i, row, j, rows (N,), margins (N,) that clear both.
+
+    Args:
+        movable, others: numbers i and j of shapes.
+    """
+    if not movable or not others:
+        return
+    corners = np.concatenate([shapes[j].corners for j in others])
+    counts = [len(shapes[j].corners) for j in others]
+    owner, rows = np.repeat(others, counts), np.concatenate([np.arange(count) for count in counts])
+    lo, hi = (reduce(end, np.moveaxis(corners, 1, 0)) for end in (np.minimum, np.maximum))
+    longest = (hi - lo).max(0)
+
+    @cache
+    def by_lower_end(axis):
+        order = np.argsort(lo[:, axis])
+        return order, lo[order, axis]
+
+    for i in movable:
+        for row, (mine, normal) in enumerate(zip(shapes[i].corners, shapes[i].normal, strict=True)):
+            slack = _precision(dtype) * np.abs(mine).max(0)
+            bottom, top = mine.min(0) - slack, mine.max(0) + slack
+            # What may overlap along an axis is a range. It is short where the face is thin, but for tiles of a floor.
+            for axis in np.argsort(top - bottom):
+                order, ends = by_lower_end(axis)
+                start, stop = np.searchsorted(ends, (bottom[axis] - longest[axis], np.nextafter(top[axis], np.inf)))
+                if stop - start < len(ends) / 10:
+                    break
+            near = order[start:stop]
+            near = near[(lo[near] <= top).all(1) & (hi[near] >= bottom).all(1) & (owner[near] != i)]
+            # The size of coordinates along the normal, to which rounding is relative.
+            reach = (np.abs(mine).max(0) + np.abs(corners[near]).max(1)) @ np.abs(normal)
+            within = np.abs((corners[near] - mine[0]) @ normal).max(1, initial=0) <= _precision(dtype) * reach
+            near, margin = near[within], _MARGIN * np.finfo(dtype).eps * reach[within]
+            for j in np.unique(owner[near]):
+                touches = owner[near] == j
+                yield i, row, j, rows[near[touches]], margin[touches]
