@@ -6,13 +6,12 @@ Images are (H, W, 3) linear RGB; what averages over pixels takes (..., 3) of any
 from __future__ import annotations
 
 import math
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from pathjax.errors import InputError
-from pathjax.io.image import read_exr, read_rgb
+from pathjax.io.image import file_format, read_exr, read_rgb
 from pathjax.picture import side_by_side, signed_colors
 
 # Added to the squared reference in relative errors, so that black pixels do not rule them.
@@ -128,7 +127,7 @@ def compare(image_file: str, reference_file: str, errors: bool = False) -> Compa
         raise InputError(f"{image_file}, {reference_file}: no pixel is finite in both, so there is nothing to compare")
 
     a, b = image[compared], reference[compared]
-    hdr = all(Path(file).suffix.lower() == ".exr" for file in files)
+    hdr = all(file_format(file) == "OpenEXR" for file in files)
     peak = max(float(b.max()), 0.0) if hdr else 1.0
     differences = flip(*(np.where(compared[..., None], x, 0) for x in (image, reference)), hdr)
     z, p, exact = None, None, None
@@ -147,7 +146,7 @@ def _read_errors(files, shape) -> list[np.ndarray | None]:
     """(H, W, 3) of each file, None where it holds none."""
     errors, held = [], []
     for file in files:
-        channels = read_exr(file)[0] if Path(file).suffix.lower() == ".exr" else {}
+        channels = read_exr(file)[0] if file_format(file) == "OpenEXR" else {}
         missing = [name for name in ERROR_CHANNELS if name not in channels]
         held.append(f"{file} holds {', '.join(sorted(channels)) or 'no named channels'}")
         errors.append(None if missing else np.stack([channels[name] for name in ERROR_CHANNELS], -1))

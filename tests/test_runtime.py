@@ -136,7 +136,7 @@ before = set(sys.modules)
 begin = time.perf_counter()
 import pathjax
 seconds = time.perf_counter() - begin
-heavy = {"trimesh", "OpenEXR", "rich", "PIL", "optimistix", "mitsuba", "matplotlib"}
+heavy = {"trimesh", "OpenEXR", "OpenImageIO", "rich", "PIL", "optimistix", "mitsuba", "matplotlib"}
 print(json.dumps([seconds, sorted(heavy & (set(sys.modules) - before))]))
 """
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,15 @@ from pathjax.errors import InputError
 from pathjax.io.files import write_whole
 
 MAX_PIXELS = 10**9
+_FIRST_BYTES = {"OpenEXR": b"\x76\x2f\x31\x01", "PNG": b"\x89PNG\r\n\x1a\n", "JPEG": b"\xff\xd8\xff"}
+
+# CIE x, y of red, green, blue and white. The white of Rec. 709 is D65 as Mitsuba rounds it, (0.950456, 1, 1.088754).
+_REC709 = (0.64, 0.33), (0.3, 0.6), (0.15, 0.06), (0.3127313, 0.3290329)
+_XYZ = (1, 0), (0, 1), (0, 0), (1 / 3, 1 / 3)
+# Chromaticities are published to three or four digits.
+_SAME_CHROMATICITY = 5e-4
+# Mitsuba's matrices between RGB and XYZ have six digits: one is the inverse of the other within this.
+_MATRIX_ROUNDING = 2e-6
 
 
 def srgb_to_linear(encoded: np.ndarray) -> np.ndarray:
@@ -53,30 +63,6 @@ def write_exr(path: str | Path, channels: Mapping[str, np.ndarray], header: Mapp
     write_whole(Path(path), write)
 
 
-def read_exr(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, str | int | float]]:
-    """All channels as (H, W) float32 by name, and those attributes of the header that are text or numbers.
-
-    Raises:
-        InputError: no such file, or not an OpenEXR file that can be read.
-    """
-    import OpenEXR
-
-    _require_file(path)
-    try:
-        with OpenEXR.File(str(path), header_only=True) as file:
-            low, high = (np.asarray(corner, dtype=np.int64) for corner in file.header()["dataWindow"])
-            if np.prod(high - low + 1, dtype=float) > MAX_PIXELS:
-                raise InputError(f"{path}: more than {MAX_PIXELS:.0e} pixels")
-        with OpenEXR.File(str(path), separate_channels=True) as file:
-            header = {name: value for name, value in file.header().items() if type(value) in (str, int, float)}
-            channels = {name: np.array(channel.pixels, np.float32) for name, channel in file.channels().items()}
-    except InputError:
-        raise
-    except Exception as error:  # OpenEXR raises RuntimeError, TypeError and others, as the file's bytes have it
-        raise InputError(f"{path}: cannot be read as OpenEXR: {error}") from None
-    return channels, header
-
-
 def write_png(path: str | Path, rgb: np.ndarray) -> None:
     """Write (H, W, 3) linear RGB as 8-bit sRGB: clipped to [0, 1], rounded to nearest, NaN black."""
     from PIL import Image
@@ -89,58 +75,248 @@ def write_png(path: str | Path, rgb: np.ndarray) -> None:
     write_whole(Path(path), lambda beside: image.save(beside, format="PNG"))
 
 
+def file_format(path: str | Path) -> str:
+    """Return "OpenEXR", "PNG" or "JPEG", by the file's first bytes, whatever its name says.
+
+    Raises:
+        InputError: no such file, no right to read it, or another format.
+    """
+    if not Path(path).is_file():
+        raise InputError(f"{path}: {'not a file' if Path(path).exists() else 'no such file'}")
+    try:
+        with open(path, "rb") as file:
+            start = file.read(8)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
+    for name, first in _FIRST_BYTES.items():
+        if start.startswith(first):
+            return name
+    fault = "is in another format" if start else "is empty"
+    raise InputError(f"{path}: {fault}; images are read from OpenEXR, PNG and JPEG")
+
+
 def read_rgb(path: str | Path, raw: bool = False) -> np.ndarray:
-    """(H, W, 3) float32 linear RGB, the top row first, from OpenEXR, PNG or JPEG; grey is repeated, alpha left out.
+    """(H, W, 3) float32 linear RGB with the primaries of Rec. 709, the top row first, from OpenEXR, PNG or JPEG.
+
+    Grey is repeated and alpha left out, as in Mitsuba: colours of OpenEXR are multiplied by alpha already, as light
+    that reached the camera is; those of PNG are taken as they stand. PNG and JPEG are sRGB, also with 16 bits; their
+    gamma, ICC profile and EXIF orientation are not applied, and of an animation its still image is read.
+
+    From OpenEXR come R, G, B, or X, Y, Z, or Y; or R, G, B of a layer if there is one alone. X, Y, Z are converted, and
+    so are primaries that the file states; white is not adapted. The image is the display window, 0 outside the data
+    window.
 
     Args:
         raw: PNG and JPEG hold plain numbers (stored / maximum), not sRGB. OpenEXR is linear in any case.
     Raises:
-        InputError: no such file, another format, or a damaged one.
+        InputError: no such file, another format, a damaged file, or one that does not tell which colours are meant.
     """
-    suffix = Path(path).suffix.lower()
-    if suffix == ".exr":
+    if file_format(path) == "OpenEXR":
         return _read_exr_rgb(path)
-    if suffix not in (".png", ".jpg", ".jpeg"):
-        raise InputError(f'{path}: "{suffix}" images are not supported; use .exr, .png or .jpg')
-    stored = _read_pixels(path)
-    return (stored if raw else srgb_to_linear(stored)).astype(np.float32)
+    stored = read_stored(path)
+    maximum = np.iinfo(stored.dtype).max
+    levels = np.arange(maximum + 1) / maximum
+    return (levels if raw else srgb_to_linear(levels)).astype(np.float32)[stored]
+
+
+def read_stored(path: str | Path) -> np.ndarray:
+    """(H, W, 3) uint8 or uint16 of a PNG or JPEG as they are stored, before the curve of sRGB.
+
+    Grey is repeated, alpha left out; fewer than 8 bits are spread over 0 to 255, and palettes are looked up.
+
+    Raises:
+        InputError: as `read_rgb`.
+    """
+    with _opened(path) as image:
+        spec = image.spec()
+        _require_size(spec)
+        if spec.getattribute("jpeg:ColorSpace") in ("CMYK", "YCbCrK"):
+            raise _Unreadable("it is CMYK, for a printer; convert it to RGB")
+        channels = 3 if spec.nchannels >= 3 else 1
+        stored = _read(image, 0, 0, channels, spec.format)
+    return np.repeat(stored, 3 // channels, axis=-1)
+
+
+# ---- OpenEXR ------------------------------------------------------------------------------------------------------
+
+
+def read_exr(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, str | int | float]]:
+    """All channels as (H, W) float32 by name, and those attributes of the header that are text or numbers.
+
+    The channels cover the display window and are 0 outside the data window. In a file of several parts the part's name
+    stands before the channel's, and the header is that of the first part.
+
+    Raises:
+        InputError: no such file, or not an OpenEXR file that can be read.
+    """
+    if (found := file_format(path)) != "OpenEXR":
+        raise InputError(f"{path}: is {found}, not OpenEXR")
+    channels = {}
+    with _opened(path) as image:
+        parts = _parts(image)
+        for part, spec in enumerate(parts):
+            pixels = _read_channels(image, part, spec, range(spec.nchannels))
+            for i, name in enumerate(spec.channelnames):
+                channels[_full_name(parts, part, name)] = pixels[..., i]
+        header = {entry.name: entry.value for entry in parts[0].extra_attribs}
+    return channels, {name: value for name, value in header.items() if type(value) in (str, int, float)}
 
 
 def _read_exr_rgb(path: str | Path) -> np.ndarray:
-    channels, _ = read_exr(path)
-    names = "RGB" if {"R", "G", "B"} <= channels.keys() else "YYY"
-    if names[0] not in channels:
-        raise InputError(f"{path}: has no channels R, G, B and no channel Y; it has: {', '.join(sorted(channels))}")
-    if len({channels[name].shape for name in names}) != 1:
-        raise InputError(f"{path}: subsampled channels are not supported")
-    return np.stack([channels[name] for name in names], axis=-1)
+    with _opened(path) as image:
+        parts = _parts(image)
+        part, kind, indices = _find_colors(parts)
+        primaries = _XYZ if kind == "XYZ" else _primaries(parts[part])
+        matrix = None
+        if kind != "Y" and not np.allclose(primaries, _REC709, rtol=0, atol=_SAME_CHROMATICITY):
+            matrix = _to_rec709(primaries)
+        pixels = _read_channels(image, part, parts[part], indices)
+        numbers = {_number(parts[part], i) for i in indices}
+    if matrix is None:
+        return np.repeat(pixels, 3 // len(indices), axis=-1)
+    # Red, green or blue that is no more than the rounding of the stored numbers leaves of it is not there.
+    rounding = np.finfo(np.float16).eps if "half" in numbers else _MATRIX_ROUNDING
+    with np.errstate(invalid="ignore"):  # infinities of different signs
+        rgb = pixels @ matrix.T
+        rgb[np.abs(rgb) < rounding * (np.abs(pixels) @ np.abs(matrix).T)] = 0
+    return rgb.astype(np.float32)
 
 
-def _read_pixels(path: str | Path) -> np.ndarray:
-    """(H, W, 3) float64 in [0, 1], as stored."""
-    from PIL import Image
+def _find_colors(parts) -> tuple[int, str, list[int]]:
+    """The part that holds the image, "RGB", "XYZ" or "Y", and the places of these channels in it."""
+    layers: dict[tuple[int, str], dict[str, int]] = {}
+    for part, spec in enumerate(parts):
+        for i, name in enumerate(spec.channelnames):
+            layer, _, last = name.rpartition(".")
+            layers.setdefault((part, layer), {}).setdefault(last.upper(), i)
+    found = {}
+    for (part, layer), places in layers.items():
+        kinds = ["RGB"]
+        if not layer and len(parts) == 1:  # elsewhere X, Y, Z are a normal or a position
+            kinds += ["XYZ"] if "X" in places else ["Y"]
+        kind = next((kind for kind in kinds if places.keys() >= set(kind)), None)
+        if kind == "Y" and places.keys() & {"RY", "BY"}:
+            raise _Unreadable("it holds luminance and chroma, Y, RY and BY; write it with channels R, G, B")
+        if kind:
+            found[part, layer] = kind
+    candidates = [place for place in found if not place[1]] or list(found)
+    if not candidates:
+        names = sorted(_full_name(parts, part, name) for part, spec in enumerate(parts) for name in spec.channelnames)
+        raise _Unreadable(f"it has no channels R, G, B or X, Y, Z and no channel Y; it has: {', '.join(names)}")
+    if len(candidates) > 1:
+        names = ", ".join(_full_name(parts, part, layer) for part, layer in candidates)
+        raise _Unreadable(f"it holds several images: {names}; write the one that is meant with channels R, G, B")
+    part, layer = candidates[0]
+    kind = found[part, layer]
+    return part, kind, [layers[part, layer][name] for name in kind]
 
-    _require_file(path)
+
+def _full_name(parts, part: int, name: str) -> str:
+    if len(parts) == 1:
+        return name
+    return f"{parts[part].getattribute('name')}.{name}".rstrip(".")
+
+
+def _primaries(spec) -> Sequence[Sequence[float]]:
+    """The file's chromaticities; those of Rec. 709 if it states none."""
+    stated = spec.getattribute("chromaticities")
+    space = spec.getattribute("colorInteropID") or "unknown"
+    linear = space == "lin_rec709_scene" or space.startswith("lin_") and stated is not None
+    if not linear and space not in ("unknown", "data"):
+        raise _Unreadable(f'its colours are "{space}"; convert them to "lin_rec709_scene"')
+    return _REC709 if stated is None else np.reshape(stated, (4, 2))
+
+
+def _to_rec709(primaries) -> np.ndarray:
+    """(3, 3) from linear RGB of these primaries to Rec. 709: the same light, so white is not adapted (as Mitsuba)."""
     try:
-        with Image.open(path, formats=("PNG", "JPEG")) as image:
-            if image.width * image.height > MAX_PIXELS:
-                raise InputError(f"{path}: more than {MAX_PIXELS:.0e} pixels")
-            if image.mode == "I;16":
-                return np.repeat(np.asarray(image, np.float64)[..., None], 3, axis=-1) / 65535
-            if image.format == "PNG" and _png_bits(path) == 16:  # Pillow would cut it down to 8 bits
-                raise InputError(f"{path}: 16-bit colour PNG is not supported; use .exr")
-            return np.asarray(image.convert("RGB"), np.float64) / 255
-    except InputError:
-        raise
-    except Exception as error:  # Pillow raises OSError, SyntaxError, ValueError and others, as the file's bytes have it
-        raise InputError(f"{path}: cannot be read as an image: {error}") from None
+        with np.errstate(all="ignore"):
+            matrix = np.linalg.solve(_to_xyz(_REC709), _to_xyz(primaries))
+    except np.linalg.LinAlgError:
+        matrix = np.full((3, 3), np.nan)
+    if not np.isfinite(matrix).all():
+        raise _Unreadable(f"its chromaticities {np.ravel(primaries).tolist()} are no primaries; mend its header")
+    return matrix
 
 
-def _png_bits(path: str | Path) -> int:
+def _to_xyz(primaries) -> np.ndarray:
+    """(3, 3) from linear RGB to CIE XYZ (SMPTE RP 177)."""
+    x, y = np.transpose(primaries)
+    xyz = np.stack([x, y, 1 - x - y])
+    return xyz[:, :3] * np.linalg.solve(xyz[:, :3], xyz[:, 3] / y[3])
+
+
+def _parts(image) -> list:
+    """The headers of all parts."""
+    parts = [image.spec(part, 0) for part in range(image.spec().getattribute("oiio:subimages") or 1)]
+    for spec in parts:
+        _require_size(spec)
+        if spec.deep:
+            raise _Unreadable("it holds deep data, many samples in a pixel; flatten it")
+    return parts
+
+
+def _read_channels(image, part: int, spec, indices: Sequence[int]) -> np.ndarray:
+    """(H, W, len(indices)) float32 over the display window, from the largest level of a pyramid."""
+    first, end = min(indices), max(indices) + 1
+    # One read for each kind of number: read as another, an integer would be divided by the largest one.
+    kinds = {_number(spec, i) for i in indices}
+    stored = {kind: _read(image, part, first, end, kind) for kind in kinds}
+    pixels = np.stack([stored[_number(spec, i)][..., i - first].astype(np.float32) for i in indices], axis=-1)
+    x, y = spec.x - spec.full_x, spec.y - spec.full_y
+    if (x, y, spec.width, spec.height) == (0, 0, spec.full_width, spec.full_height):
+        return pixels
+    shown = np.zeros((spec.full_height, spec.full_width, len(indices)), np.float32)
+    left, top = max(x, 0), max(y, 0)
+    inside = pixels[top - y : max(spec.full_height - y, 0), left - x : max(spec.full_width - x, 0)]
+    shown[top : top + inside.shape[0], left : left + inside.shape[1]] = inside
+    return shown
+
+
+def _number(spec, channel: int) -> str:
+    """ "half", "float" or "uint"."""
+    return str(spec.channelformat(channel))
+
+
+# ---- any format ---------------------------------------------------------------------------------------------------
+
+
+class _Unreadable(Exception):
+    """Why, and what to do about it."""
+
+
+@contextmanager
+def _opened(path: str | Path) -> Iterator:
+    """The file as OpenImageIO has it; whatever goes wrong with it is an InputError that names it."""
+    import OpenImageIO
+
+    found = file_format(path)
+    how = OpenImageIO.ImageSpec()
+    how.attribute("oiio:UnassociatedAlpha", 1)  # else colours of PNG would be multiplied by it
     with open(path, "rb") as file:
-        return file.read(25)[24]
+        try:
+            name = str(path)
+            if name.encode("utf-8", "ignore").decode() != name:  # OpenImageIO takes no other bytes
+                name = f"/dev/fd/{file.fileno()}"
+            image = OpenImageIO.ImageInput.open(name, how)
+            reason = OpenImageIO.geterror()
+            if image is None:
+                remedy = "write all channels at full size" if "ubsampled" in reason else "it is damaged, write it anew"
+                raise _Unreadable(f"{reason}; {remedy}")
+            yield image
+        except Exception as error:  # also UnicodeDecodeError and others, as the file's bytes have it
+            raise InputError(f"{path}: cannot be read as {found}: {' '.join(str(error).split())}") from None
 
 
-def _require_file(path: str | Path) -> None:
-    if not Path(path).is_file():
-        raise InputError(f"{path}: {'not a file' if Path(path).exists() else 'no such file'}")
+def _read(image, part: int, first: int, end: int, number) -> np.ndarray:
+    """(h, w, end - first) of one part as `number`."""
+    pixels = image.read_image(part, 0, first, end, number)
+    reason = image.geterror()
+    if pixels is None or reason:  # a JPEG that is cut off gives both
+        raise _Unreadable(f"{reason}; it is damaged, write it anew")
+    return pixels
+
+
+def _require_size(spec) -> None:
+    if max(spec.width * spec.height, spec.full_width * spec.full_height) > MAX_PIXELS:
+        raise _Unreadable(f"it has more than {MAX_PIXELS:.0e} pixels; scale it down")
