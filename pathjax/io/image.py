@@ -91,8 +91,8 @@ def file_format(path: str | Path) -> str:
     for name, first in _FIRST_BYTES.items():
         if start.startswith(first):
             return name
-    fault = "is in another format" if start else "is empty"
-    raise InputError(f"{path}: {fault}; images are read from OpenEXR, PNG and JPEG")
+    reason = "begins like another format" if start else "is empty"
+    raise InputError(f"{path}: not supported, as it {reason}; use OpenEXR, PNG or JPEG")
 
 
 def read_rgb(path: str | Path, raw: bool = False) -> np.ndarray:
