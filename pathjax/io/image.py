@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -57,8 +58,10 @@ def write_exr(path: str | Path, channels: Mapping[str, np.ndarray], header: Mapp
     fixed = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
 
     def write(beside: str) -> None:
+        content = io.BytesIO()  # OpenEXR itself writes on when the disk has no room for the last bytes
         with OpenEXR.File({**header, **fixed}, pixels) as file:
-            file.write(beside)
+            file.write(content)
+        Path(beside).write_bytes(content.getbuffer())
 
     write_whole(Path(path), write)
 

@@ -69,6 +69,19 @@ def test_a_failed_write_leaves_the_old_file_and_nothing_beside(tmp_path, rgb, mo
     assert [path.name for path in tmp_path.iterdir()] == ["a.exr"]
 
 
+@pytest.mark.parametrize("name", ["a.exr", "a.png"])
+def test_an_image_for_which_there_is_no_room_is_not_lost_silently(tmp_path, rgb, name):
+    resource = pytest.importorskip("resource")
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (50, hard))
+    try:
+        with pytest.raises(InputError, match="cannot be written: "):
+            write_exr(tmp_path / name, planes(rgb), {}) if name == "a.exr" else write_png(tmp_path / name, rgb)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert list(tmp_path.iterdir()) == []
+
+
 @pytest.mark.parametrize(
     ("channels", "header", "words"),
     [
@@ -177,7 +190,7 @@ ACES = (0.7347, 0.2653, 0.0, 1.0, 0.0001, -0.077, 0.32168, 0.33767)
 
 
 def exr(path, channels, header=None):
-    with OpenEXR.File(header or {}, {name: np.ascontiguousarray(x) for name, x in channels.items()}) as file:
+    with OpenEXR.File(dict(header or {}), {name: np.ascontiguousarray(x) for name, x in channels.items()}) as file:
         file.write(str(path))
     return path
 
@@ -423,11 +436,10 @@ def test_a_format_is_told_by_content_not_by_name(tmp_path, rgb, suffix):
         read_exr(tmp_path / "b.exr")
 
 
-def test_names_of_any_bytes_are_read(tmp_path, rgb):
-    write_exr(tmp_path / "a.exr", planes(rgb), {})
-    for name in ("b%04d.exr", "b?x=1.exr", "größe.exr", os.fsdecode(b"b\xff.exr")):
-        (tmp_path / name).write_bytes((tmp_path / "a.exr").read_bytes())
-        np.testing.assert_array_equal(read_rgb(tmp_path / name), rgb)
+@pytest.mark.parametrize("name", ["b%04d.exr", "b?x=1.exr", "größe.exr", os.fsdecode(b"b\xff.exr")])
+def test_names_of_any_bytes_are_written_and_read(tmp_path, rgb, name):
+    write_exr(tmp_path / name, planes(rgb), {})
+    np.testing.assert_array_equal(read_rgb(tmp_path / name), rgb)
 
 
 # ---- beside Mitsuba -----------------------------------------------------------------------------------------------
