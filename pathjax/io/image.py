@@ -254,13 +254,13 @@ def _parts(image) -> list:
     parts = [image.spec(part, 0) for part in range(image.spec().getattribute("oiio:subimages") or 1)]
     for spec in parts:
         _require_size(spec)
-        if spec.deep:
-            raise _Unreadable("it holds deep data, many samples in a pixel; flatten it")
     return parts
 
 
 def _read_channels(image, part: int, spec, indices: Sequence[int]) -> np.ndarray:
     """(H, W, len(indices)) float32 over the display window, from the largest level of a pyramid."""
+    if spec.deep:
+        raise _Unreadable("it holds deep data, many samples in a pixel; flatten it")
     first, end = min(indices), max(indices) + 1
     # One read for each kind of number: read as another, an integer would be divided by the largest one.
     kinds = {_number(spec, i) for i in indices}

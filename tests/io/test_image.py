@@ -367,12 +367,27 @@ def test_a_value_that_is_not_finite_spoils_its_own_pixel_alone(tmp_path, rgb):
         np.testing.assert_array_equal(np.isfinite(read_rgb(tmp_path / "a.exr")).all(-1), ~lost)
 
 
+DEEP = {"type": OpenEXR.deepscanline, "compression": OpenEXR.ZIPS_COMPRESSION}
+
+
+def samples(height, width):
+    pixels = np.empty((height, width), object)
+    for i, j in np.ndindex(height, width):
+        pixels[i, j] = np.ones(i + j + 1, np.float32)
+    return pixels
+
+
 def deep(path, _):
-    samples = np.empty((2, 3), object)
-    for i, j in np.ndindex(2, 3):
-        samples[i, j] = np.ones(i + j + 1, np.float32)
-    header = {"type": OpenEXR.deepscanline, "compression": OpenEXR.ZIPS_COMPRESSION}
-    exr(path, {name: samples for name in "RGB"}, header)
+    exr(path, {name: samples(2, 3) for name in "RGB"}, DEEP)
+
+
+def test_an_image_beside_deep_data_is_read(tmp_path, rgb):
+    image = OpenEXR.Part({"name": "beauty"}, {k: np.ascontiguousarray(x) for k, x in planes(rgb).items()})
+    with OpenEXR.File([image, OpenEXR.Part({"name": "deep", **DEEP}, {"Z": samples(5, 7)})]) as file:
+        file.write(str(tmp_path / "a.exr"))
+    np.testing.assert_array_equal(read_rgb(tmp_path / "a.exr"), rgb)
+    with pytest.raises(InputError, match="holds deep data"):
+        read_exr(tmp_path / "a.exr")
 
 
 def luminance_and_chroma(path, step):
