@@ -17,7 +17,7 @@ def parser(commands: dict[str, Callable]) -> argparse.ArgumentParser:
     render.add_argument("-o", "--output", required=True, metavar="OUT.{exr,png}")
     spp = "most samples per pixel; default: the file's, where neither --error nor --time is given"
     render.add_argument("--spp", type=_positive, metavar="N", help=spp)
-    error = "stop when sqrt(relMSE) is as low: 0.02 is 2 %%"
+    error = "stop when the error relative to the image's own level is as low: 0.02 is 2 %%"
     render.add_argument("--error", type=_real, metavar="E", help=error)
     render.add_argument("--time", type=_real, metavar="SECONDS", help="stop after so much rendering")
     checkpoint = "save the state there, and go on from it when called again"
@@ -59,8 +59,9 @@ def parser(commands: dict[str, Callable]) -> argparse.ArgumentParser:
         "compare",
         help="how an image differs from a reference",
         description="Of image A against reference B, in linear light: MSE; relMSE = mean((A - B)^2 / (B^2 + 0.01)); "
-        "PSNR, whose peak is B's maximum; HDR-FLIP. If one is PNG or JPEG, the peak is 1 and FLIP is LDR-FLIP.",
-        epilog="Exit status: 0 the images agree, or no limit was set; 1 they differ: relMSE or FLIP is above its "
+        "error, which `render --error` aims at: sqrt(relMSE) if images are exposed so that B has the level 1; PSNR, "
+        "whose peak is B's maximum; HDR-FLIP. If one is PNG or JPEG, the peak is 1 and FLIP is LDR-FLIP.",
+        epilog="Exit status: 0 the images agree, or no limit was set; 1 they differ: a measure is above its "
         "limit, or with --errors p is below ALPHA; 2 the command or a file is wrong.",
     )
     compare.add_argument("image", metavar="A.{exr,png,jpg}")
@@ -74,6 +75,8 @@ def parser(commands: dict[str, Callable]) -> argparse.ArgumentParser:
     alpha = "with --errors: the chance that equal scenes are said to differ; default: 0.001"
     compare.add_argument("--alpha", type=_chance, default=1e-3, help=alpha)
     compare.add_argument("--max-relmse", type=_limit, metavar="X", help="differ where relMSE is above")
+    error = "differ where the error is above"
+    compare.add_argument("--max-error", type=_limit, metavar="E", help=error)
     compare.add_argument("--max-flip", type=_limit, metavar="X", help="differ where the mean of FLIP is above")
     picture = "a picture: A, B, their difference (red: A is brighter) and, with --errors, its z-scores"
     compare.add_argument("-o", "--output", metavar="DIFF.png", help=picture)

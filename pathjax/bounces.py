@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import partial, reduce
 
 import jax
 import jax.numpy as jnp
@@ -35,13 +35,18 @@ class Bounces:
     """
 
     terms: jax.Array  # (depth, H, W, 3) linear RGB
-    variance: jax.Array  # (depth, H, W, 3) unbiased estimate of that of `terms`, 3 degrees of freedom; nan below 2 spp
+    deviation: jax.Array  # (depth, H, W, 3) root of `variance`, whose range is that of radiance
     samples: jax.Array  # (H, W) int32 of each pixel
+
+    @property
+    def variance(self) -> jax.Array:
+        """(depth, H, W, 3) unbiased estimate of that of `terms`, 3 degrees of freedom; nan below 2 spp."""
+        return self.deviation**2
 
     @property
     def standard_error(self) -> np.ndarray:
         """(depth, H, W, 3), pooled over 3 x 3 pixels as that of `render_until`."""
-        images, variances = np.asarray(self.terms), np.asarray(self.variance)
+        images, variances = np.asarray(self.terms), np.asarray(self.deviation, float) ** 2
         count = np.asarray(self.samples)
         return np.stack([estimate.standard_error(*term, count) for term in zip(images, variances, strict=True)])
 
@@ -51,12 +56,12 @@ class Bounces:
         Raises:
             InputError: fewer than 3 terms, or no such pixel.
         """
-        means, variance = (np.asarray(x, float).reshape(len(x), -1, 3) for x in (self.terms, self.variance))
+        means, deviation = (np.asarray(x, float).reshape(len(x), -1, 3) for x in (self.terms, self.deviation))
         known = np.isfinite(means).all((0, 2))
         if not known.any():
             raise InputError("no pixel is finite, so nothing can be told of the light beyond these terms")
         # Pixels are independent of each other.
-        error = np.sqrt(variance[:, known].sum(1)) / known.sum()
+        error = np.sqrt((deviation[:, known] ** 2).sum(1)) / known.sum()
         return tail.fit(means[:, known].mean(1), error)
 
 
@@ -71,7 +76,7 @@ def render_bounces(
     scene's own max_depth does not count.
 
     Pure; may be called inside `jax.jit`, under `jax.vmap`, and `terms` be differentiated in named reflectances,
-    radiances and other colours, as `render`, forwards or backwards. `variance` has no derivative.
+    radiances and other colours, as `render`, forwards or backwards. `deviation` and `variance` have no derivative.
 
     Args:
         depth: how many terms, 1 to 64; 1 is emission alone. Static.
@@ -131,15 +136,19 @@ def _bounces(scene, depth, pixels, spp, seed, strategy, errors) -> Bounces:
 
 @partial(jax.jit, static_argnames="shape")
 def _moments(sums, shares, *, shape):
-    """Means and their variances (depth, H, W, 3), of sums (R, N, depth, 3) of (R, N) samples; `replicates.moments`."""
+    """Means and deviations (depth, H, W, 3), of sums (R, N, depth, 3) of (R, N) samples; see `replicates.moments`."""
     sums, shares = list(sums), [x[:, None, None].astype(sums.dtype) for x in shares]  # a loop over them vectorises
     count = jnp.maximum(sum(shares), 1)
     mean = sum(sums) / count
-    spread = sum(n * (x / jnp.maximum(n, 1) - mean) ** 2 for x, n in zip(sums, shares, strict=True)) / count
+    apart = [lax.stop_gradient(x / jnp.maximum(n, 1) - mean) for x, n in zip(sums, shares, strict=True)]
+    # As in a norm: squares of radiances leave the range of float32.
+    largest = reduce(jnp.maximum, map(jnp.abs, apart))
+    scale = jnp.where(largest > 0, largest, 1)
+    spread = sum(n * (x / scale) ** 2 for x, n in zip(apart, shares, strict=True)) / count
     freedom = sum(n > 0 for n in shares) - 1
-    variance = jnp.where(freedom > 0, spread / jnp.maximum(freedom, 1), jnp.nan)
+    deviation = jnp.where(freedom > 0, scale * jnp.sqrt(spread / jnp.maximum(freedom, 1)), jnp.nan)
     depth = mean.shape[1]
-    return tuple(jnp.moveaxis(x, 1, 0).reshape(depth, *shape, 3) for x in (mean, lax.stop_gradient(variance)))
+    return tuple(jnp.moveaxis(x, 1, 0).reshape(depth, *shape, 3) for x in (mean, deviation))
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))

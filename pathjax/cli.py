@@ -83,13 +83,13 @@ def _render(options) -> int:
     loaded = time.perf_counter()
     result, layers = _rendered(scene, spp, options)
     _write(output, result, layers, options)
-    pixels_lost = int((result.image != result.image).any(-1).sum())
+    pixels_lost = int((~(abs(result.image) < math.inf)).any(-1).sum())
     if pixels_lost:
         print(f"pathjax: {pixels_lost} pixels met a sample that is not finite, and hold nan", file=sys.stderr)
     interrupted = result.reason == "interrupted"
     missed = interrupted or (options.error is not None and result.reason != "target error")
     if missed:
-        print(f"pathjax: {_reached(result, output, spp, options)}", file=sys.stderr)
+        print(f"pathjax: {_reached(result, pixels_lost, output, spp, options)}", file=sys.stderr)
     if options.json:
         report = {
             "output": str(output),
@@ -175,8 +175,14 @@ def _terms(scene, result, options) -> dict:
     }
 
 
-def _reached(result, output: Path, spp: int | None, options) -> str:
+def _reached(result, pixels_lost: int, output: Path, spp: int | None, options) -> str:
     """What there is, where it is not what was asked for."""
+    if result.reason == "no estimate":
+        why = f"{pixels_lost} of its pixels are not finite" if pixels_lost else "it is black, or nearly so"
+        return (
+            f"{output} holds {result.spp:.4g} spp, and its error cannot be told, for {why}; float32 has room for "
+            "radiances from 1e-31 to 1e36"
+        )
     ended = {"interrupted": "interrupted", "time limit": "out of time", "spp": "out of samples"}[result.reason]
     text = f"{ended}; {output} holds {result.spp:.4g}{f' of {spp}' if spp else ''} spp"
     if options.error is not None:
@@ -285,6 +291,8 @@ def _compare(options) -> int:
     differ = []
     if options.max_relmse is not None and comparison.rel_mse > options.max_relmse:
         differ.append(f"relMSE {comparison.rel_mse:.4g} is above {options.max_relmse:g}")
+    if options.max_error is not None and not comparison.relative_error <= options.max_error:
+        differ.append(f"the error {comparison.relative_error:.4g} is not below {options.max_error:g}")
     if options.max_flip is not None and comparison.flip > options.max_flip:
         differ.append(f"FLIP {comparison.flip:.4g} is above {options.max_flip:g}")
     if options.errors and comparison.p < options.alpha:

@@ -16,6 +16,8 @@ from pathjax.picture import side_by_side, signed_colors
 
 # Added to the squared reference in relative errors, so that black pixels do not rule them.
 RELATIVE_FLOOR = 0.01
+# The brightest of the lit pixels, lamps and skies in view, do not count in the level of an image; the others do.
+LEVEL_SHARE = 0.75
 # Values are equal if they differ by this share or less: float32 leaves as much in the mean of a pixel's samples.
 ROUNDING = 1e-5
 ERROR_CHANNELS = "error.R", "error.G", "error.B"
@@ -38,6 +40,36 @@ def rel_mse(image, reference) -> float:
     return float(np.mean((np.asarray(image, float) - reference) ** 2 / (reference**2 + RELATIVE_FLOOR)))
 
 
+def relative_error(image, reference) -> float:
+    """sqrt(relMSE) of images exposed so that the reference has the level 1: the same in any unit of radiance.
+
+    So sqrt(mean((I - R)^2 / (R^2 + 0.01 L^2))), where L is `level` of R. nan where that is not known.
+    """
+    exposure = 1 / level(reference)
+    return math.sqrt(rel_mse(exposure * np.asarray(image, float), exposure * np.asarray(reference, float)))
+
+
+def level(image) -> float:
+    """How bright an image (..., 3) is: the mean of its lit pixels and their channels, but for the brightest quarter.
+
+    So neither what is black counts nor a lamp in view, however bright. Pixels that are not finite are left out. nan
+    where nothing is lit, or the level is below 1e-31: what single paths add to it then underflows in float32.
+    """
+    brightness = mean_of_channels(np.asarray(image, float))
+    lit = brightness[np.isfinite(brightness) & (brightness > 0)]
+    if not lit.size:
+        return math.nan
+    count = math.ceil(LEVEL_SHARE * lit.size)
+    level = float(np.partition(lit, count - 1)[:count].mean())
+    single = np.finfo(np.float32)
+    return level if level > single.tiny / single.eps else math.nan
+
+
+def mean_of_channels(x: np.ndarray) -> np.ndarray:
+    """(...) of (..., 3): `x.mean(-1)`, but faster."""
+    return sum(np.moveaxis(x, -1, 0)) / x.shape[-1]
+
+
 def psnr(image, reference, peak: float) -> float:
     """10 log10(peak^2 / MSE) in dB; infinite for equal images."""
     error = mse(image, reference)
@@ -56,10 +88,15 @@ def flip(image, reference, hdr: bool) -> np.ndarray | None:
         import flip_evaluator
     except ImportError:
         return None
-    top = None if hdr else 1
+    top, exposures = 1, {}
+    if hdr:
+        # FLIP exposes the reference well in any unit of radiance, if the program does not take it for black.
+        top, brightest = np.finfo(np.float32).max, np.max(np.asarray(reference, float) @ _LUMINANCE)
+        _, exponent = np.frexp(np.nanmax([brightest, level(image)]))
+        image, reference = (np.ldexp(np.asarray(x, float), -exponent) for x in (image, reference))
+        if np.ldexp(brightest, -exponent) < _FLIP_LEAST_LUMINANCE:
+            exposures = {"startExposure": 0.0, "stopExposure": 0.0}
     image, reference = (np.ascontiguousarray(np.clip(x, 0, top), np.float32) for x in (image, reference))
-    dark = hdr and (reference @ _LUMINANCE).max() < _FLIP_LEAST_LUMINANCE
-    exposures = {"startExposure": 0.0, "stopExposure": 0.0} if dark else {}
     errors, _, _ = flip_evaluator.evaluate(
         reference, image, "HDR" if hdr else "LDR", inputsRGB=False, applyMagma=False, parameters=exposures
     )
@@ -100,6 +137,7 @@ class Comparison(NamedTuple):
     hdr: bool  # neither is PNG or JPEG
     mse: float
     rel_mse: float
+    relative_error: float  # nan where the reference has no level
     psnr: float  # dB
     peak: float  # of the PSNR: 1 where one is PNG or JPEG, else the reference's maximum
     flip: float | None  # mean; None without `flip-evaluator`
@@ -137,9 +175,8 @@ def compare(image_file: str, reference_file: str, errors: bool = False) -> Compa
         p = sidak_p(z[compared])
         exact = next((file for file, e in zip(files, deviations, strict=True) if e is None), None)
     mean_flip = None if differences is None else float(differences[compared].mean())
-    return Comparison(
-        image, reference, compared, hdr, mse(a, b), rel_mse(a, b), psnr(a, b, peak), peak, mean_flip, z, p, exact
-    )
+    measures = mse(a, b), rel_mse(a, b), relative_error(a, b), psnr(a, b, peak), peak, mean_flip
+    return Comparison(image, reference, compared, hdr, *measures, z, p, exact)
 
 
 def _read_errors(files, shape) -> list[np.ndarray | None]:
@@ -173,6 +210,7 @@ def facts(comparison: Comparison) -> dict:
         "not_finite_pixels": int((~c.compared).sum()),
         "mse": c.mse,
         "rel_mse": c.rel_mse,
+        "relative_error": c.relative_error,
         "psnr": c.psnr,
         "psnr_peak": c.peak,
         "flip": c.flip,
@@ -192,6 +230,7 @@ def text(comparison: Comparison) -> str:
     lines = [
         f"MSE     {c.mse:.6g}",
         f"relMSE  {c.rel_mse:.6g}",
+        f"error   {c.relative_error:.4g} (sqrt(relMSE) at the exposure of level 1, as of `render --error`)",
         f"PSNR    {c.psnr:.2f} dB (peak {c.peak:.6g}, {peak})",
         f"FLIP    {seen}",
     ]

@@ -1,7 +1,8 @@
 """How wrong an image is, from the variance between its replicates: of a pixel, and of the whole.
 
 Three degrees of freedom are few, so a pixel borrows from its neighbours. Of light that no sample of a pixel and its
-neighbours has met these numbers cannot know: they are then too small.
+neighbours has met these numbers cannot know: they are then too small. Variances are float64, as those of
+`replicates.moments`: so nothing here depends on the unit of radiance, but for what float32 cannot hold.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pathjax.compare import RELATIVE_FLOOR
+from pathjax.compare import RELATIVE_FLOOR, level, mean_of_channels
 from pathjax.replicates import blocks
 
 # Weight of a pixel's own variance; its eight neighbours share the rest.
@@ -22,7 +23,7 @@ LEAST_SHARE = 0.25
 
 
 class ImageError(NamedTuple):
-    """sqrt(relMSE) of an image against the truth; nan where nothing is known."""
+    """`compare.relative_error` of an image against the truth; nan where nothing is known."""
 
     estimate: float
     bound: float  # that the error exceeds in some 5 % of renders
@@ -51,36 +52,41 @@ def _standard_error(image, variance, count):
     image, variance = (np.ascontiguousarray(np.moveaxis(x, -1, 0)) for x in (image, variance))
     around = _around(variance, 1)
     pooled = np.where(np.isfinite(around), OWN_SHARE * variance + (1 - OWN_SHARE) * around, variance)
-    least = image / (3 * np.maximum(count, 1)).astype(image.dtype)
+    least = image / (3.0 * np.maximum(count, 1))
     return np.moveaxis(np.sqrt(np.maximum(pooled, least**2)), 0, -1)
 
 
 def contributions(image: np.ndarray, variance: np.ndarray) -> np.ndarray:
-    """(...,) share of each pixel in relMSE, from (..., 3); nan where not finite.
+    """(...,) share of each pixel in the squared relative error, from (..., 3); nan where it is not known.
 
     image^2 - variance estimates the squared truth without bias. Taking image^2 would halve the error of noisy images,
     since what makes a pixel too bright makes its variance large.
     """
-    with np.errstate(invalid="ignore", over="ignore"):
-        relative = variance / (np.maximum(image**2 - variance, 0) + RELATIVE_FLOOR)
-    relative = sum(np.moveaxis(relative, -1, 0)) / relative.shape[-1]  # as the mean over the last axis, but faster
+    with np.errstate(invalid="ignore"):
+        relative = variance / (np.maximum(np.square(image, dtype=float) - variance, 0) + _floor(image))
+    relative = mean_of_channels(relative)
     return np.where(np.isfinite(relative), relative, np.nan)
 
 
+def _floor(image: np.ndarray) -> float:
+    """What is added to the squared truth in relative errors; nan where the image has no level."""
+    return RELATIVE_FLOOR * level(image) ** 2
+
+
 def image_error(image: np.ndarray, variance: np.ndarray) -> ImageError:
-    """Of (..., 3). Pixels that are not finite are left out.
+    """Of (..., 3). Pixels that are not finite are left out; nan where the image has no `compare.level`.
 
     The bound takes pixels as draws from a population: where few of them make up most of the error, their number is
     small and the bound high. Where single samples do (skewness beyond 6), the error exceeds it more often.
     """
-    shares = contributions(image, variance).astype(float)
+    shares = contributions(image, variance)
     known = shares[np.isfinite(shares)]
     if not known.size:
         return ImageError(np.nan, np.nan)
     total = known.sum()
     uncertainty = np.sqrt((known**2).sum()) / total if total > 0 else 0.0
-    rel_mse = total / known.size
-    return ImageError(float(np.sqrt(rel_mse)), float(np.sqrt(rel_mse * (1 + CONFIDENCE * uncertainty))))
+    square = total / known.size
+    return ImageError(float(np.sqrt(square)), float(np.sqrt(square * (1 + CONFIDENCE * uncertainty))))
 
 
 def sample_weights(image: np.ndarray, variance: np.ndarray) -> np.ndarray:
@@ -90,8 +96,8 @@ def sample_weights(image: np.ndarray, variance: np.ndarray) -> np.ndarray:
     number of samples does not depend on what they were (but through the mean of all weights, by 1/N), and its mean
     stays unbiased.
     """
-    with np.errstate(invalid="ignore", over="ignore"):
-        relative = (variance / (image**2 + RELATIVE_FLOOR)).mean(-1)
+    with np.errstate(invalid="ignore"):
+        relative = mean_of_channels(variance / (np.square(image, dtype=float) + _floor(image)))
     (weights,) = np.sqrt(_around(np.where(np.isfinite(relative), relative, np.nan)[None], 2))
     known = np.isfinite(weights)
     if not known.any() or not weights[known].any():

@@ -46,15 +46,17 @@ def moments(means: np.ndarray, count: np.ndarray) -> tuple[np.ndarray, np.ndarra
     """The image (N, 3), the mean over all samples, and an unbiased estimate of its variance (N, 3).
 
     The variance has COUNT - 1 degrees of freedom, and is nan with fewer than 2 samples; replicates of unequal numbers
-    of samples count as if variance fell with their number. A pixel without samples is black.
+    of samples count as if variance fell with their number. A pixel without samples is black. The variance is float64:
+    squares of radiances leave the range of float32.
     """
-    image, variance = np.empty_like(means[0]), np.empty_like(means[0])
+    image, variance = np.empty_like(means[0]), np.empty(means[0].shape)
     for block in blocks(len(count)):
-        replicates, samples = means[:, block], one_if_equal(count[block])
-        n, share = (x.astype(means.dtype)[..., None] for x in (samples, shares(samples)))
-        image[block] = (replicates * share).sum(0) / np.maximum(n, 1)
+        replicates, samples = means[:, block].astype(float), one_if_equal(count[block])
+        n, share = (x.astype(float)[..., None] for x in (samples, shares(samples)))
         freedom = np.minimum(n, COUNT) - 1
         with np.errstate(invalid="ignore"):  # a pixel that is not finite
-            spread = ((replicates - image[block]) ** 2 * share).sum(0) / np.maximum(n, 1)
+            mean = (replicates * share).sum(0) / np.maximum(n, 1)
+            spread = ((replicates - mean) ** 2 * share).sum(0) / np.maximum(n, 1)
+        image[block] = mean
         variance[block] = np.where(freedom > 0, spread / np.maximum(freedom, 1), np.nan)
     return image, variance

@@ -40,9 +40,9 @@ class RenderResult:
     samples: np.ndarray  # (H, W) int32 of each pixel
     compile_seconds: float  # of this call
     run_seconds: float  # of all calls that shared the checkpoint
-    error: float  # estimate of sqrt(relMSE), relMSE = mean((I - R)^2 / (R^2 + 0.01)); nan before the second sample
+    error: float  # estimate of `compare.relative_error`, of the pixels that are finite; nan where it cannot be made
     error_bound: float  # that the error exceeds in some 5 % of renders; what is compared with the target
-    reason: str  # why it ended: "target error", "time limit", "spp", "interrupted"
+    reason: str  # why it ended: "target error", "time limit", "spp", "interrupted", "no estimate"
 
 
 def render_until(
@@ -57,13 +57,19 @@ def render_until(
 ) -> RenderResult:
     """Render until the first of three limits is reached.
 
+    The error is sqrt(mean((I - R)^2 / (R^2 + 0.01 L^2))) of the image I against the truth R, where L is the level of R:
+    the mean of what is lit, but for its brightest quarter, such as lamps in view (`compare.level`). So 0.02 is 2 % in
+    any unit of radiance. It is estimated as long as float32 holds the radiances, some 1e-31 to 1e36. A target is never
+    claimed of an image that is black, darker than that or not finite: a render that nothing else would end then ends
+    with the reason "no estimate", after the pilot or when the finite pixels are on target.
+
     The image is the mean of independent replicates, so not that of `render` for the same seed. With `spp` alone all
     pixels get as many samples; else, after a pilot, noisy neighbourhoods get more (`estimate.sample_weights`). Either
     way the image is unbiased up to the scene's max_depth. The same arguments give the same image, bit for bit, unless a
     time limit or an interrupt ended it.
 
     Args:
-        target_error: of sqrt(relMSE). Reached when the upper bound of its estimate is below.
+        target_error: reached when the upper bound of the estimate is no higher.
         time_limit: seconds of rendering; compilation, which nothing can cut short, comes on top.
         spp: most samples per pixel, on average.
         checkpoint: a .npz file to save the state in, at intervals, when interrupted and at the end. Where it exists
@@ -147,6 +153,8 @@ class Render:
             image, variance, error = found = self._evaluate()
             if self._on_target(error):
                 return "target error", found
+            if math.isnan(error.bound) and self.spp == MAX_SPP and self.time_limit is None:
+                return "no estimate", found
             if state.spp == PILOT_SPP:
                 state.weights = estimate.sample_weights(image, variance).ravel()
             progressive.plan(state, min(_next_spp(state.spp, error, self.target_error), self.spp))
@@ -166,7 +174,7 @@ class Render:
         image, variance, error = found
         count = self.state.count.reshape(image.shape[:2])
         if reason != "interrupted" and self._on_target(error):
-            reason = "target error"
+            reason = "target error" if np.isfinite(image).all() else "no estimate"
         standard_error = estimate.standard_error(image, variance, count)
         seconds = self.compile_seconds, self.state.seconds
         return RenderResult(image, standard_error, float(count.mean()), count, *seconds, *error, reason)

@@ -160,6 +160,19 @@ def test_variance_is_that_of_the_terms(cavity):
     np.testing.assert_allclose(variances, squares, rtol=0.1)
 
 
+@pytest.mark.parametrize("power", [-66, 66, 80])
+def test_a_power_of_two_in_the_lamp_scales_terms_and_errors(cavity, power):
+    """2^-66 is 1.4e-20, and 2^66 7e19."""
+    radiance = pj.parameters(cavity)["lamp.radiance"]
+    one = pj.render_bounces(cavity, DEPTH, 16)
+    other = pj.render_bounces(pj.with_parameters(cavity, {"lamp.radiance": 2.0**power * radiance}), DEPTH, 16)
+    for field in ("terms", "deviation", "standard_error"):
+        np.testing.assert_array_equal(getattr(other, field), np.ldexp(getattr(one, field), power))
+    shares, errors = one.tail().cut_off(10)
+    np.testing.assert_allclose(other.tail().cut_off(10), (shares, errors), rtol=1e-9)
+    assert (errors > 0).all()
+
+
 @pytest.mark.slow
 def test_float64(x64, shipped):
     with x64():

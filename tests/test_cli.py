@@ -175,6 +175,33 @@ def test_an_error_that_is_not_reached_is_a_failure(run, tmp_path, limit, reason,
     assert run(*arguments)[0] == 0
 
 
+@pytest.mark.parametrize(
+    "radiance, says",
+    [("0", "it is black"), ("1e-36", "it is black, or nearly so"), ("3e38", "64 of its pixels are not finite")],
+)
+def test_an_error_that_cannot_be_told_is_a_failure(run, tmp_path, radiance, says):
+    arguments = ("render", FURNACE, *SMALL, "-o", tmp_path / "a.exr", "--set", f"glow.radiance={radiance}", "--json")
+    status, out, err = run(*arguments, "--error", 0.02)
+    report = json.loads(out)
+    assert (status, report["reason"], report["error"]) == (1, "no estimate", None)
+    assert f"its error cannot be told, for {says}" in err and "from 1e-31 to 1e36" in err
+    assert set(read_exr(tmp_path / "a.exr")[0]) == {"R", "G", "B"}
+
+
+@pytest.mark.parametrize("radiance", ["1e-20", "1e20", "2.2e25"])
+def test_error_is_reached_in_any_unit_of_radiance(run, tmp_path, radiance):
+    """As many samples as at 1; bright lamps ended with 16 and an error of 0."""
+    arguments = ("render", FURNACE, *SMALL, "-o", tmp_path / "a.exr", "--aov", "error", "--error", 0.01, "--json")
+    one = json.loads(run(*arguments)[1])
+    status, out, _ = run(*arguments, "--set", f"glow.radiance={radiance}")
+    report = json.loads(out)
+    assert (status, report["reason"]) == (0, "target error")
+    assert report["spp"] == pytest.approx(one["spp"], rel=0.1) and one["spp"] > 16
+    assert report["error"] == pytest.approx(one["error"], rel=0.1)
+    errors = read_exr(tmp_path / "a.exr")[0]["error.R"]
+    assert (errors > 1e-4 * float(radiance)).all() and (errors < 0.1 * float(radiance)).all()
+
+
 def test_checkpoint_is_taken_up(run, tmp_path):
     files = ("-o", tmp_path / "a.exr", "--checkpoint", tmp_path / "run.npz")
     # Portions of 4 and 12, as without a stop.

@@ -62,6 +62,30 @@ def test_measures_of_a_known_difference():
     assert compare.psnr(reference, 0 * reference, 0) == -math.inf
 
 
+def test_level_is_the_mean_of_what_is_lit_but_for_its_brightest_quarter():
+    lit = [[0.1, 0.2, 0.3], [0.4, 0.4, 0.4], [0.5, 0.6, 1.0], [1e9, 0, 0]]
+    dark = [[0.0, 0.0, 0.0]] * 96
+    for image in (lit, lit + dark, [*lit, [np.nan, 1, 1], [np.inf, 1, 1]]):
+        assert compare.level(image) == pytest.approx((0.2 + 0.4 + 0.7) / 3)
+    assert compare.level(lit[:1]) == pytest.approx(0.2)
+
+
+@pytest.mark.parametrize("value", [0, -1, np.nan, np.inf, 1e-32])
+def test_level_of_nothing_is_not_known(value):
+    image = np.full((2, 3, 3), value, np.float32)
+    assert math.isnan(compare.level(image)) and math.isnan(compare.relative_error(image, image))
+
+
+@pytest.mark.parametrize("unit", [1e-25, 1e-10, 0.1, 1, 1e10, 1e25])
+def test_relative_error_knows_no_unit(unit):
+    """A tenth too bright everywhere, where one half of the image is black."""
+    reference = np.zeros((4, 4, 3))
+    reference[2:] = unit
+    expected = 0.1 / math.sqrt(2 * 1.01)
+    assert compare.relative_error(1.1 * reference, reference) == pytest.approx(expected)
+    assert compare.relative_error(reference.astype(np.float32), reference) == pytest.approx(0, abs=1e-7)
+
+
 @pytest.mark.parametrize("hdr", [True, False])
 def test_flip_is_0_for_equal_images_and_grows_with_the_difference(hdr):
     pytest.importorskip("flip_evaluator")
@@ -76,6 +100,19 @@ def test_flip_meets_black_references_and_negative_values():
     for dark in (0 * GREY, 1e-9 * GREY, -GREY):
         assert compare.flip(dark, dark, True).max() == 0
         assert compare.flip(GREY, dark, True).min() > 0.5
+
+
+@pytest.mark.parametrize("power", [-80, -66, -30])
+def test_flip_of_high_dynamic_range_knows_no_unit(power):
+    """FLIP's own program takes what is darker than 2e-7 for black."""
+    pytest.importorskip("flip_evaluator")
+    rng = np.random.default_rng(0)
+    reference = rng.lognormal(size=GREY.shape).astype(np.float32)
+    image = (reference * rng.normal(1, 0.1, GREY.shape)).astype(np.float32)
+    expected = compare.flip(image, reference, True)
+    assert expected.mean() > 0.01
+    scaled = compare.flip(np.ldexp(image, power), np.ldexp(reference, power), True)
+    np.testing.assert_allclose(scaled, expected, rtol=1e-4)
 
 
 def test_z_scores_of_known_numbers():
@@ -222,6 +259,22 @@ def test_limits_decide_the_status(exr, run):
     assert run(a, a, "--max-flip", 0, "--max-relmse", 0)[0] == 0
 
 
+@pytest.mark.parametrize("unit", [1e-20, 1, 1e20])
+def test_a_limit_of_the_relative_error_knows_no_unit(exr, run, unit):
+    a, b = exr("a.exr", unit * (GREY + np.float32(0.03))), exr("b.exr", unit * GREY)  # 0.1 / sqrt(1.01)
+    assert run(a, b, "--max-error", 0.1)[0] == 0
+    status, out, _ = run(a, b, "--max-error", 0.099)
+    assert status == 1
+    assert "the error 0.0995 is not below 0.099" in out
+    assert json.loads(run(a, b, "--json")[1])["relative_error"] == pytest.approx(0.0995, rel=1e-3)
+
+
+def test_no_error_is_claimed_relative_to_black(exr, run):
+    black = exr("b.exr", 0 * GREY)
+    assert run(black, black, "--max-error", 1)[0] == 1
+    assert json.loads(run(black, black, "--json")[1])["relative_error"] is None
+
+
 def test_alpha_decides_the_status(exr, run):
     a, b = exr("a.exr", noisy(1), 0.02), exr("b.exr", noisy(2), 0.02)
     p = compare.compare(a, b, errors=True).p
@@ -256,6 +309,7 @@ def test_without_its_package_flip_is_left_out(exr, run, monkeypatch):
         (["a.exr", "a.exr", "-o", "none/d.png"], ["no folder", "none"]),
         (["a.exr"], ["B.{exr,png,jpg}"]),
         (["a.exr", "a.exr", "--max-relmse", "-1"], ["--max-relmse", "-1"]),
+        (["a.exr", "a.exr", "--max-error", "-1"], ["--max-error", "-1"]),
         (["a.exr", "a.exr", "--max-flip", "few"], ["--max-flip", "few"]),
         (["a.exr", "a.exr", "--max-flip", "nan"], ["--max-flip", "nan"]),
         (["a.exr", "a.exr", "--alpha", "2"], ["--alpha", "2"]),

@@ -145,6 +145,27 @@ def test_without_noise_the_error_is_0():
     assert estimate.image_error(np.ones((4, 4, 3)), np.zeros((4, 4, 3))) == (0, 0)
 
 
+def test_a_black_image_has_no_error():
+    """There is nothing to be relative to."""
+    black = np.zeros((4, 4, 3), np.float32)
+    assert np.isnan(estimate.image_error(black, black)).all()
+    assert (estimate.sample_weights(black, black) == 1).all()
+
+
+def test_one_pixel_has_its_relative_error():
+    pixel = np.full((1, 1, 3), 3.0, np.float32)
+    assert estimate.image_error(pixel, 0.09 * pixel).estimate == pytest.approx(0.3 / np.sqrt(3 * (1.01 - 0.03)))
+
+
+def test_a_lamp_in_view_does_not_hide_the_noise_of_the_room():
+    """A tenth of the pixels, and 10^6 times brighter: the others keep their error."""
+    image, variance = normal_image(np.random.default_rng(8), 0.5)
+    room = estimate.image_error(image, variance).estimate
+    lamp = np.arange(64) < 6
+    image[lamp], variance[lamp] = 1e6, 0
+    assert estimate.image_error(image, variance).estimate == pytest.approx(room * np.sqrt(58 / 64), rel=0.05)
+
+
 # ---- where samples go -----------------------------------------------------------------------------------------------
 
 
@@ -172,3 +193,35 @@ def test_weights_have_a_floor():
 
 def test_weights_without_noise_are_even():
     assert (estimate.sample_weights(np.ones((5, 5, 3)), np.zeros((5, 5, 3))) == 1).all()
+
+
+# ---- the unit of radiance -------------------------------------------------------------------------------------------
+
+
+def everything(means, counts):
+    """What is estimated, of replicates (R, 64 * 64, 3): that in units of radiance, and that without a unit."""
+    image, variance = replicates.moments(means, counts)
+    image, variance = image.reshape(64, 64, 3), variance.reshape(64, 64, 3)
+    errors = estimate.standard_error(image, variance, counts.reshape(64, 64))
+    return (image, errors), (estimate.image_error(image, variance), estimate.sample_weights(image, variance))
+
+
+@pytest.mark.parametrize("power", [-90, -66, -40, -4, 4, 40, 66, 110])
+def test_a_power_of_two_scales_every_bit_of_an_estimate(power):
+    """2^-66 is 1.4e-20, and 2^66 7e19."""
+    rng = np.random.default_rng(9)
+    counts = rng.integers(2, 40, 64 * 64).astype(np.int32)
+    means = rng.lognormal(-1, 2, (R, 64 * 64, 3)).astype(np.float32)
+    of_radiance, without = everything(means, counts)
+    scaled_radiance, still_without = everything(np.ldexp(means, power), counts)
+    for here, there in zip(of_radiance, scaled_radiance, strict=True):
+        assert here.dtype == there.dtype == np.float32
+        np.testing.assert_array_equal(np.ldexp(here, power), there)
+    assert without[0] == still_without[0]
+    np.testing.assert_array_equal(without[1], still_without[1])
+
+
+@pytest.mark.parametrize("power", [-110, -130])
+def test_an_image_too_dark_for_float32_has_no_error(power):
+    image, variance = normal_image(np.random.default_rng(10), 0.5)
+    assert np.isnan(estimate.image_error(np.ldexp(image, power), np.ldexp(variance, 2 * power))).all()

@@ -8,7 +8,7 @@ import pytest
 
 import pathjax as pj
 from pathjax import estimate, progressive, runtime, until
-from pathjax.compare import rel_mse
+from pathjax.compare import relative_error
 
 
 @pytest.fixture(scope="module")
@@ -30,8 +30,57 @@ def test_an_error_asked_for_is_the_error_got(cornell, truth):
         results = [pj.render_until(cornell, target, seed=seed) for seed in range(8)]
         assert {r.reason for r in results} == {"target error"}
         assert all(r.error < r.error_bound <= target for r in results)
-        got = np.sqrt(np.mean([rel_mse(r.image, truth) for r in results]))
+        got = np.sqrt(np.mean([relative_error(r.image, truth) ** 2 for r in results]))
         assert 0.8 < got / target < 1.1
+
+
+def lit_by(scene, factor):
+    """The scene with all radiances times `factor`."""
+    values = pj.parameters(scene).items()
+    return pj.with_parameters(scene, {name: factor * value for name, value in values if name.endswith(".radiance")})
+
+
+GLOBE = """
+<bsdf type="diffuse" id="grey"/>
+<shape type="sphere"><ref id="grey"/></shape>
+<shape type="rectangle"><transform name="to_world"><translate z="2"/><scale value="0.5"/></transform>
+  <emitter type="area" id="lamp"><rgb name="radiance" value="9, 5, 2"/></emitter></shape>
+<emitter type="constant" id="sky"><rgb name="radiance" value="0.1, 0.2, 0.3"/></emitter>
+"""
+
+
+@pytest.fixture(scope="module")
+def globe(make_scene):
+    """A lamp that is hidden from the camera in front of a sphere, under a sky of which only the light is seen."""
+    return make_scene(GLOBE, res=16, depth=4, hide="true", origin="0, 0, 4", target="0, 0, 0", fov=40)
+
+
+@pytest.mark.parametrize("power", [-66, -4, 66, 80])
+@pytest.mark.parametrize("name", ["cornell", "globe"])
+def test_a_power_of_two_in_all_lights_scales_the_image_and_changes_nothing_else(request, name, power):
+    """2^-66 is 1.4e-20, and 2^80 1.2e24."""
+    scene = request.getfixturevalue(name)
+    one = pj.render_until(scene, 0.05, spp=2000, seed=3)
+    other = pj.render_until(lit_by(scene, 2.0**power), 0.05, spp=2000, seed=3)
+    np.testing.assert_array_equal(other.image, np.ldexp(one.image, power))
+    np.testing.assert_array_equal(other.standard_error, np.ldexp(one.standard_error, power))
+    np.testing.assert_array_equal(other.samples, one.samples)
+    assert (other.error, other.error_bound) == (one.error, one.error_bound)
+    assert other.reason == one.reason == "target error"
+    assert 16 < one.spp < 2000 and one.samples.max() > one.samples.min()
+
+
+@pytest.mark.parametrize("factor, least_spp", [(0, 16), (1e-34, 16), (1e37, 17)])
+def test_no_target_is_claimed_where_the_error_cannot_be_told(cornell, factor, least_spp):
+    """In the dark, or where float32 underflows; where it overflows in the lamp, the rest is on target first."""
+    scene = lit_by(cornell, factor)
+    result = pj.render_until(scene, 0.1)
+    assert result.reason == "no estimate"
+    assert least_spp <= result.spp < 1000
+    assert np.isfinite(result.image).all() == (factor < 1)
+    # What would end the render anyway does so.
+    assert pj.render_until(scene, 1e-3, spp=32).reason == "spp"
+    assert pj.render_until(scene, 1e-3, time_limit=0.05).reason == "time limit"
 
 
 def test_spp_alone_is_uniform_and_exact(cornell):
