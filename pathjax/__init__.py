@@ -3,7 +3,7 @@
 from pathjax import runtime as _runtime  # noqa: F401  first: sets XLA up before a backend starts
 from pathjax.aovs import render_aovs
 from pathjax.bounces import Bounces, render_bounces
-from pathjax.errors import InputError
+from pathjax.errors import InputError, InputWarning
 from pathjax.gradient import Jacobian, jacobian
 from pathjax.named import parameters, with_parameters
 from pathjax.query import closest_hit
@@ -17,6 +17,7 @@ __all__ = [
     "Fit",
     "GradientCheck",
     "InputError",
+    "InputWarning",
     "Jacobian",
     "RenderResult",
     "Scene",
@@ -40,11 +41,18 @@ def load_scene(file, **parameters) -> Scene:
 
     Raises:
         InputError: names the file, the line, what is wrong and what to do.
+    Warns:
+        InputWarning: nothing in the file emits light.
     """
-    from pathjax import scene
+    import warnings
+
+    from pathjax import emitters, scene
     from pathjax.io import mitsuba_xml
 
-    return scene.build(mitsuba_xml.load(file, **parameters))
+    loaded = scene.build(mitsuba_xml.load(file, **parameters))
+    if dark := emitters.darkness(loaded.emitters):
+        warnings.warn(f"{file}: {dark}, so images of it are black", InputWarning, stacklevel=2)
+    return loaded
 
 
 def __getattr__(name):

@@ -1,4 +1,4 @@
-"""The one exception for mistakes that the user can mend."""
+"""Mistakes that the user can mend: those that end the work, and those with which it goes on."""
 
 
 class InputError(ValueError):
@@ -6,3 +6,7 @@ class InputError(ValueError):
 
     The command line prints the message alone and exits with status 2.
     """
+
+
+class InputWarning(UserWarning):
+    """What is surely not meant, or could not be done beside the work; the command line prints the message alone."""

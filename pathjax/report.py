@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pathjax import bounces, bsdfs, film
+from pathjax import bounces, bsdfs, emitters, film
 from pathjax.named import parameters
 from pathjax.scene import UNBOUNDED, Scene
 from pathjax.shapes import geometry
@@ -22,6 +22,7 @@ def facts(scene: Scene) -> dict:
     max_depth = int(scene.max_depth)
     parts = [part for table in scene.geometry.tables for part in geometry.searched(table)]
     height, width = film.image_shape(scene.film)
+    dark = emitters.darkness(scene.emitters)
     return {
         "file": description.file,
         "image": {"width": width, "height": height, "filter": scene.film.filter, "spp": description.spp},
@@ -55,7 +56,7 @@ def facts(scene: Scene) -> dict:
             name: {"value": np.asarray(value).tolist(), "shape": list(value.shape), "bounds": _bounds(about, name)}
             for name, value in parameters(scene).items()
         },
-        "notes": list(description.notes),
+        "notes": [*description.notes, *([f"{dark}, so images are black"] if dark else [])],
     }
 
 

@@ -1,6 +1,7 @@
 """Parameters by name: what they are called, what they reach, what they refuse."""
 
 import re
+import warnings
 
 import jax
 import jax.numpy as jnp
@@ -247,3 +248,23 @@ def test_float64_is_refused_where_jax_would_cut_it_down(zoo, x64):
         build(zoo.about.description, jnp.float64)
     with x64():
         assert build(zoo.about.description, jnp.float64).camera.origin.dtype == jnp.float64
+
+
+# ---- dark scenes ----------------------------------------------------------------------------------------------------
+
+DARK = '<emitter type="constant"><rgb name="radiance" value="0"/></emitter>'
+
+
+@pytest.mark.parametrize("lights, says", [("", "there is no light"), (DARK, "the radiance of every light is 0")])
+def test_a_file_that_renders_black_is_warned_of(write_scene, lights, says):
+    path = write_scene('<shape type="sphere"/>' + lights)
+    with pytest.warns(pj.InputWarning, match=f"{path}: {says}, so images of it are black"):
+        scene = pj.load_scene(path)
+    assert not pj.render(scene, spp=1).any()
+
+
+def test_a_dark_light_beside_a_bright_one_is_no_news(write_scene):
+    bright = '<shape type="sphere"><emitter type="area"><rgb name="radiance" value="0, 0, 1e-9"/></emitter></shape>'
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        pj.load_scene(write_scene(DARK + bright))

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 
 from pathjax.core.math import at, luminance
@@ -30,6 +31,14 @@ class Choice:
 
     pdf: jax.Array  # (R,)
     cdf: jax.Array  # (R,) ends at 1
+
+
+def darkness(emitters: Emitters) -> str | None:
+    """Why every image is black, in words; None where light may come. Of known values, not of traced ones."""
+    radiances = [table.radiance for table in (emitters.area, emitters.constant) if table is not None]
+    if not radiances:
+        return "there is no light"
+    return None if any(np.asarray(radiance).any() for radiance in radiances) else "the radiance of every light is 0"
 
 
 def choice(emitters: Emitters, strategy: str) -> Choice | None:
