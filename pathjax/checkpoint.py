@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import glob
 import hashlib
 import json
-import os
 import time
+import warnings
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +16,7 @@ import jax
 import numpy as np
 
 from pathjax import film
-from pathjax.errors import InputError
+from pathjax.errors import InputError, InputWarning
 from pathjax.io.files import write_whole
 from pathjax.progressive import State, plan
 from pathjax.replicates import one_if_equal
@@ -59,10 +60,12 @@ class Checkpoint:
 
     def __init__(self, path: str | Path, identity: Mapping[str, str | int]):
         self.path, self.identity = Path(path), dict(identity)
+        self.problem: str | None = None  # why the last state is not in the file
         self._saved, self._cost = 0.0, _FIRST_COST
         # What a killed process left half written.
         for part in self.path.parent.glob(f".{glob.escape(self.path.name)}.*.part"):
-            part.unlink(missing_ok=True)
+            with contextlib.suppress(OSError):
+                part.unlink()
 
     def load(self, fresh: State) -> State:
         """The saved state, or `fresh`, which has the same shapes, where there is no file.
@@ -106,21 +109,27 @@ class Checkpoint:
             arrays = {"means": state.means} | {name: one_if_equal(getattr(state, name)) for name in OF_PIXELS}
         facts = json.dumps({"identity": self.identity, "spp": state.spp, "seconds": state.seconds})
 
-        def write(beside: str) -> None:
-            with open(beside, "wb") as file:
-                np.savez(file, facts=np.array(facts), **arrays)
-                file.flush()
-                os.fsync(file.fileno())
+        try:
+            write_whole(self.path, lambda file: np.savez(file, facts=np.array(facts), **arrays))
+        finally:
+            self._saved = time.perf_counter()
+            if arrays:
+                self._cost = self._saved - started
 
-        write_whole(self.path, write)
-        self._saved = time.perf_counter()
-        if arrays:
-            self._cost = self._saved - started
+    def keep(self, state: State) -> None:
+        """Save; where that fails warn, once for each reason, for the render is worth more than its checkpoint."""
+        earlier, self.problem = self.problem, None
+        try:
+            self.save(state)
+        except Exception as error:
+            self.problem = str(error) or type(error).__name__
+            if self.problem != earlier:
+                warnings.warn(f"{self.problem}; the render goes on without", InputWarning, stacklevel=2)
 
     def save_if_due(self, state: State) -> None:
-        """Save, unless the last time was so lately that it would slow the render down."""
+        """Keep, unless the last time was so lately that it would slow the render down."""
         if time.perf_counter() - self._saved > COST * self._cost:
-            self.save(state)
+            self.keep(state)
 
     def _refusal(self, what: str) -> InputError:
         return InputError(f"{self.path} {what}; delete it, or name another checkpoint")

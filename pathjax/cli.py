@@ -5,34 +5,51 @@ Exit status: 0 done, 1 the work failed (of `compare`: the images differ), 2 the 
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import os
-import sys
 import threading
 import time
+import warnings
 from pathlib import Path
 
 from pathjax.arguments import parser
-from pathjax.errors import InputError
+from pathjax.errors import InputError, InputWarning
+from pathjax.interrupts import Interrupts
+from pathjax.io.files import check_writable
+from pathjax.output import Output, say
 
 DONE, FAILED, WRONG = 0, 1, 2
 
 
 def main(arguments: list[str] | None = None) -> int:
     commands = {"render": _render, "fit": _fit, "info": _info, "bench": _bench, "compare": _compare}
-    options = parser(commands).parse_args(arguments)
-    try:
-        return options.run(options)
-    except InputError as error:
-        print(f"pathjax: {error}", file=sys.stderr)
-        return WRONG
-    except KeyboardInterrupt:
-        print("pathjax: interrupted; nothing was written", file=sys.stderr)
-        return FAILED
-    except BrokenPipeError:
-        sys.stderr.close()
-        return FAILED
+    options, output = parser(commands).parse_args(arguments), Output()
+    with _warnings_as_messages():
+        try:
+            status = options.run(options, output)
+        except InputError as error:
+            say(str(error))
+            return WRONG
+        except KeyboardInterrupt:
+            say("interrupted; nothing was written")
+            return FAILED
+    return FAILED if output.failed else status
+
+
+@contextlib.contextmanager
+def _warnings_as_messages():
+    """Print an InputWarning as a message; never raise it, whatever Python was told to do with warnings."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("default", InputWarning)
+        plain = warnings.showwarning
+
+        def show(message, category, *place):
+            say(str(message)) if issubclass(category, InputWarning) else plain(message, category, *place)
+
+        warnings.showwarning = show
+        yield
 
 
 def _numbers(option: str, name: str, text: str):
@@ -44,12 +61,12 @@ def _numbers(option: str, name: str, text: str):
 
 
 def _load(options):
-    import pathjax
-    from pathjax import runtime
+    from pathjax import named, runtime, scene
+    from pathjax.io import mitsuba_xml
 
     runtime.keep_kernels()
-    scene = pathjax.load_scene(options.scene, **dict(options.defines))
-    return pathjax.with_parameters(scene, {name: _numbers("--set", name, text) for name, text in options.settings})
+    loaded = scene.build(mitsuba_xml.load(options.scene, **dict(options.defines)))
+    return named.with_parameters(loaded, {name: _numbers("--set", name, text) for name, text in options.settings})
 
 
 # ---- render -------------------------------------------------------------------------------------------------------
@@ -59,86 +76,97 @@ def _load(options):
 CHANNELS = {"error": "RGB", "depth": "Z", "normal": "XYZ", "albedo": "RGB"}
 
 
-def _render(options) -> int:
-    output = Path(options.output)
-    if output.suffix.lower() not in (".exr", ".png"):
-        raise InputError(f"{output}: images are written as .exr or .png")
-    if not output.parent.is_dir():
-        raise InputError(f"{output}: there is no folder {output.parent}; make it first")
-    if output.is_dir():
-        raise InputError(f"{output}: is a folder; name a file")
+def _render(options, output: Output) -> int:
+    path = Path(options.output)
+    if path.suffix.lower() not in (".exr", ".png"):
+        raise InputError(f"{path}: images are written as .exr or .png")
+    check_writable(path, [options.checkpoint] if options.checkpoint is not None else [])
 
-    from pathjax import aovs
+    from pathjax import aovs, emitters
+    from pathjax.until import Render
 
     aovs.check_names(options.aov, (*CHANNELS, "bounces"))
-    if options.aov and output.suffix.lower() == ".png":
-        raise InputError(f"{output}: --aov needs an .exr file; a .png holds one image")
+    if options.aov and path.suffix.lower() == ".png":
+        raise InputError(f"{path}: --aov needs an .exr file; a .png holds one image")
     started = time.perf_counter()
     scene = _load(options)
+    if dark := emitters.darkness(scene.emitters):
+        say(f"{options.scene}: {dark}, so the image will be black")
     if "bounces" in options.aov:
         _check_terms(scene, options)
     spp = options.spp
     if spp is None and options.error is None and options.time is None:
         spp = scene.about.description.spp
     loaded = time.perf_counter()
-    result, layers = _rendered(scene, spp, options)
-    _write(output, result, layers, options)
-    pixels_lost = int((~(abs(result.image) < math.inf)).any(-1).sum())
-    if pixels_lost:
-        print(f"pathjax: {pixels_lost} pixels met a sample that is not finite, and hold nan", file=sys.stderr)
-    interrupted = result.reason == "interrupted"
-    missed = interrupted or (options.error is not None and result.reason != "target error")
-    if missed:
-        print(f"pathjax: {_reached(result, pixels_lost, output, spp, options)}", file=sys.stderr)
-    if options.json:
-        report = {
-            "output": str(output),
-            "width": result.image.shape[1],
-            "height": result.image.shape[0],
-            "spp": result.spp,
-            "fewest_spp": int(result.samples.min()),
-            "most_spp": int(result.samples.max()),
-            "seed": options.seed,
-            "load_seconds": loaded - started,
-            "compile_seconds": result.compile_seconds,
-            "run_seconds": result.run_seconds,
-            "error": _known(result.error),
-            "error_bound": _known(result.error_bound),
-            "reason": result.reason,
-            "not_finite_pixels": pixels_lost,
-            "interrupted": interrupted,
-        }
-        print(json.dumps(report))
-    return FAILED if missed else DONE
+    render = Render(scene, options.error, options.time, spp, options.seed, options.strategy, options.checkpoint)
+    first_hits = _compiled(render, spp, options)
+    # From the first sample to the written image a signal only ends the rendering.
+    with Interrupts() as interrupts:
+        result = render.run(progress=True)
+        layers = _layers(scene, result, first_hits, options, interrupts, output)
+        place = output.file(path, lambda place: _write(place, result, layers, options))
+        pixels_lost = int((~(abs(result.image) < math.inf)).any(-1).sum())
+        if pixels_lost:
+            say(f"{pixels_lost} pixels met a sample that is not finite, and hold nan")
+        if not dark and not result.image.any():
+            say(f"every pixel is black: none of the paths met a light (max_depth {int(scene.max_depth)})")
+        interrupted = result.reason == "interrupted"
+        missed = interrupted or (options.error is not None and result.reason != "target error")
+        saved = render.checkpoint is not None and render.checkpoint.problem is None
+        if missed:
+            say(_reached(result, pixels_lost, place, spp, saved, options))
+        if options.json:
+            report = {
+                "output": None if place is None else str(place),
+                "width": result.image.shape[1],
+                "height": result.image.shape[0],
+                "spp": result.spp,
+                "fewest_spp": int(result.samples.min()),
+                "most_spp": int(result.samples.max()),
+                "seed": options.seed,
+                "load_seconds": loaded - started,
+                "compile_seconds": result.compile_seconds,
+                "run_seconds": result.run_seconds,
+                "error": _known(result.error),
+                "error_bound": _known(result.error_bound),
+                "reason": result.reason,
+                "not_finite_pixels": pixels_lost,
+                "interrupted": interrupted,
+            }
+            output.text(json.dumps(report))
+    return FAILED if missed or (options.checkpoint is not None and not saved) else DONE
 
 
-def _rendered(scene, spp: int | None, options):
-    """RenderResult, and the channels of the output variables by name."""
+def _compiled(render, spp: int | None, options) -> dict:
+    """Compile the render; returns the images of what is seen first, by name."""
     from rich.console import Console
 
     from pathjax import aovs
-    from pathjax.until import Render
 
-    render = Render(scene, options.error, options.time, spp, options.seed, options.strategy, options.checkpoint)
     first_hits, images = [name for name in options.aov if name in aovs.NAMES], {}
     try:
         with Console(stderr=True).status("compiling"):
             _interruptible(render.compile)
             if first_hits:
-                images = _interruptible(lambda: aovs.render_aovs(scene, first_hits, spp or aovs.MAX_SPP, options.seed))
+                spp = spp or aovs.MAX_SPP
+                images = _interruptible(lambda: aovs.render_aovs(render.scene, first_hits, spp, options.seed))
     except KeyboardInterrupt:
         # The compiler cannot be stopped, and aborts the process if the interpreter ends under it.
-        print("pathjax: interrupted; nothing was written", file=sys.stderr, flush=True)
+        say("interrupted; nothing was written")
         os._exit(FAILED)
-    result = render.run(progress=True)
-    images["error"] = result.standard_error
+    return images
+
+
+def _layers(scene, result, first_hits: dict, options, interrupts: Interrupts, output: Output) -> dict:
+    """The channels of the output variables by name."""
+    images = first_hits | {"error": result.standard_error}
     layers = {}
     for name in options.aov:
         if name == "bounces":
-            layers |= _terms(scene, result, options)
+            layers |= _terms(scene, result, options, interrupts, output)
         else:
             layers |= {f"{name}.{channel}": images[name][..., i] for i, channel in enumerate(CHANNELS[name])}
-    return result, layers
+    return layers
 
 
 def _check_terms(scene, options) -> None:
@@ -153,7 +181,7 @@ def _check_terms(scene, options) -> None:
         )
 
 
-def _terms(scene, result, options) -> dict:
+def _terms(scene, result, options, interrupts: Interrupts, output: Output) -> dict:
     """Channels of the terms of the series, of the same samples as the image, and of their standard errors."""
     import numpy as np
 
@@ -162,10 +190,12 @@ def _terms(scene, result, options) -> dict:
     try:
         if result.reason == "interrupted":
             raise KeyboardInterrupt
-        bounces = render_bounces(scene, int(scene.max_depth), result.samples, options.seed, options.strategy)
-        images = {"": np.asarray(bounces.terms), "error.": bounces.standard_error}
-    except KeyboardInterrupt:
-        print("pathjax: interrupted; the bounces are left out", file=sys.stderr)
+        with interrupts.let_through():
+            bounces = render_bounces(scene, int(scene.max_depth), result.samples, options.seed, options.strategy)
+            images = {"": np.asarray(bounces.terms), "error.": bounces.standard_error}
+    except (KeyboardInterrupt, Exception) as error:  # the image is there, whatever this second render ran out of
+        output.failed = True
+        say(f"{'interrupted' if isinstance(error, KeyboardInterrupt) else error}; the bounces are left out")
         return {}
     return {
         f"bounces.{k}.{what}{channel}": term[..., i]
@@ -175,21 +205,21 @@ def _terms(scene, result, options) -> dict:
     }
 
 
-def _reached(result, pixels_lost: int, output: Path, spp: int | None, options) -> str:
+def _reached(result, pixels_lost: int, place: Path | None, spp: int | None, saved: bool, options) -> str:
     """What there is, where it is not what was asked for."""
     if result.reason == "no estimate":
         why = f"{pixels_lost} of its pixels are not finite" if pixels_lost else "it is black, or nearly so"
         return (
-            f"{output} holds {result.spp:.4g} spp, and its error cannot be told, for {why}; float32 has room for "
-            "radiances from 1e-31 to 1e36"
+            f"{place or 'the image'} holds {result.spp:.4g} spp, and its error cannot be told, for {why}; float32 has "
+            "room for radiances from 1e-31 to 1e36"
         )
     ended = {"interrupted": "interrupted", "time limit": "out of time", "spp": "out of samples"}[result.reason]
-    text = f"{ended}; {output} holds {result.spp:.4g}{f' of {spp}' if spp else ''} spp"
+    text = f"{ended}; {place or 'the image'} holds {result.spp:.4g}{f' of {spp}' if spp else ''} spp"
     if options.error is not None:
         bound = _known(result.error_bound)
         reached = "unknown" if bound is None else f"at most {bound:.3g}"
         text += f", and its error is {reached}, not yet {options.error:g}"
-    if options.checkpoint is not None and result.reason == "interrupted":
+    if saved and result.reason == "interrupted":
         text += "; the same command goes on from there"
     return text
 
@@ -219,12 +249,12 @@ def _interruptible(call):
     return result
 
 
-def _write(output: Path, result, layers, options) -> None:
+def _write(path: Path, result, layers, options) -> None:
     from pathjax import __version__
     from pathjax.io import image as files
 
-    if output.suffix.lower() == ".png":
-        files.write_png(output, result.image)
+    if path.suffix.lower() == ".png":
+        files.write_png(path, result.image)
         return
     header = {
         "pathjax.version": __version__,
@@ -234,14 +264,15 @@ def _write(output: Path, result, layers, options) -> None:
         "pathjax.seed": options.seed,
     }
     channels = {name: result.image[..., i] for i, name in enumerate("RGB")}
-    files.write_exr(output, channels | layers, header)
+    files.write_exr(path, channels | layers, header)
 
 
 # ---- fit ----------------------------------------------------------------------------------------------------------
 
 
-def _fit(options) -> int:
+def _fit(options, output: Output) -> int:
     from rich.console import Console
+    from rich.markup import escape
 
     from pathjax import inverse
     from pathjax.inverse import report
@@ -249,9 +280,9 @@ def _fit(options) -> int:
     from pathjax.io import image as files
     from pathjax.io.files import write_text
 
-    prefix = Path(options.output)
-    if not prefix.parent.is_dir():
-        raise InputError(f"{prefix}: there is no folder {prefix.parent}; make it first")
+    table, picture = (Path(f"{Path(options.output)}{suffix}") for suffix in (".json", ".png"))
+    for path in (table, picture):
+        check_writable(path, [options.target, options.scene])
     start, names = {}, []
     for text in options.params:
         name, equals, value = text.partition("=")
@@ -264,27 +295,30 @@ def _fit(options) -> int:
     with console.status("compiling") as status:
 
         def show(entry):
-            status.update(step_text(entry))
+            status.update(escape(step_text(entry)))
 
         fit = inverse.fit(scene, target, names, start=start, spp=options.spp, seed=options.seed, progress=show)
     facts = {"scene": str(options.scene), "target": str(options.target), "spp": options.spp, "seed": options.seed}
     facts |= report.facts(fit)
-    write_text(prefix.with_name(prefix.name + ".json"), json.dumps(facts, indent=1) + "\n")
-    if fit.images:
-        files.write_png(prefix.with_name(prefix.name + ".png"), report.picture(fit, [target]))
-    print(json.dumps(facts) if options.json else report.text(fit))
+    with Interrupts():
+        output.file(table, lambda path: write_text(path, json.dumps(facts, indent=1) + "\n"))
+        if fit.images:
+            output.file(picture, lambda path: files.write_png(path, report.picture(fit, [target])))
+        output.text(json.dumps(facts) if options.json else report.text(fit))
     return DONE if fit.converged else FAILED
 
 
 # ---- compare ------------------------------------------------------------------------------------------------------
 
 
-def _compare(options) -> int:
+def _compare(options, output: Output) -> int:
     from pathjax import compare
     from pathjax.io import image as files
 
-    if options.output and Path(options.output).suffix.lower() != ".png":
-        raise InputError(f"{options.output}: the picture is written as .png")
+    if options.output:
+        if Path(options.output).suffix.lower() != ".png":
+            raise InputError(f"{options.output}: the picture is written as .png")
+        check_writable(options.output, [options.image, options.reference])
     comparison = compare.compare(options.image, options.reference, options.errors)
     if options.max_flip is not None and comparison.flip is None:
         raise InputError("--max-flip: FLIP needs its authors' package: pip install 'pathjax[flip]'")
@@ -300,28 +334,28 @@ def _compare(options) -> int:
     lines = [compare.text(comparison), *(f"the images differ: {reason}" for reason in differ)]
     if options.output:
         picture, scale = compare.picture(comparison)
-        files.write_png(options.output, picture)
-        lines.insert(1, f"{options.output} shows differences of {scale:.3g} in full colour")
+        place = output.file(options.output, lambda path: files.write_png(path, picture))
+        lines.insert(1, f"{place} shows differences of {scale:.3g} in full colour")
     facts = {"image": options.image, "reference": options.reference, **compare.facts(comparison), "differ": differ}
-    print(json.dumps(facts) if options.json else "\n".join(lines))
+    output.text(json.dumps(facts) if options.json else "\n".join(lines))
     return FAILED if differ else DONE
 
 
 # ---- info and bench -----------------------------------------------------------------------------------------------
 
 
-def _info(options) -> int:
+def _info(options, output: Output) -> int:
     from pathjax import report
 
     scene = _load(options)
     facts = report.facts(scene)
     if options.tail is not None:
         facts["tail"] = report.tail_facts(scene, options.tail)
-    print(json.dumps(facts) if options.json else report.text(facts))
+    output.text(json.dumps(facts) if options.json else report.text(facts))
     return DONE
 
 
-def _bench(options) -> int:
+def _bench(options, output: Output) -> int:
     from pathjax.bench import bench
 
-    return bench.run(options)
+    return bench.run(options, output)

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import math
 import operator
-import signal
-import threading
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,6 +17,7 @@ from pathjax import estimate, film, progressive, replicates
 from pathjax.checkpoint import Checkpoint, identity
 from pathjax.errors import InputError
 from pathjax.integrators import path
+from pathjax.interrupts import Interrupts
 from pathjax.scene import Scene
 
 # Samples of every pixel before their number may differ.
@@ -78,9 +77,10 @@ def render_until(
         progress: show a bar on stderr.
     Raises:
         InputError: an argument is out of range, or nothing to stop at is given; a checkpoint of another render, a
-            damaged one, or one that cannot be written (before rendering starts, where that can be known).
-        KeyboardInterrupt: by Ctrl-C while the kernel compiles. Later, Ctrl-C and SIGTERM end the render, which returns
-            what is done (in the main thread, where alone Python hears them).
+            damaged one, or one that cannot be written. Once rendering has begun that is an InputWarning: the image is
+            returned, and the last checkpoint that was written is intact.
+        KeyboardInterrupt: by Ctrl-C while the kernel compiles. Later, Ctrl-C, SIGTERM and SIGHUP end the render, which
+            returns what is done (in the main thread, where alone Python hears them).
     """
     render = Render(scene, target_error, time_limit, spp, seed, strategy, checkpoint)
     render.compile()
@@ -114,13 +114,13 @@ class Render:
         self.compile_seconds += time.perf_counter() - started
 
     def run(self, progress: bool = False) -> RenderResult:
-        with _Interrupts() as interrupts, _bar(progress) as show:
+        with Interrupts() as interrupts, _bar(progress) as show:
             reason, found = self._run(interrupts, show)
             with ThreadPoolExecutor(1) as beside:
-                save = beside.submit(self.checkpoint.save, self.state) if self.checkpoint is not None else None
+                saved = beside.submit(self.checkpoint.keep, self.state) if self.checkpoint is not None else None
                 result = self._result(reason, found or self._evaluate())
-                if save is not None:
-                    save.result()
+                if saved is not None:
+                    saved.result()
         return result
 
     def _run(self, interrupts, show) -> tuple[str, tuple | None]:
@@ -200,35 +200,12 @@ def _next_spp(spp: int, error: estimate.ImageError, target: float | None) -> int
     return spp + math.ceil(spp * (growth - 1) / replicates.COUNT) * replicates.COUNT
 
 
-class _Interrupts:
-    """Within it Ctrl-C and SIGTERM are only noted, so that no state is left half changed; a second one acts as ever."""
-
-    heard = False
-
-    def __enter__(self):
-        self._earlier = {}
-        if threading.current_thread() is threading.main_thread():
-            for number in (signal.SIGINT, signal.SIGTERM):
-                if signal.getsignal(number) != signal.SIG_IGN:
-                    self._earlier[number] = signal.signal(number, self._hear)
-        return self
-
-    def _hear(self, number, frame):
-        self.heard = True
-        self._restore()
-
-    def __exit__(self, *_):
-        self._restore()
-
-    def _restore(self):
-        while self._earlier:
-            number, handler = self._earlier.popitem()
-            signal.signal(number, signal.SIG_DFL if handler is None else handler)
-
-
 @contextmanager
 def _bar(wanted: bool) -> Iterator:
-    """A function (Render, error at the end of the last round) that shows how far it is."""
+    """A function (Render, error at the end of the last round) that shows how far it is.
+
+    Nothing that goes wrong with the display ends the render.
+    """
     if not wanted:
         yield lambda *_: None
         return
@@ -236,17 +213,24 @@ def _bar(wanted: bool) -> Iterator:
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
     columns = TextColumn("rendering"), BarColumn(), TextColumn("{task.fields[status]}"), TimeRemainingColumn()
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task("", total=1.0, status="")
+    bar = Progress(*columns, console=Console(stderr=True), transient=True)
+    task = bar.add_task("", total=1.0, status="")
 
-        def show(render: Render, error: estimate.ImageError) -> None:
-            spp = render.state.count.mean()
-            status = f"{spp:.4g} spp"
-            if math.isfinite(error.estimate):
-                status += f"  error {error.estimate:.2%}"
+    def show(render: Render, error: estimate.ImageError) -> None:
+        spp = render.state.count.mean()
+        status = f"{spp:.4g} spp"
+        if math.isfinite(error.estimate):
+            status += f"  error {error.estimate:.2%}"
+        with suppress(Exception):
             bar.update(task, completed=_share_done(render, spp, error), status=status)
 
+    with suppress(Exception):
+        bar.start()
+    try:
         yield show
+    finally:
+        with suppress(Exception):
+            bar.stop()
 
 
 def _share_done(render: Render, spp: float, error: estimate.ImageError) -> float:

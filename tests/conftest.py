@@ -34,9 +34,12 @@ ROUNDING = 1e-5
 
 @pytest.fixture(scope="session", autouse=True)
 def interrupts_are_heard():
-    """Shells make what they start in the background deaf to Ctrl-C, which some tests send."""
-    if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
+    """What shells and other programs start in the background may be deaf to signals that some tests send."""
+    for number, handler in ((signal.SIGINT, signal.default_int_handler), (signal.SIGTERM, signal.SIG_DFL)):
+        if signal.getsignal(number) == signal.SIG_IGN:
+            signal.signal(number, handler)
+    if hasattr(signal, "pthread_sigmask"):
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, (signal.SIGINT, signal.SIGTERM))
 
 
 @pytest.fixture(scope="session")

@@ -243,24 +243,43 @@ def test_unwritable_places_are_noticed_before_rendering(cornell, tmp_path, monke
             pj.render_until(cornell, spp=4, checkpoint=tmp_path / "locked" / "run.npz")
 
 
-def test_a_full_disk_leaves_the_last_checkpoint(cornell, undisturbed, tmp_path, monkeypatch):
+def test_a_full_disk_leaves_the_last_checkpoint_and_costs_no_image(cornell, undisturbed, tmp_path, monkeypatch):
     file, saves = tmp_path / "run.npz", iter(range(10**6))
 
     def savez(stream, plain=np.savez, **arrays):
-        if next(saves) == 6:
+        if next(saves) >= 6:
             stream.write(b"PK")
             raise OSError(errno.ENOSPC, "No space left on device")
         plain(stream, **arrays)
 
     monkeypatch.setattr(np, "savez", savez)
     monkeypatch.setattr(checkpoint, "COST", 0)
-    with pytest.raises(pj.InputError, match="run.npz: cannot be written: .*No space left"):
-        pj.render_until(cornell, **HOW, checkpoint=file)
+    with pytest.warns(pj.InputWarning, match="run.npz: cannot be written: No space left") as warned:
+        same(pj.render_until(cornell, **HOW, checkpoint=file), undisturbed)
+    assert len(warned) == 1
+    assert next(saves) > 8  # it was tried again
+    monkeypatch.undo()
     assert [path.name for path in tmp_path.iterdir()] == ["run.npz"]
     with np.load(file) as saved:
         assert 0 < saved["count"].min() < undisturbed.samples.min()
         assert json.loads(str(saved["facts"]))["seconds"] > 0
     same(pj.render_until(cornell, **HOW, checkpoint=file), undisturbed)
+
+
+def test_a_failure_that_passes_costs_nothing(cornell, undisturbed, tmp_path, monkeypatch):
+    saves = iter(range(10**6))
+
+    def savez(stream, plain=np.savez, **arrays):
+        if 3 <= next(saves) < 6:
+            raise MemoryError
+        plain(stream, **arrays)
+
+    monkeypatch.setattr(np, "savez", savez)
+    monkeypatch.setattr(checkpoint, "COST", 0)
+    with pytest.warns(pj.InputWarning, match="MemoryError; the render goes on without"):
+        same(pj.render_until(cornell, **HOW, checkpoint=tmp_path / "run.npz"), undisturbed)
+    monkeypatch.setattr(progressive, "compile", lambda *_: lambda *_: pytest.fail("it rendered"))
+    same(pj.render_until(cornell, **HOW, checkpoint=tmp_path / "run.npz"), undisturbed)
 
 
 def test_saving_takes_a_small_share_of_the_time(cornell, tmp_path, monkeypatch):

@@ -1,22 +1,30 @@
 """The command line: exit status, messages, files. Most of it in this process, signals in one of its own."""
 
+import errno
+import io
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 
 import numpy as np
 import pytest
+import trimesh
 
 import pathjax as pj
-from pathjax import cli
-from pathjax.io.image import linear_to_srgb, read_exr, write_exr
+from pathjax import bounces, cli, inverse, until
+from pathjax.interrupts import SIGNALS
+from pathjax.io import image
+from pathjax.io.image import linear_to_srgb, read_exr, read_rgb, write_exr, write_png
 
 FURNACE = "scenes/furnace.xml"
 SMALL = ("-D", "res=8")
 
+sends_signals = pytest.mark.skipif(sys.platform == "win32", reason="sends SIGINT")
 PIPES = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
 
 
@@ -237,6 +245,209 @@ def test_bounces_are_channels_that_add_up_to_the_image(run, tmp_path):
         assert (channels[f"bounces.2.error.{c}"] > 0).all()
 
 
+# ---- nothing is lost ------------------------------------------------------------------------------------------------
+
+# A byte that no UTF-8 holds, as Python has it in arguments and names of files.
+BYTE = "\udcff"
+
+
+@pytest.fixture
+def meanwhile(monkeypatch):
+    """(what happens after the last sample, before anything is written)."""
+
+    def install(act, plain=until.Render.run):
+        def run(*arguments, **keywords):
+            result = plain(*arguments, **keywords)
+            act()
+            return result
+
+        monkeypatch.setattr(until.Render, "run", run)
+
+    return install
+
+
+def fill_disk(path):
+    """What is written beside `path`, to be renamed, goes to a full disk."""
+    (path.parent / f".{path.name}.{os.getpid()}.part").symlink_to("/dev/full")
+
+
+@pytest.mark.parametrize(
+    "happens, says",
+    [
+        (lambda path: shutil.rmtree(path.parent), "there is no folder"),
+        (lambda path: path.mkdir(), "is a folder"),
+        pytest.param(
+            fill_disk, "No space left", marks=pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no /dev/full")
+        ),
+    ],
+)
+@pytest.mark.parametrize("name", ["a.exr", "a.png"])
+def test_an_image_that_cannot_go_where_it_was_asked_for_goes_to_the_current_folder(
+    run, root, tmp_path, monkeypatch, meanwhile, happens, says, name
+):
+    (tmp_path / "there").mkdir()
+    monkeypatch.chdir(tmp_path)
+    asked = tmp_path / "there" / name
+    arguments = ("render", root / FURNACE, *SMALL, "--spp", 4, "--json", "-o")
+    assert run(*arguments, asked)[0] == 0
+    expected = asked.read_bytes()
+    asked.unlink()
+    meanwhile(lambda: happens(asked))
+    status, out, err = run(*arguments, asked)
+    assert status == 1
+    assert f"{asked}: " in err and says in err and f"{tmp_path / name} was written instead" in err
+    assert json.loads(out)["output"] == str(tmp_path / name)
+    assert (tmp_path / name).read_bytes() == expected
+
+
+def test_an_image_that_fits_nowhere_is_said_to_be_lost(run, root, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    monkeypatch.setattr(os, "replace", lambda *_: (_ for _ in ()).throw(OSError(errno.EIO, "Input/output error")))
+    status, out, err = run("render", root / FURNACE, *SMALL, "-o", tmp_path / "a.exr", "--spp", 4, "--json")
+    assert (status, json.loads(out)["output"]) == (1, None)
+    assert "Input/output error" in err and "it is lost" in err
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_full_disk_under_the_checkpoint_costs_no_image(run, tmp_path, monkeypatch):
+    saves = iter(range(10**6))
+
+    def savez(stream, plain=np.savez, **arrays):
+        if next(saves):
+            raise OSError(errno.ENOSPC, "No space left on device")
+        plain(stream, **arrays)
+
+    monkeypatch.setattr(np, "savez", savez)
+    files = ("-o", tmp_path / "a.exr", "--checkpoint", tmp_path / "run.npz")
+    status, _, err = run("render", FURNACE, *SMALL, *files, "--spp", 4)
+    assert status == 1
+    assert (
+        err.strip()
+        == f"pathjax: {tmp_path}/run.npz: cannot be written: No space left on device; the render goes on without"
+    )
+    expected = pj.render_until(pj.load_scene(FURNACE, res=8), spp=4).image
+    np.testing.assert_array_equal(read_rgb(tmp_path / "a.exr"), expected)
+
+
+def test_names_that_are_not_utf8(run, root, write_scene, tmp_path):
+    """Of the scene, its folder, texture and meshes, the image and the checkpoint."""
+    folder = tmp_path / f"d{BYTE}"
+    folder.mkdir()
+    write_png(folder / f"t{BYTE}.png", np.full((2, 2, 3), 0.5))
+    mesh = trimesh.creation.box()
+    for kind in ("obj", "ply", "stl", "glb"):
+        with open(folder / f"m{BYTE}.{kind}", "wb") as file:
+            exported = mesh.export(file_type=kind)
+            file.write(exported.encode() if isinstance(exported, str) else exported)
+    shapes = "".join(
+        f'<shape type="{kind}"><string name="filename" value="m$byte.{kind}"/></shape>'
+        for kind in ("obj", "ply", "stl", "glb")
+    )
+    texture = '<texture type="bitmap" name="reflectance"><string name="filename" value="t$byte.png"/></texture>'
+    picture = f'<shape type="rectangle"><bsdf type="diffuse">{texture}</bsdf></shape>'
+    scene = folder / f"s{BYTE}.xml"
+    shutil.copy(write_scene(shapes + picture + '<emitter type="constant"/>'), scene)
+    assert run("info", scene, "-D", f"byte={BYTE}")[0] == 0
+
+    shutil.copy(root / FURNACE, scene)
+    files = ("-o", folder / f"o{BYTE}.exr", "--checkpoint", folder / f"c{BYTE}.npz")
+    for _ in range(2):  # and again, from the checkpoint
+        status, out, err = run("render", scene, *SMALL, *files, "--spp", 4, "--json")
+        assert status == 0, err
+        assert json.loads(out)["output"] == str(files[1])
+    channels, header = read_exr(files[1])
+    assert header["pathjax.scene"] == str(scene).replace(BYTE, r"\udcff")
+    assert run("compare", files[1], files[1], "-o", folder / f"p{BYTE}.png")[0] == 0
+    assert {f"{x}{BYTE}{end}" for x, end in (("o", ".exr"), ("c", ".npz"), ("p", ".png"))} <= set(os.listdir(folder))
+
+
+def test_names_that_are_not_utf8_in_messages(refused, tmp_path):
+    refused("render", f"{BYTE}.xml", "-o", tmp_path / "a.exr", says=[r"\udcff.xml: no such file"])
+    refused("render", FURNACE, "-D", f"{BYTE}=1", "-o", tmp_path / "a.exr", says=[r"\udcff"])
+    refused("render", FURNACE, "--set", f"{BYTE}=1", "-o", tmp_path / "a.exr", says=[r"\udcff"])
+    refused("render", FURNACE, "-o", tmp_path / f"{BYTE}" / "a.exr", says=[r"there is no folder"])
+
+
+@sends_signals
+@pytest.mark.parametrize("number", SIGNALS)
+def test_a_signal_while_the_image_is_written_costs_nothing(run, tmp_path, monkeypatch, number):
+    earlier = signal.signal(number, signal.default_int_handler)
+
+    def write(*arguments, plain=image.write_exr):
+        signal.raise_signal(number)
+        plain(*arguments)
+
+    monkeypatch.setattr(image, "write_exr", write)
+    try:
+        assert run("render", FURNACE, *SMALL, "-o", tmp_path / "a.exr", "--spp", 4)[0] == 0
+    finally:
+        signal.signal(number, earlier)
+    assert set(read_exr(tmp_path / "a.exr")[0]) == {"R", "G", "B"}
+
+
+@pytest.mark.parametrize(
+    "error, says", [(KeyboardInterrupt, "interrupted"), (MemoryError("out of memory"), "out of memory")]
+)
+def test_bounces_that_fail_cost_no_image(run, tmp_path, monkeypatch, error, says):
+    def fail(*_):
+        raise error
+
+    monkeypatch.setattr(bounces, "render_bounces", fail)
+    arguments = ("-D", "max_depth=3", "--aov", "error,bounces", "--spp", 4)
+    status, _, err = run("render", FURNACE, *SMALL, "-o", tmp_path / "a.exr", *arguments)
+    assert status == 1
+    assert f"{says}; the bounces are left out" in err
+    assert set(read_exr(tmp_path / "a.exr")[0]) == {"R", "G", "B", "error.R", "error.G", "error.B"}
+
+
+def test_a_terminal_that_lacks_letters_shows_their_codes(run, root, tmp_path, monkeypatch):
+    scene = tmp_path / "a.xml"
+    scene.write_text((root / FURNACE).read_text().replace('"wall"', '"weiß"'), encoding="utf-8")
+    shown = io.BytesIO()
+    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(shown, "ascii"))
+    assert run("info", scene)[0] == 0
+    assert rb"wei\xdf.reflectance" in shown.getvalue()
+
+
+# ---- dark scenes ----------------------------------------------------------------------------------------------------
+
+
+BALL = '<shape type="sphere"/>'
+
+
+@pytest.mark.parametrize(
+    "lights, arguments, says",
+    [
+        ("", (), "there is no light"),
+        ('<emitter type="constant"><rgb name="radiance" value="0"/></emitter>', (), "the radiance of every light is 0"),
+        ('<emitter type="constant" id="sky"/>', ("--set", "sky.radiance=0"), "the radiance of every light is 0"),
+    ],
+)
+def test_a_scene_without_light_is_told(run, write_scene, tmp_path, lights, arguments, says):
+    scene = write_scene(BALL + lights, res=4)
+    status, _, err = run("render", scene, *arguments, "-o", tmp_path / "a.exr")
+    assert status == 0
+    assert err.strip() == f"pathjax: {scene}: {says}, so the image will be black"
+    assert f"note        {says}, so images are black" in run("info", scene, *arguments)[1]
+
+
+def test_a_light_that_was_set_is_one(run, write_scene, tmp_path):
+    scene = write_scene(BALL + '<emitter type="constant" id="sky"><rgb name="radiance" value="0"/></emitter>', res=4)
+    status, _, err = run("render", scene, "--set", "sky.radiance=1", "-o", tmp_path / "a.exr")
+    assert (status, err.strip()) == (0, "")
+    assert "black" not in run("info", scene, "--set", "sky.radiance=1")[1]
+
+
+def test_light_that_is_never_met_is_told(run, write_scene, tmp_path):
+    """The camera is in a closed box, the light outside."""
+    box = '<shape type="cube"><transform name="to_world"><scale value="9"/></transform><bsdf type="twosided">'
+    scene = write_scene(f'{box}<bsdf type="diffuse"/></bsdf></shape><emitter type="constant"/>', res=4, depth=3)
+    status, _, err = run("render", scene, "-o", tmp_path / "a.exr")
+    assert status == 0
+    assert err.strip() == "pathjax: every pixel is black: none of the paths met a light (max_depth 3)"
+
+
 # ---- what is refused ------------------------------------------------------------------------------------------------
 
 
@@ -385,6 +596,41 @@ def test_fit_prints_a_table_and_writes_its_files(run, target, tmp_path):
     z = (np.array(facts["values"]["wall.reflectance"]) - [0.3, 0.5, 0.7]) / facts["standard_errors"]["wall.reflectance"]
     assert np.abs(z).max() < 4.5
     assert (tmp_path / "f.png").stat().st_size > 0
+
+
+def test_a_fit_keeps_its_values_whatever_happens_to_its_files(run, root, target, tmp_path, monkeypatch):
+    """The names hold what markup, terminals and UTF-8 do not take; the folder is gone when the fit ends."""
+    scene, there = tmp_path / f"{BYTE}.xml", tmp_path / "there"
+    scene.write_text((root / FURNACE).read_text().replace('"wall"', '"weiß[/b]"'), encoding="utf-8")
+    there.mkdir()
+    monkeypatch.chdir(tmp_path)
+
+    def fit(*arguments, plain=inverse.fit, **keywords):
+        found = plain(*arguments, **keywords)
+        there.rmdir()
+        return found
+
+    monkeypatch.setattr(inverse, "fit", fit)
+    shown = io.BytesIO()
+    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(shown, "ascii"))
+    param = ("--param", "weiß[/b].reflectance=0.6")
+    status, _, err = run("fit", scene, target, *SMALL, *param, "-o", there / f"f{BYTE}")
+    assert status == 1
+    assert rb"wei\xdf[/b].reflectance.r" in shown.getvalue()
+    for name in (f"f{BYTE}.json", f"f{BYTE}.png"):
+        assert rf"{tmp_path}/{name}".replace(BYTE, r"\udcff") + " was written instead" in err
+    facts = json.loads((tmp_path / f"f{BYTE}.json").read_text())
+    assert facts["converged"] and facts["values"].keys() == {"weiß[/b].reflectance"}
+
+
+def test_a_command_does_not_overwrite_what_it_reads(refused, target, tmp_path):
+    picture = tmp_path / "target.png"
+    write_png(picture, np.full((8, 8, 3), 0.5))
+    says = [f"{picture}: is read by the same command"]
+    refused("fit", FURNACE, picture, *SMALL, "--param", "wall.reflectance", "-o", tmp_path / "target", says=says)
+    refused("compare", picture, target, "-o", picture, says=says)
+    both = tmp_path / "a.exr"
+    refused("render", FURNACE, *SMALL, "-o", both, "--checkpoint", both, says=[f"{both}: is read by the same command"])
 
 
 def test_fit_as_json(run, target, tmp_path):
@@ -557,7 +803,6 @@ def interrupt(root):
 
 # Ctrl-C is to be heard within a second; half a second more for a busy machine to write and leave.
 SOON = 1.5
-sends_signals = pytest.mark.skipif(sys.platform == "win32", reason="sends SIGINT")
 
 
 @sends_signals
@@ -669,6 +914,26 @@ def test_a_cache_of_the_users_choice_is_used_instead(counted, tmp_path):
 
 
 @linux
-def test_a_cache_that_cannot_be_written_stops_no_render(counted, tmp_path):
+@pytest.mark.parametrize("name", ["file", BYTE])
+def test_a_cache_that_cannot_be_written_stops_no_render(counted, tmp_path, name):
     (tmp_path / "file").write_text("")
-    assert end(counted(XDG_CACHE_HOME=tmp_path / "file"))[1] == 0
+    assert end(counted(XDG_CACHE_HOME=tmp_path / name))[1] == 0
+
+
+@linux
+def test_a_full_cache_disk_stops_no_render_and_keeps_no_halves(counted, tmp_path):
+    import resource
+
+    cache, limits = tmp_path / "cache", resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 15, limits[1]))  # of the child; its kernel is larger
+    try:
+        started = counted(XDG_CACHE_HOME=cache)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    _, found, image = end(started)
+    assert found == 0
+    assert any(path.stat().st_size == 1 << 15 for path in cache.rglob("*-cache"))
+    end(counted(XDG_CACHE_HOME=cache))
+    wanted, found, again = end(counted(XDG_CACHE_HOME=cache))
+    assert wanted == found > 0
+    assert again == image

@@ -1,6 +1,8 @@
 """Renders that stop by themselves: what they claim, when they stop, and that they are unbiased."""
 
+import io
 import signal
+import sys
 import threading
 
 import numpy as np
@@ -9,6 +11,7 @@ import pytest
 import pathjax as pj
 from pathjax import estimate, progressive, runtime, until
 from pathjax.compare import relative_error
+from pathjax.interrupts import SIGNALS
 
 
 @pytest.fixture(scope="module")
@@ -179,14 +182,17 @@ def after_calls(monkeypatch):
     return install
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", SIGNALS)
 def test_signals_end_a_render_with_what_is_done(cornell, after_calls, number):
-    earlier = signal.getsignal(number)
-    after_calls(3 * runtime.calls_at_once() - 1, lambda: signal.raise_signal(number))
-    result = pj.render_until(cornell, spp=10**6)
+    earlier = signal.signal(number, signal.default_int_handler)  # whatever started the tests may have it ignored
+    try:
+        after_calls(3 * runtime.calls_at_once() - 1, lambda: signal.raise_signal(number))
+        result = pj.render_until(cornell, spp=10**6)
+        assert signal.getsignal(number) == signal.default_int_handler
+    finally:
+        signal.signal(number, earlier)
     assert result.reason == "interrupted"
     assert result.spp == 448  # portions of 64, 192 and 192, each by one call of every thread
-    assert signal.getsignal(number) == earlier
 
 
 def test_interrupt_before_the_first_samples(cornell, monkeypatch):
@@ -323,3 +329,21 @@ def test_adaptive_images_have_the_mean_of_uniform_ones(shipped, agree, estimate_
         return estimate_type(images.mean(0), images.var(0, ddof=1) / len(images), len(images))
 
     agree(estimated(True, range(48)), estimated(False, range(1000, 1048)))
+
+
+# ---- what is shown --------------------------------------------------------------------------------------------------
+
+
+def test_a_display_that_fails_costs_no_image(cornell, monkeypatch):
+    class Gone(io.StringIO):
+        def isatty(self):
+            return True
+
+        def write(self, text):
+            raise OSError("the terminal is gone")
+
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setattr(sys, "stderr", Gone())
+    monkeypatch.setattr(threading, "excepthook", lambda _: None)  # of the thread that repaints
+    image = pj.render_until(cornell, spp=4, progress=True).image
+    np.testing.assert_array_equal(image, pj.render_until(cornell, spp=4).image)

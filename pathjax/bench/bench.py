@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 import platform
-import sys
 from pathlib import Path
 
 import jax
@@ -17,10 +16,12 @@ from pathjax.bench import mitsuba_peer, plot
 from pathjax.bench.measure import Plan, measure
 from pathjax.bench.report import markdown
 from pathjax.errors import InputError
-from pathjax.io.files import write_text
+from pathjax.interrupts import Interrupts
+from pathjax.io.files import check_writable, write_text
+from pathjax.output import Output, say
 
 
-def run(options) -> int:
+def run(options, output: Output) -> int:
     """The command: `options` as `pathjax.cli` parses them. Returns 1 where a part of the work failed."""
     folder = None if options.output is None else Path(options.output)
     if folder is not None and not folder.parent.is_dir():
@@ -32,33 +33,47 @@ def run(options) -> int:
         pathjax.load_scene(file, **defines)  # a wrong one is refused before an hour of work on the others
     if options.against == "mitsuba":
         _find_mitsuba(options.scenes[0], defines)
-    plan = Plan(sorted(set(options.spp)), options.repeat, options.reference_spp, options.against, options.quick, _say)
+    plan = Plan(sorted(set(options.spp)), options.repeat, options.reference_spp, options.against, options.quick, say)
     report = {"machine": machine(), "against": options.against, "repeat": options.repeat, "scenes": []}
     if folder is not None:
-        folder.mkdir(exist_ok=True)
+        try:
+            folder.mkdir(exist_ok=True)
+        except OSError as error:
+            raise InputError(f"{folder}: cannot be made: {error.strerror}") from None
+        for name in ("bench.json", "bench.md"):
+            check_writable(folder / name)
         if not plot.available():
-            _say("pathjax: no plots, for there is no matplotlib: pip install 'pathjax[bench]'")
+            say("no plots, for there is no matplotlib: pip install 'pathjax[bench]'")
+    cut_short = False
     try:
         for name, file in _plot_names(options.scenes):
             scene = measure(file, defines, plan)
-            for failure in scene["failures"]:
-                _say(f"pathjax: {file}: {failure}")
-            drawn = folder is not None and plot.available() and plot.write(scene, folder / name)
-            report["scenes"].append({**scene, "plot": name if drawn else None})
-            if folder is not None:
-                write_text(folder / "bench.json", json.dumps(report, indent=2))
-                write_text(folder / "bench.md", markdown(report))
-    except KeyboardInterrupt:
-        if folder is None or not report["scenes"]:
+            with Interrupts() as interrupts:
+                for failure in scene["failures"]:
+                    say(f"{file}: {failure}")
+                report["scenes"].append({**scene, "plot": None})
+                if folder is not None:
+                    _write(report, folder, name, output)
+            if interrupts.heard:
+                raise KeyboardInterrupt
+    except (KeyboardInterrupt, Exception) as error:
+        if not report["scenes"]:
             raise
-        _say(f"pathjax: interrupted; {folder} holds {len(report['scenes'])} of {len(options.scenes)} scenes")
-        return 1
-    print(json.dumps(report) if options.json else markdown(report))
-    return int(any(scene["failures"] for scene in report["scenes"]))
+        cut_short = True
+        why = "interrupted" if isinstance(error, KeyboardInterrupt) else f"{file}: {type(error).__name__}: {error}"
+        say(f"{why}; {len(report['scenes'])} of {len(options.scenes)} scenes are done")
+    output.text(json.dumps(report) if options.json else markdown(report))
+    return int(cut_short or any(scene["failures"] for scene in report["scenes"]))
 
 
-def _say(message: str) -> None:
-    print(message, file=sys.stderr)
+def _write(report: dict, folder: Path, name: str, output: Output) -> None:
+    """Plot the last scene, and write the report of all."""
+    scene = report["scenes"][-1]
+    if plot.available() and plot.worth_while(scene):
+        place = output.file(folder / name, lambda path: plot.write(scene, path))
+        scene["plot"] = name if place == folder / name else place and str(place)
+    output.file(folder / "bench.json", lambda path: write_text(path, json.dumps(report, indent=2)))
+    output.file(folder / "bench.md", lambda path: write_text(path, markdown(report)))
 
 
 def _find_mitsuba(scene: str, defines: dict) -> None:

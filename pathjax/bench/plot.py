@@ -6,7 +6,7 @@ import math
 from pathlib import Path
 
 from pathjax.bench import figures
-from pathjax.io.files import write_whole
+from pathjax.io.files import encodable, write_whole
 
 _OURS = {"color": "black", "marker": "o", "linewidth": 2.2, "markersize": 7, "zorder": 3}
 _PEERS = {
@@ -26,15 +26,18 @@ def available() -> bool:
     return True
 
 
-def write(scene: dict, path: Path) -> bool:
-    """Plot a scene of the report; False, and no file, where nothing in it has noise."""
+def worth_while(scene: dict) -> bool:
+    """Whether there is something to plot: errors of a scene of the report that has noise."""
+    return any(_points(rows) for rows in (scene["pathjax"], scene["mitsuba"]))
+
+
+def write(scene: dict, path: Path) -> None:
+    """Plot a scene of the report, of which something must have noise."""
     lines = {"pathjax": (scene["pathjax"], _OURS)}
     for sampler in scene["slopes"]["mitsuba"]:
         lines[f"Mitsuba {sampler}"] = [row for row in scene["mitsuba"] if row["sampler"] == sampler], _PEERS[sampler]
-    if not any(_points(rows) for rows, _ in lines.values()):
-        return False
-    write_panels([(f"{scene['file']}, {scene['width']} x {scene['height']}", lines)], path)
-    return True
+    title = encodable(f"{scene['file']}, {scene['width']} x {scene['height']}")
+    write_panels([(title, lines)], path)
 
 
 def write_panels(panels: list[tuple[str, dict]], path: Path, columns: int = 1) -> None:
@@ -51,7 +54,7 @@ def write_panels(panels: list[tuple[str, dict]], path: Path, columns: int = 1) -
     FigureCanvasAgg(figure)
     for number, (title, lines) in enumerate(panels, 1):
         _draw(figure.add_subplot(rows, columns, number, xscale="log", yscale="log"), title, lines)
-    write_whole(path, lambda beside: figure.savefig(beside, format="png"))
+    write_whole(path, lambda file: figure.savefig(file, format="png"))
 
 
 def _draw(axes, title: str, lines: dict) -> None:

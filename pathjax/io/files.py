@@ -2,26 +2,71 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import BinaryIO
 
 from pathjax.errors import InputError
 
 
 def write_text(path: str | Path, text: str) -> None:
-    write_whole(Path(path), lambda beside: Path(beside).write_text(text, encoding="utf-8"))
+    write_whole(Path(path), lambda file: file.write(encodable(text).encode()))
 
 
-def write_whole(path: Path, write: Callable[[str], None]) -> None:
-    """Let `write` fill a file beside `path`, then put it in its place: who reads `path` never sees half a file."""
-    if not path.parent.is_dir():
-        raise InputError(f"{path}: there is no folder {path.parent}")
-    beside = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        write(str(beside))
+def encodable(text: str, encoding: str = "utf-8") -> str:
+    r"""The text with \escapes for what the encoding lacks, as for a byte of a file's name that is not UTF-8."""
+    return text.encode(encoding, "backslashreplace").decode(encoding)
+
+
+def write_whole(path: Path, write: Callable[[BinaryIO], object]) -> None:
+    """Let `write` fill a file beside `path`, then put it in its place: who reads `path` never sees half a file.
+
+    Raises:
+        InputError: it cannot be written, and `path` is as it was.
+    """
+    with _beside(path) as beside:
+        with open(beside, "wb") as file:
+            write(file)
+            file.flush()
+            os.fsync(file.fileno())  # quotas and disks across a network may refuse no sooner
         os.replace(beside, path)
-    except (OSError, RuntimeError) as error:
-        raise InputError(f"{path}: cannot be written: {error}") from None
-    finally:
-        beside.unlink(missing_ok=True)
+
+
+def check_writable(path: str | Path, sources: tuple[str | Path, ...] = ()) -> None:
+    """Refuse before the work what `write_whole` would refuse after it, as far as can be known.
+
+    Args:
+        sources: files that must not be overwritten.
+    Raises:
+        InputError: no folder, no right to write in it, a name that is too long, a folder, a read-only file or a source.
+    """
+    path = Path(path)
+    with _beside(path) as beside:
+        beside.touch()
+        for source in sources:
+            if os.path.realpath(path) == os.path.realpath(source):
+                raise InputError(f"{path}: is read by the same command; name another file to write")
+
+
+@contextlib.contextmanager
+def _beside(path: Path) -> Iterator[Path]:
+    """A file beside `path`, gone afterwards; any failure to write is an InputError that names `path`."""
+    try:
+        if not path.parent.is_dir():
+            raise InputError(f"{path}: there is no folder {path.parent}; make it first")
+        if path.is_dir():
+            raise InputError(f"{path}: is a folder; name a file")
+        if path.exists() and not os.access(path, os.W_OK):
+            raise InputError(f"{path}: is read-only; name another file, or delete it")
+        beside = path.with_name(f".{path.name}.{os.getpid()}.part")
+        try:
+            yield beside
+        finally:
+            with contextlib.suppress(OSError):
+                beside.unlink()
+    except InputError:
+        raise
+    except (OSError, RuntimeError, ValueError) as error:  # ValueError: a name that the system cannot encode
+        raise InputError(f"{path}: cannot be written: {getattr(error, 'strerror', None) or error}") from None

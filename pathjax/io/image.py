@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from pathjax.errors import InputError
-from pathjax.io.files import write_whole
+from pathjax.io.files import encodable, write_whole
 
 MAX_PIXELS = 10**9
 _FIRST_BYTES = {"OpenEXR": b"\x76\x2f\x31\x01", "PNG": b"\x89PNG\r\n\x1a\n", "JPEG": b"\xff\xd8\xff"}
@@ -41,7 +41,7 @@ def write_exr(path: str | Path, channels: Mapping[str, np.ndarray], header: Mapp
 
     Args:
         channels: name to (H, W); a viewer shows those named R, G, B.
-        header: attributes of the file; an int must fit 32 bits.
+        header: attributes of the file; an int must fit 32 bits; what UTF-8 cannot hold of a text is escaped.
     Raises:
         InputError: no such folder, no right to write, or shapes that differ.
     """
@@ -55,15 +55,13 @@ def write_exr(path: str | Path, channels: Mapping[str, np.ndarray], header: Mapp
     for name, value in header.items():
         if isinstance(value, int) and not -(2**31) <= value < 2**31:
             raise InputError(f'{path}: the header\'s "{name}" is {value}; an integer there must fit 32 bits')
+    header = {name: encodable(value) if isinstance(value, str) else value for name, value in header.items()}
     fixed = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
 
-    def write(beside: str) -> None:
-        content = io.BytesIO()  # OpenEXR itself writes on when the disk has no room for the last bytes
-        with OpenEXR.File({**header, **fixed}, pixels) as file:
-            file.write(content)
-        Path(beside).write_bytes(content.getbuffer())
-
-    write_whole(Path(path), write)
+    encoded = io.BytesIO()  # OpenEXR itself writes on when the disk has no room for the last bytes
+    with OpenEXR.File({**header, **fixed}, pixels) as file:
+        file.write(encoded)
+    write_whole(Path(path), lambda file: file.write(encoded.getbuffer()))
 
 
 def write_png(path: str | Path, rgb: np.ndarray) -> None:
@@ -75,7 +73,7 @@ def write_png(path: str | Path, rgb: np.ndarray) -> None:
         raise InputError(f"{path}: an image must have the shape (H, W, 3), has {rgb.shape}")
     encoded = linear_to_srgb(np.clip(np.nan_to_num(rgb, nan=0.0, posinf=1.0, neginf=0.0), 0, 1))
     image = Image.fromarray(np.rint(encoded * 255).astype(np.uint8))
-    write_whole(Path(path), lambda beside: image.save(beside, format="PNG"))
+    write_whole(Path(path), lambda file: image.save(file, format="PNG"))
 
 
 def file_format(path: str | Path) -> str:

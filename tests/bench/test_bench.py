@@ -2,6 +2,7 @@
 
 import importlib.util
 import json
+import shutil
 import sys
 from pathlib import Path
 
@@ -152,10 +153,67 @@ def test_an_interrupt_keeps_the_scenes_that_are_done(tmp_path, capsys, monkeypat
 
     monkeypatch.setattr(bench, "measure", measure)
     run(FURNACE, FURNACE, CORNELL, *SMALL, "--quick", "-o", str(tmp_path), status=1)
-    assert f"{tmp_path} holds 2 of 3 scenes" in capsys.readouterr().err
+    assert "interrupted; 2 of 3 scenes are done" in capsys.readouterr().err
     scenes = json.loads((tmp_path / "bench.json").read_text())["scenes"]
     assert [scene["plot"] for scene in scenes] == ["furnace-1.png", "furnace-2.png"]
     assert all((tmp_path / scene["plot"]).exists() for scene in scenes)
+
+
+@pytest.fixture
+def measured(scene, monkeypatch):
+    """(what measuring each scene does before its figures are there, None: nothing)."""
+
+    def install(*happen):
+        happen = iter(happen)
+
+        def measure(*_):
+            if (act := next(happen)) is not None:
+                act()
+            return {name: value for name, value in scene.items() if name != "plot"}
+
+        monkeypatch.setattr(bench, "measure", measure)
+        monkeypatch.setitem(sys.modules, "matplotlib", None)
+
+    return install
+
+
+def raises(error):
+    def act():
+        raise error
+
+    return act
+
+
+@pytest.mark.parametrize(
+    "error, says", [(KeyboardInterrupt(), "interrupted"), (MemoryError("out of memory"), "MemoryError: out of memory")]
+)
+@pytest.mark.parametrize("written", [False, True])
+def test_what_ends_the_work_early_costs_no_scene_that_is_done(measured, tmp_path, capsys, error, says, written):
+    measured(None, raises(error))
+    run(FURNACE, FURNACE, FURNACE, "--json", *(["-o", str(tmp_path)] if written else []), status=1)
+    told = capsys.readouterr()
+    assert f"{says}; 1 of 3 scenes are done" in told.err
+    assert len(json.loads(told.out)["scenes"]) == 1
+    assert (tmp_path / "bench.json").exists() == written
+
+
+def test_a_report_whose_folder_is_gone_is_written_in_the_current_one(measured, tmp_path, capsys, monkeypatch):
+    folder, here = tmp_path / "report", tmp_path / "here"
+    here.mkdir()
+    monkeypatch.chdir(here)
+    measured(None, lambda: shutil.rmtree(folder), None)
+    run(FURNACE, FURNACE, FURNACE, "-o", str(folder), status=1)
+    assert sorted(path.name for path in here.iterdir()) == ["bench.json", "bench.md"]
+    assert len(json.loads((here / "bench.json").read_text())["scenes"]) == 3
+    assert f"{here / 'bench.md'} was written instead" in capsys.readouterr().err
+
+
+def test_names_that_are_not_utf8(measured, tmp_path):
+    scene = tmp_path / "s\udcff.xml"
+    shutil.copy(FURNACE, scene)
+    measured(None)
+    run(str(scene), "-o", str(tmp_path / "r\udcff"))
+    assert (tmp_path / "r\udcff" / "bench.md").exists()
 
 
 def test_a_folder_without_parent_is_refused(tmp_path, capsys):

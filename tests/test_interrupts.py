@@ -1,0 +1,111 @@
+"""Signals that ask the program to end wait for work that is being finished; and the tests themselves hear them."""
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+
+import pytest
+
+from pathjax.interrupts import SIGNALS, Interrupts
+
+pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="sends signals")
+
+
+@pytest.fixture(params=SIGNALS)
+def number(request):
+    """A signal that raises KeyboardInterrupt, whatever started the tests."""
+    earlier = signal.signal(request.param, signal.default_int_handler)
+    yield request.param
+    signal.signal(request.param, earlier)
+
+
+def test_the_first_signal_is_noted_and_the_second_acts(number):
+    with pytest.raises(KeyboardInterrupt):
+        with Interrupts() as interrupts:
+            signal.raise_signal(number)
+            assert interrupts.heard
+            signal.raise_signal(number)
+    assert signal.getsignal(number) is signal.default_int_handler
+
+
+def test_what_is_nested_notes_one_signal_each(number):
+    with Interrupts() as outer:
+        with Interrupts() as inner:
+            signal.raise_signal(number)
+            assert inner.heard and not outer.heard
+            signal.raise_signal(number)
+            assert outer.heard
+
+
+def test_work_that_may_be_given_up_is(number):
+    with Interrupts() as interrupts:
+        with pytest.raises(KeyboardInterrupt), interrupts.let_through():
+            signal.raise_signal(number)
+        with pytest.raises(KeyboardInterrupt), interrupts.let_through():
+            pytest.fail("it began after a signal")
+
+
+def test_a_signal_after_such_work_is_noted(number):
+    with Interrupts() as interrupts:
+        with interrupts.let_through():
+            pass
+        signal.raise_signal(number)
+    assert interrupts.heard
+
+
+def test_ignored_signals_stay_ignored(number):
+    signal.signal(number, signal.SIG_IGN)
+    with Interrupts() as interrupts:
+        signal.raise_signal(number)
+    assert not interrupts.heard
+
+
+def test_other_threads_change_nothing(number):
+    def work():
+        with Interrupts():
+            handlers.append(signal.getsignal(number))
+
+    handlers = []
+    thread = threading.Thread(target=work)
+    thread.start()
+    thread.join()
+    assert handlers == [signal.default_int_handler]
+
+
+# ---- the tests themselves -------------------------------------------------------------------------------------------
+
+SENT = signal.SIGINT, signal.SIGTERM
+# Prints which of them a process would not hear.
+DEAF = f"""
+import signal
+print([n for n in {[int(number) for number in SENT]}
+       if signal.getsignal(n) == signal.SIG_IGN or n in signal.pthread_sigmask(signal.SIG_BLOCK, ())])
+"""
+# Starts a command that is as deaf as what some shells, and programs that start tests, put in the background.
+BACKGROUND = f"""
+import os, signal, sys
+for number in {[int(number) for number in SENT]}:
+    signal.signal(number, signal.SIG_IGN)
+    if sys.argv[1] == "block":
+        signal.pthread_sigmask(signal.SIG_BLOCK, [number])
+os.execv(sys.argv[2], sys.argv[2:])
+"""
+
+
+def test_signals_that_tests_send_are_heard_here_and_in_processes_that_are_started():
+    assert all(signal.getsignal(number) != signal.SIG_IGN for number in SENT)
+    assert not signal.pthread_sigmask(signal.SIG_BLOCK, ()) & set(SENT)
+    assert subprocess.run([sys.executable, "-c", DEAF], capture_output=True, text=True).stdout == "[]\n"
+
+
+@pytest.mark.parametrize("how", ["ignore", "block"])
+def test_they_are_heard_where_the_tests_run_in_the_background(root, how):
+    chosen = f"{__file__}::test_signals_that_tests_send_are_heard_here_and_in_processes_that_are_started"
+    command = [sys.executable, "-m", "pytest", "-q", "-n", "0", "-p", "no:cacheprovider", chosen]
+    command = [sys.executable, "-c", BACKGROUND, how, *command]
+    plain = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST_")}
+    done = subprocess.run(command, cwd=root, env=plain, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stdout
+    assert "1 passed" in done.stdout
