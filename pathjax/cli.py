@@ -33,7 +33,7 @@ def main(arguments: list[str] | None = None) -> int:
             say(str(error))
             return WRONG
         except KeyboardInterrupt:
-            say("interrupted; nothing was written")
+            say("interrupted" if output.written else "interrupted; nothing was written")
             return FAILED
     return FAILED if output.failed else status
 
@@ -46,7 +46,10 @@ def _warnings_as_messages():
         plain = warnings.showwarning
 
         def show(message, category, *place):
-            say(str(message)) if issubclass(category, InputWarning) else plain(message, category, *place)
+            if issubclass(category, InputWarning):
+                say(str(message))
+            else:
+                plain(message, category, *place)
 
         warnings.showwarning = show
         yield
@@ -99,46 +102,46 @@ def _render(options, output: Output) -> int:
         spp = scene.about.description.spp
     loaded = time.perf_counter()
     render = Render(scene, options.error, options.time, spp, options.seed, options.strategy, options.checkpoint)
-    first_hits = _compiled(render, spp, options)
+    first_hits = _compile(render, spp, options)
     # From the first sample to the written image a signal only ends the rendering.
     with Interrupts() as interrupts:
         result = render.run(progress=True)
         layers = _layers(scene, result, first_hits, options, interrupts, output)
         place = output.file(path, lambda place: _write(place, result, layers, options))
-        pixels_lost = int((~(abs(result.image) < math.inf)).any(-1).sum())
-        if pixels_lost:
-            say(f"{pixels_lost} pixels met a sample that is not finite, and hold nan")
-        if not dark and not result.image.any():
-            say(f"every pixel is black: none of the paths met a light (max_depth {int(scene.max_depth)})")
-        interrupted = result.reason == "interrupted"
-        missed = interrupted or (options.error is not None and result.reason != "target error")
-        saved = render.checkpoint is not None and render.checkpoint.problem is None
-        if missed:
-            say(_reached(result, pixels_lost, place, spp, saved, options))
-        if options.json:
-            report = {
-                "output": None if place is None else str(place),
-                "width": result.image.shape[1],
-                "height": result.image.shape[0],
-                "spp": result.spp,
-                "fewest_spp": int(result.samples.min()),
-                "most_spp": int(result.samples.max()),
-                "seed": options.seed,
-                "load_seconds": loaded - started,
-                "compile_seconds": result.compile_seconds,
-                "run_seconds": result.run_seconds,
-                "error": _known(result.error),
-                "error_bound": _known(result.error_bound),
-                "reason": result.reason,
-                "not_finite_pixels": pixels_lost,
-                "interrupted": interrupted,
-            }
-            output.text(json.dumps(report))
+    pixels_lost = int((~(abs(result.image) < math.inf)).any(-1).sum())
+    if pixels_lost:
+        say(f"{pixels_lost} pixels met a sample that is not finite, and hold nan")
+    if not dark and not result.image.any():
+        say("every pixel is black: none of the paths met a light")
+    interrupted = result.reason == "interrupted"
+    missed = interrupted or (options.error is not None and result.reason != "target error")
+    saved = render.checkpoint is not None and render.checkpoint.problem is None
+    if missed:
+        say(_reached(result, pixels_lost, place, spp, saved, options))
+    if options.json:
+        report = {
+            "output": None if place is None else str(place),
+            "width": result.image.shape[1],
+            "height": result.image.shape[0],
+            "spp": result.spp,
+            "fewest_spp": int(result.samples.min()),
+            "most_spp": int(result.samples.max()),
+            "seed": options.seed,
+            "load_seconds": loaded - started,
+            "compile_seconds": result.compile_seconds,
+            "run_seconds": result.run_seconds,
+            "error": _known(result.error),
+            "error_bound": _known(result.error_bound),
+            "reason": result.reason,
+            "not_finite_pixels": pixels_lost,
+            "interrupted": interrupted,
+        }
+        output.text(json.dumps(report))
     return FAILED if missed or (options.checkpoint is not None and not saved) else DONE
 
 
-def _compiled(render, spp: int | None, options) -> dict:
-    """Compile the render; returns the images of what is seen first, by name."""
+def _compile(render, spp: int | None, options) -> dict:
+    """Compile the render, and make the images of what is hit first, by name."""
     from rich.console import Console
 
     from pathjax import aovs

@@ -23,10 +23,10 @@ def _for(stream, text: str) -> str:
 
 
 class Output:
-    """Of one command; `failed` is true once something could not go where it was asked for."""
+    """Of one command; `written` is true once a file is, `failed` once something could not go where it was asked for."""
 
     def __init__(self):
-        self.failed = False
+        self.failed = self.written = False
         self._moved: dict[Path, Path] = {}
 
     def file(self, path: str | Path, write: Callable[[Path], object]) -> Path | None:
@@ -44,6 +44,7 @@ class Output:
             except Exception as error:  # whatever it is, the work is done and must not be lost
                 problems.append(str(error) or type(error).__name__)
                 continue
+            self.written = True
             if problems:
                 self.failed, self._moved[path] = True, place
                 say(f"{problems[0]}; {place} was written instead")

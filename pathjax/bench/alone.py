@@ -37,7 +37,7 @@ def call(request: dict) -> tuple[dict, np.ndarray]:
         places = [str(Path(__file__).resolve().parents[2]), os.environ.get("PYTHONPATH")]
         environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, places))}
         command = [sys.executable, "-P", str(Path(__file__).resolve()), str(file)]
-        done = subprocess.run(command, capture_output=True, text=True, env=environment)
+        done = subprocess.run(command, capture_output=True, text=True, errors="replace", env=environment)
         if done.returncode:
             raise Failed((done.stderr.strip().splitlines() or [f"it ended with status {done.returncode}"])[-1])
         with np.load(output) as arrays:

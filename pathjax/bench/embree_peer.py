@@ -76,7 +76,7 @@ def call(vertices, faces, origins, directions, runs: int = 5, timeout: float | N
         rays, hits = os.path.join(folder, "rays.npz"), os.path.join(folder, "hits.npz")
         np.savez(rays, vertices=vertices, faces=faces, origins=origins, directions=directions)
         command = [sys.executable, "-P", str(Path(__file__).resolve()), rays, hits, str(runs)]
-        done = subprocess.run(command, capture_output=True, text=True, timeout=timeout)
+        done = subprocess.run(command, capture_output=True, text=True, errors="replace", timeout=timeout)
         if done.returncode:
             message = (done.stderr.strip().splitlines() or [f"it ended with status {done.returncode}"])[-1]
             raise (PeerMissing if done.returncode == 3 else RuntimeError)(message)

@@ -84,7 +84,7 @@ def call(request: dict, timeout: float | None = None) -> tuple[dict, dict[str, n
         file.write_text(json.dumps(request))
         # -P: the modules beside this file must not shadow the standard library's
         command = [sys.executable, "-P", str(Path(__file__).resolve()), str(file)]
-        done = subprocess.run(command, capture_output=True, text=True, timeout=timeout)
+        done = subprocess.run(command, capture_output=True, text=True, errors="replace", timeout=timeout)
         if done.returncode:
             message = done.stderr.strip().splitlines()[-1:] or [f"it ended with status {done.returncode}"]
             raise {2: RequestError, 3: PeerMissing}.get(done.returncode, PeerFailed)(message[0])

@@ -12,6 +12,7 @@ large either. Newton's method finds its root; its scatter over the pixels, which
 
 from __future__ import annotations
 
+import contextlib
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -137,7 +138,8 @@ def step_text(entry: dict) -> str:
 
 
 def _tell(entry: dict) -> None:
-    print(step_text(entry), file=sys.stderr)
+    with contextlib.suppress(OSError):  # a terminal that is gone costs no fit
+        print(step_text(entry), file=sys.stderr)
 
 
 class _Run:
