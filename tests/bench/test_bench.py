@@ -166,10 +166,10 @@ def measured(scene, monkeypatch):
     def install(*happen):
         happen = iter(happen)
 
-        def measure(*_):
+        def measure(file, *_):
             if (act := next(happen)) is not None:
                 act()
-            return {name: value for name, value in scene.items() if name != "plot"}
+            return {name: value for name, value in scene.items() if name != "plot"} | {"file": file}
 
         monkeypatch.setattr(bench, "measure", measure)
         monkeypatch.setitem(sys.modules, "matplotlib", None)
@@ -213,7 +213,7 @@ def test_names_that_are_not_utf8(measured, tmp_path):
     shutil.copy(FURNACE, scene)
     measured(None)
     run(str(scene), "-o", str(tmp_path / "r\udcff"))
-    assert (tmp_path / "r\udcff" / "bench.md").exists()
+    assert r"s\udcff.xml, 8 x 8" in (tmp_path / "r\udcff" / "bench.md").read_text(encoding="utf-8")
 
 
 def test_a_folder_without_parent_is_refused(tmp_path, capsys):
