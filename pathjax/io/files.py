@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import BinaryIO
 
@@ -34,7 +34,7 @@ def write_whole(path: Path, write: Callable[[BinaryIO], object]) -> None:
         os.replace(beside, path)
 
 
-def check_writable(path: str | Path, sources: tuple[str | Path, ...] = ()) -> None:
+def check_writable(path: str | Path, sources: Iterable[str | Path] = ()) -> None:
     """Refuse before the work what `write_whole` would refuse after it, as far as can be known.
 
     Args:
