@@ -68,10 +68,11 @@ class _Loader:
         background, background_name = None, ""
         for element in scene["emitter"]:
             background, background_name = self.make(element, BACKGROUNDS), element.id or self.unique("background")
-        shapes = tuple(
+        shapes = [
             self.make(element, dict.fromkeys(SHAPES, _shape), element.id or self.numbered("shape"))
             for element in scene["shape"]
-        )
+        ]
+        shapes = tuple(shape for shape in shapes if shape is not None)
         for element in scene["bsdf"] + scene["texture"]:
             if element not in self.made:
                 self.notes.append(f"{element.file}:{element.line}: {element} is used by nothing")
@@ -109,7 +110,8 @@ class _Loader:
         return name
 
 
-def _shape(loader: _Loader, fields: Fields, name: str) -> d.Shape:
+def _shape(loader: _Loader, fields: Fields, name: str) -> d.Shape | None:
+    """None where nothing of a mesh is left, as all its triangles are degenerate: no ray meets it, nor does it emit."""
     geometry = SHAPES[fields.type](loader, fields)
     flip_normals = fields.boolean("flip_normals", False)
     if isinstance(geometry, d.Sphere) and np.linalg.det(geometry.to_world[:3, :3]) < 0:
@@ -126,6 +128,10 @@ def _shape(loader: _Loader, fields: Fields, name: str) -> d.Shape:
     else:
         # Mitsuba: a light that is given no bsdf reflects nothing
         bsdf = d.Diffuse(inherited or loader.numbered("bsdf"), np.full(3, 0.5 if radiance is None else 0.0))
+    if isinstance(geometry, d.Mesh) and not len(geometry.faces):
+        place, light = f"{fields.element.file}:{fields.element.line}", "" if radiance is None else ", and its light too"
+        loader.notes.append(f"{place}: {fields.element} is left out, as no triangle has an area{light}")
+        return None
     return d.Shape(name, geometry, bsdf, radiance, emitter_name, flip_normals)
 
 

@@ -315,6 +315,24 @@ def test_a_shape_without_bsdf_is_grey_and_a_light_without_bsdf_is_black(read, mi
 # --- bsdfs
 
 
+def test_a_mesh_without_any_area_is_left_out_with_its_light_and_noted(read, tmp_path):
+    (tmp_path / "line.obj").write_text("v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\nf 3 2 1\n")
+    file, light = '<string name="filename" value="line.obj"/>', '<emitter type="area"/>'
+    scene = read(shape(file, "obj", 'id="crack"') + shape() + "\n" + shape(file + light, "obj") + shape(light))
+    assert [s.name for s in scene.shapes] == ["shape0", "shape2"]  # the names of the others are what they were
+    assert [s.radiance is None for s in scene.shapes] == [True, False]
+    left_out = [note for note in scene.notes if "is left out, as no triangle has an area" in note]
+    assert ["scene.xml:2: " in note and "light" not in note for note in left_out] == [True, False]
+    assert "scene.xml:3: " in left_out[1] and left_out[1].endswith("and its light too")
+    assert sum("2 degenerate triangles" in note for note in scene.notes) == 2
+
+
+def test_what_stands_in_a_mesh_without_any_area_is_still_checked(refused, tmp_path):
+    (tmp_path / "line.obj").write_text("v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n")
+    file = '<string name="filename" value="line.obj"/>'
+    assert "frosted" in refused(shape(file + '<bsdf type="frosted"/>', "obj"))
+
+
 def test_ior_names_are_mitsubas(mitsuba):
     for name, value in IOR.items():
         body = with_bsdf("dielectric", f'<string name="int_ior" value="{name}"/><float name="ext_ior" value="1"/>')

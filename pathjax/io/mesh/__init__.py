@@ -1,0 +1,151 @@
+"""Triangle meshes from OBJ, PLY, STL and glTF files, in world space and fit to be traced.
+
+A file for each format says what is in it (`Raw`); `load` checks that, cuts polygons into triangles, and carries them to
+world space.
+
+uv of a `Mesh` points v downwards: (u, v) looks up `texels[int(v * H), int(u * W)]`, the top row of the image first.
+glTF files store it like that. OBJ files count v from the bottom of the image, so it is flipped (`flip_tex_coords`
+true by default); of PLY, Mitsuba assumes that nothing is to be flipped, and so does this loader.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from pathjax.description import Mesh
+from pathjax.errors import InputError
+from pathjax.io.mesh import gltf, obj, ply, polygons, stl
+from pathjax.io.mesh.raw import Raw
+
+READERS = {"obj": obj.read, "ply": ply.read, "stl": stl.read, "glb": gltf.read, "gltf": gltf.read}
+
+
+def load(
+    path: str | Path,
+    kind: str,
+    to_world: np.ndarray,
+    face_normals: bool = False,
+    flip_tex_coords: bool | None = None,
+) -> tuple[Mesh, list[str]]:
+    """Read a mesh, carry it to world space, and leave out degenerate triangles.
+
+    Shading normals are the file's; where OBJ and PLY have none they are means of the faces around, weighted by angle,
+    as Mitsuba makes them. STL and glTF without normals are flat. A mirroring `to_world` turns faces inside out, as in
+    Mitsuba; where the file has normals those decide, and the order of vertices is reversed to agree with them.
+
+    Args:
+        kind: "obj", "ply", "stl", "glb" or "gltf".
+        to_world: (4, 4), affine and invertible.
+        face_normals: flat shading whatever the file has.
+        flip_tex_coords: v to 1 - v; None: what the format needs.
+    Returns:
+        the mesh, without faces if all its triangles are degenerate, and notes worth telling the user.
+    Raises:
+        InputError: unreadable file, no triangles, an index out of range, a coordinate that is not finite in float32.
+    """
+    raw = _read(Path(path), kind)
+    vertices = _transformed(path, raw.vertices, to_world)
+    notes = list(raw.notes)
+    if raw.sizes is None:
+        faces = raw.corners.reshape(-1, 3)
+    else:
+        faces, crossing = polygons.triangles(raw.vertices, raw.corners, raw.sizes)
+        if crossing:
+            notes.append(f"{crossing} polygons cross themselves; no triangles cover such just once")
+    area_vectors = _area_vectors(vertices, faces)
+    # Also false where an index is repeated. Both spaces: a transform rounds a line of three vertices to a sliver.
+    solid = _area_vectors(raw.vertices, faces).any(axis=0) & area_vectors.any(axis=0)
+    dropped = int(len(solid) - np.count_nonzero(solid))
+    if dropped:
+        faces, area_vectors = faces[solid], area_vectors[:, solid]
+        notes.append(f"{dropped} degenerate triangles left out")
+
+    normals, uv = None, raw.uv
+    if not face_normals and (raw.normals is not None or kind in ("obj", "ply")):
+        if raw.normals is None:
+            given, lacking = np.empty_like(vertices), np.ones(len(vertices), bool)
+        else:
+            given = raw.normals @ np.linalg.inv(to_world[:3, :3])
+            lacking = ~given.any(axis=1)
+            if np.linalg.det(to_world[:3, :3]) < 0:
+                faces, area_vectors = faces[:, ::-1], -area_vectors
+            if lacking[faces].any():
+                notes.append(f"{np.unique(faces[lacking[faces]]).size} vertices without a normal got a smooth one")
+        if lacking.any():
+            given[lacking] = _smooth_normals(vertices, faces, area_vectors)[lacking]
+        normals = given / np.linalg.norm(given, axis=1, keepdims=True)
+
+    if uv is not None and (kind == "obj" if flip_tex_coords is None else flip_tex_coords):
+        uv = uv * [1, -1] + [0, 1]
+    return Mesh(vertices, np.ascontiguousarray(faces), normals, uv, dropped), [f"{path}: {note}" for note in notes]
+
+
+def _read(path: Path, kind: str) -> Raw:
+    """What the file says; all indices and all normals and uv are sound."""
+    try:
+        raw = READERS[kind](path)
+    except InputError:
+        raise
+    except Exception as error:  # of the libraries, or brought about by a header that is not as the format says
+        reason = f"{type(error).__name__}: {error}"[:200]
+        raise InputError(f"{path}: cannot be read as {kind.upper()} ({reason})") from None
+    if len(raw.vertices) == 0 or len(raw.corners) == 0:
+        raise InputError(f"{path}: the mesh is empty, it has no triangles")
+    if raw.corners.min() < 0 or raw.corners.max() >= len(raw.vertices):
+        bad = int(np.flatnonzero((raw.corners < 0) | (raw.corners >= len(raw.vertices)))[0])
+        face = bad // 3 if raw.sizes is None else int(np.searchsorted(np.cumsum(raw.sizes), bad, side="right"))
+        there = f"there are {len(raw.vertices)}"
+        raise InputError(f"{path}: face {face} (counting from 0) has the vertex {raw.corners[bad]}, but {there}")
+    for name, values in (("normal", raw.normals), ("uv", raw.uv)):
+        if values is not None and not np.isfinite(values).all():
+            raise InputError(f"{path}: {name} {_first_bad(values)} is not finite")
+    return raw
+
+
+def _transformed(path: str | Path, vertices: np.ndarray, to_world: np.ndarray) -> np.ndarray:
+    """(V, 3) float64; finite also when rounded to float32, as everything downstream does."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        world = vertices @ to_world[:3, :3].T + to_world[:3, 3]
+        finite = np.isfinite(world.astype(np.float32)).all() and np.isfinite(vertices).all()
+        if not finite:
+            bad = _first_bad(world.astype(np.float32) + vertices)
+            raise InputError(f"{path}: vertex {bad} (counting from 0) is not finite: {vertices[bad].tolist()}")
+    return world
+
+
+def _first_bad(values: np.ndarray) -> int:
+    return int(np.flatnonzero(~np.isfinite(values).all(axis=1))[0])
+
+
+def _area_vectors(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """(3, F) twice the area along the normal; 0 for what has no area once rounded to float32."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        rounded = vertices.T.astype(np.float32).astype(np.float64)
+        a, b, c = (np.take(rounded, corner, axis=1) for corner in faces.T)
+        return polygons.cross(b - a, c - a)
+
+
+def _smooth_normals(vertices: np.ndarray, faces: np.ndarray, area_vectors: np.ndarray) -> np.ndarray:
+    """(V, 3) sums of unit face normals weighted by the angle at the vertex (Thuermer and Wuethrich 1998)."""
+    unit = area_vectors / _norm(area_vectors)
+    sums = np.zeros_like(vertices)
+    corners = [np.take(vertices.T, corner, axis=1) for corner in faces.T]
+    for k in range(3):
+        one, two = corners[(k + 1) % 3] - corners[k], corners[(k + 2) % 3] - corners[k]
+        cosine = _dot(one, two) / (_norm(one) * _norm(two))
+        angle = np.arccos(np.clip(cosine, -1, 1))
+        for axis in range(3):
+            sums[:, axis] += np.bincount(faces[:, k], angle * unit[axis], len(vertices))
+    sums[~sums.any(axis=1)] = [1, 0, 0]  # vertices of no face
+    return sums
+
+
+def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Of columns, (3, N) each."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def _norm(a: np.ndarray) -> np.ndarray:
+    return np.sqrt(_dot(a, a))

@@ -1,0 +1,244 @@
+"""glTF 2.0, also as GLB: all triangles of the default scene, where its nodes place them.
+
+Materials, cameras, lights and animations are not read. What would change the triangles and is not modelled here, as
+skins or compression, is refused by name. trimesh 5.2 leaves out sparse accessors and triangle fans without a word.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from urllib.parse import unquote, unquote_to_bytes
+
+import numpy as np
+
+from pathjax.errors import InputError
+from pathjax.io.mesh.polygons import strips
+from pathjax.io.mesh.raw import Raw
+
+COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
+TRIANGLES, STRIP, FAN = 4, 5, 6  # the modes below draw points and lines
+
+# Extensions that files may require: they leave the triangles alone, or are modelled.
+HARMLESS = re.compile(r"(KHR_materials|KHR_texture|EXT_texture)_\w+|KHR_lights_punctual|KHR_mesh_quantization")
+# Extensions of nodes that change which triangles there are, also where they are not required.
+PLACING = ("EXT_mesh_gpu_instancing", "KHR_node_visibility")
+
+
+@dataclass(frozen=True)
+class _File:
+    path: Path
+    header: dict
+    chunk: bytes | None  # the binary part of a GLB
+    buffers: dict[int, bytes] = field(default_factory=dict)
+
+    def refuse(self, what: str) -> InputError:
+        return InputError(f"{self.path}: glTF with {what} is not supported; export plain triangles")
+
+    def entry(self, kind: str, number: int) -> dict:
+        """`number` of one of the header's lists; negative numbers do not count from its end."""
+        there = len(self.header.get(kind, ()))
+        if not 0 <= number < there:
+            raise InputError(f"{self.path}: {kind} {number} does not exist; there are {there}")
+        return self.header[kind][number]
+
+    def buffer(self, number: int) -> bytes:
+        if number not in self.buffers:
+            uri = self.entry("buffers", number).get("uri")
+            data = self.chunk if uri is None and number == 0 else self._fetch(uri)
+            if data is None or len(data) < self.entry("buffers", number)["byteLength"]:
+                raise InputError(f"{self.path}: buffer {number} is shorter than its byteLength says, or is not there")
+            self.buffers[number] = data
+        return self.buffers[number]
+
+    def _fetch(self, uri: str | None) -> bytes | None:
+        if uri is None:
+            return None
+        if uri[:5].lower() == "data:":
+            kind, _, data = uri.partition(",")
+            return base64.b64decode(unquote(data)) if kind.endswith(";base64") else unquote_to_bytes(data)
+        if re.match(r"\w{2,}:", uri):  # one letter is a drive of Windows
+            raise self.refuse(f"the address {uri[:60]}")
+        names = [unquote(uri), uri]  # the second: written by programs that do not know of percent-encoding
+        found = next((file for name in names if (file := self.path.parent / name).is_file()), None)
+        if found is None:
+            raise InputError(f"{self.path}: its buffer {unquote(uri)[:200]} is not beside it")
+        return found.read_bytes()
+
+    def accessor(self, number: int) -> np.ndarray:
+        """(count, width): float64, or where integers are meant as such, integers."""
+        this = self.entry("accessors", number)
+        layout = this["componentType"], this["type"], this["count"]
+        if "bufferView" in this:
+            values = self._view(this, *layout)
+        else:
+            values = np.zeros((this["count"], WIDTHS[this["type"]]), COMPONENTS[this["componentType"]])
+        if "sparse" in this:
+            sparse = this["sparse"]
+            places = self._view(sparse["indices"], sparse["indices"]["componentType"], "SCALAR", sparse["count"])[:, 0]
+            values = values.copy()
+            values[places] = self._view(sparse["values"], *layout[:2], sparse["count"])
+        if this.get("normalized") and values.dtype.kind in "iu":
+            values = np.maximum(values / np.iinfo(values.dtype).max, -1.0)
+        return values if values.dtype.kind in "iu" else values.astype(np.float64)
+
+    def _view(self, where: dict, component: int, kind: str, count: int) -> np.ndarray:
+        """(count, width) as stored from `byteOffset` of a bufferView on."""
+        view, offset = self.entry("bufferViews", where["bufferView"]), where.get("byteOffset", 0)
+        data, dtype, width = self.buffer(view["buffer"]), np.dtype(COMPONENTS[component]), WIDTHS[kind]
+        start = view.get("byteOffset", 0)
+        stride = view.get("byteStride", width * dtype.itemsize)
+        end = offset + max(count - 1, 0) * stride + width * dtype.itemsize
+        if min(offset, start, count) < 0 or stride < 1 or end > view["byteLength"] or start + end > len(data):
+            raise InputError(f"{self.path}: bufferView {where['bufferView']} is shorter than its accessor")
+        return np.ndarray((count, width), dtype, data, start + offset, (stride, dtype.itemsize))
+
+
+def read(path: Path) -> Raw:
+    file = _opened(path, path.read_bytes())
+    header = file.header
+    refused = [name for name in header.get("extensionsRequired", []) if not HARMLESS.fullmatch(name)]
+    refused += sorted({name for node in header.get("nodes", []) for name in node.get("extensions", {})} & set(PLACING))
+    refused += ["skins"] if header.get("skins") else []
+    if any(not {"bufferView", "sparse"} & accessor.keys() for accessor in header.get("accessors", [])):
+        refused.append("accessors without data")
+    if any(primitive.get("targets") for mesh in header.get("meshes", []) for primitive in mesh["primitives"]):
+        refused.append("morph targets")
+    if refused:
+        raise file.refuse(", ".join(refused))
+
+    parts = []
+    for node, matrix in _placed(file):
+        for primitive in file.entry("meshes", node["mesh"])["primitives"] if "mesh" in node else ():
+            if primitive.get("mode", TRIANGLES) >= TRIANGLES:
+                parts.append(_part(file, primitive, matrix))
+    notes = ["its materials, cameras and lights are not read"]
+    if "KHR_texture_transform" in header.get("extensionsUsed", []):
+        notes.append("transforms of its materials' textures are not applied to uv")
+    if len(header.get("scenes", [])) > 1:
+        notes.append(f"scene {header.get('scene', 0)} of its {len(header['scenes'])} is read")
+    lacking = sum(len(part.vertices) for part in parts if part.uv is None)
+    if lacking and any(part.uv is not None for part in parts):
+        notes.append(f"{lacking} vertices without texture coordinates got (0, 0)")
+    return _joined(parts, tuple(notes))
+
+
+def _opened(path: Path, data: bytes) -> _File:
+    chunk = None
+    if data[:4] == b"glTF":
+        _, version, _ = struct.unpack_from("<4s2I", data)
+        if version != 2:
+            raise InputError(f"{path}: glTF of version {version} is not supported; export glTF 2.0")
+        chunks, at = {}, 12
+        while at + 8 <= len(data):
+            size, kind = struct.unpack_from("<I4s", data, at)
+            chunks.setdefault(kind, data[at + 8 : at + 8 + size])
+            at += 8 + size
+        if at > len(data):
+            raise InputError(f"{path}: the file ends within a chunk")
+        data, chunk = chunks[b"JSON"], chunks.get(b"BIN\0")
+    header = json.loads(data)
+    version = header.get("asset", {}).get("version", "2.0")
+    if not version.startswith("2."):
+        raise InputError(f"{path}: glTF of version {version[:20]} is not supported; export glTF 2.0")
+    return _File(path, header, chunk)
+
+
+def _placed(file: _File) -> Iterator[tuple[dict, np.ndarray]]:
+    """The nodes of the default scene, or where there are no scenes all, each with the matrix that places it."""
+    nodes = file.header.get("nodes", [])
+    if file.header.get("scenes"):
+        roots = file.entry("scenes", file.header.get("scene", 0)).get("nodes", [])
+    else:
+        roots = set(range(len(nodes))).difference(*(node.get("children", []) for node in nodes))
+    waiting = [(number, np.eye(4)) for number in reversed(list(roots))]
+    seen = set()
+    while waiting:
+        number, above = waiting.pop()
+        if number in seen:
+            raise InputError(f"{file.path}: node {number} has two parents")
+        seen.add(number)
+        node = file.entry("nodes", number)
+        matrix = above @ _local(node)
+        yield node, matrix
+        waiting += [(child, matrix) for child in reversed(node.get("children", []))]
+
+
+def _local(node: dict) -> np.ndarray:
+    if "matrix" in node:
+        return np.reshape(np.array(node["matrix"], np.float64), (4, 4)).T
+    x, y, z, w = np.array(node.get("rotation", [0, 0, 0, 1])) / np.linalg.norm(node.get("rotation", 1))
+    turn = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    matrix = np.eye(4)
+    matrix[:3, :3] = turn * np.array(node.get("scale", [1, 1, 1]), np.float64)
+    matrix[:3, 3] = node.get("translation", [0, 0, 0])
+    return matrix
+
+
+def _part(file: _File, primitive: dict, matrix: np.ndarray) -> Raw:
+    """A primitive of a mesh, in the space of the scene."""
+    attributes, mode = primitive["attributes"], primitive.get("mode", TRIANGLES)
+    vertices = file.accessor(attributes["POSITION"]).astype(np.float64)
+    index = file.accessor(primitive["indices"])[:, 0] if "indices" in primitive else np.arange(len(vertices))
+    if index.dtype.kind not in "iu":
+        raise InputError(f"{file.path}: its indices are not integers")
+    index = index.astype(np.int64)
+    if mode == TRIANGLES and len(index) % 3 == 0:
+        faces = index.reshape(-1, 3)
+    elif mode == STRIP:
+        faces = strips(index, np.array([len(index)]))
+    elif mode == FAN:
+        faces = np.stack([index[1:-1], index[2:], np.repeat(index[:1], max(len(index) - 2, 0))], axis=1)
+    else:
+        raise InputError(f"{file.path}: {len(index)} corners of a primitive of mode {mode} make no triangles")
+
+    def attribute(name: str, width: int) -> np.ndarray | None:
+        if name not in attributes:
+            return None
+        values = file.accessor(attributes[name])
+        if values.shape != (len(vertices), width):
+            raise InputError(f"{file.path}: {name} has the shape {values.shape} beside {len(vertices)} positions")
+        if values.dtype.kind in "iu":
+            raise file.refuse(f"integer {name}")
+        return values
+
+    linear = matrix[:3, :3]
+    normals = attribute("NORMAL", 3)
+    if normals is not None:
+        # The inverse transpose but for its scale; it exists where `linear` flattens, too.
+        cofactors = np.stack([np.cross(linear[k - 2], linear[k - 1]) for k in range(3)])
+        normals = normals @ cofactors.T * np.copysign(1, np.linalg.det(linear))
+    if np.linalg.det(linear) < 0:  # the format says that a mirroring node reverses the winding
+        faces = faces[:, ::-1]
+    vertices = vertices @ linear.T + matrix[:3, 3]
+    return Raw(vertices, faces.ravel(), normals=normals, uv=attribute("TEXCOORD_0", 2))
+
+
+def _joined(parts: list[Raw], notes: tuple[str, ...]) -> Raw:
+    """One mesh of several; normals or uv that only some have are zeros in the others."""
+    starts = np.cumsum([0] + [len(part.vertices) for part in parts])
+
+    def column(values: list[np.ndarray | None], width: int) -> np.ndarray | None:
+        if all(value is None for value in values):
+            return None
+        filled = (np.zeros((len(part.vertices), width)) for part in parts)
+        return np.concatenate([zeros if value is None else value for value, zeros in zip(values, filled, strict=True)])
+
+    empty = Raw(np.zeros((0, 3)), np.zeros(0, np.int64))
+    return Raw(
+        np.concatenate([part.vertices for part in [empty, *parts]]),
+        np.concatenate([empty.corners, *(part.corners + start for part, start in zip(parts, starts, strict=False))]),
+        normals=column([part.normals for part in parts], 3),
+        uv=column([part.uv for part in parts], 2),
+        notes=notes,
+    )
