@@ -68,7 +68,8 @@ def load(
             given, lacking = np.empty_like(vertices), np.ones(len(vertices), bool)
         else:
             given = raw.normals @ np.linalg.inv(to_world[:3, :3])
-            lacking = ~given.any(axis=1)
+            lengths = np.linalg.norm(given, axis=1)
+            lacking = (lengths == 0) | np.isinf(lengths)
             if np.linalg.det(to_world[:3, :3]) < 0:
                 faces, area_vectors = faces[:, ::-1], -area_vectors
             if lacking[faces].any():

@@ -159,6 +159,14 @@ def test_vertices_without_normal_get_a_smooth_one_and_a_note(write):
     assert any("without a normal" in note for note in notes)
 
 
+@pytest.mark.parametrize("size", ["1e-200", "1e200", "1e-30", "1e30"])
+def test_normals_of_any_length_are_made_unit(write, size):
+    """Or are none, where the square of their length is out of range."""
+    text = OBJ["no normals"].replace("f 1 2 3", f"vn 0 0 {size}\nf 1//1 2//1 3//1")
+    mesh, _ = load(write("obj", text), "obj", IDENTITY)
+    np.testing.assert_allclose(mesh.normals[mesh.faces[0]], [[0, 0, 1]] * 3, atol=1e-12)
+
+
 @pytest.mark.parametrize(
     ("kind", "text", "words"),
     [
