@@ -67,9 +67,10 @@ def load(
         if raw.normals is None:
             given, lacking = np.empty_like(vertices), np.ones(len(vertices), bool)
         else:
-            given = raw.normals @ np.linalg.inv(to_world[:3, :3])
-            lengths = np.linalg.norm(given, axis=1)
-            lacking = (lengths == 0) | np.isinf(lengths)
+            with np.errstate(over="ignore"):
+                given = raw.normals @ np.linalg.inv(to_world[:3, :3])
+                lengths = np.linalg.norm(given, axis=1)
+            lacking = (lengths == 0) | ~np.isfinite(lengths)
             if np.linalg.det(to_world[:3, :3]) < 0:
                 faces, area_vectors = faces[:, ::-1], -area_vectors
             if lacking[faces].any():
