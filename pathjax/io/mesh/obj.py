@@ -87,11 +87,10 @@ def _logical_lines(text: bytes) -> bytes:
 
 def _keywords(path: Path, text: bytes, data: np.ndarray, lines: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(L,) kinds of the lines, and (L,) how many words follow the keyword, which becomes space in `data`."""
-    starts = _word_starts(SPACE[data])
-    ends = np.cumsum(lines)
-    words = np.diff(np.cumsum(starts, dtype=np.int32)[ends - 1], prepend=0)
+    starts, ends = np.flatnonzero(_word_starts(SPACE[data])), np.cumsum(lines)
+    words = np.diff(np.searchsorted(starts, ends), prepend=0)
     filled = np.flatnonzero(words)
-    first = np.flatnonzero(starts)[(np.cumsum(words) - words)[filled]]
+    first = starts[(np.cumsum(words) - words)[filled]]
     kind = np.full(len(lines), EMPTY, np.int8)
     kind[filled] = OTHER
     for k, name in enumerate([*TABLES, "f"]):
