@@ -51,7 +51,8 @@ def faces_of_mesh(vertices, glass: bool, lamp: bool, dtype) -> Faces:
     largest = some[np.argmax(triangle.area(some))]
     corner, edge, normal = largest[0], largest[1] - largest[0], triangle.face_normals(largest[None])[0, 0]
     from_corner = vertices - corner
-    if np.abs(from_corner @ normal).max() > 2 * _precision(dtype) * (np.abs(vertices) @ np.abs(normal)).max():
+    flat = np.abs(from_corner @ normal).max() <= 2 * _precision(dtype) * (np.abs(vertices) @ np.abs(normal)).max()
+    if not flat:
         return Faces(vertices, None, None, glass, lamp)
     axes = np.stack([edge, np.cross(normal, edge)]) / np.linalg.norm(edge)
     places = from_corner @ axes.T
