@@ -7,6 +7,9 @@ when the backend starts, so this module sets it on import.
 
 Side effect on other code in the process: a user's own JAX loop over large element-wise arrays is then compiled for
 one thread. `PATHJAX_NATIVE_LOOPS=0` in the environment opts out; pathjax still works, slowly.
+
+A kernel on several devices ends in an all-gather, whose parts wait for each other in threads of XLA's pool. XLA aborts
+the process where that takes a minute, so two limits are raised on import too: on those threads, and on that time.
 """
 
 from __future__ import annotations
@@ -16,6 +19,7 @@ import hashlib
 import itertools
 import os
 import platform
+import re
 import sys
 import warnings
 from collections import deque
@@ -26,6 +30,7 @@ from pathlib import Path
 
 import jax
 import jax.numpy as jnp
+import jaxlib
 import numpy as np
 from jax import lax
 from jax.custom_batching import custom_vmap
@@ -39,6 +44,19 @@ _FLAG = f"--xla_backend_extra_options={_OPTION}=1000000000000"
 _WIDTH_OPTION = "xla_cpu_prefer_vector_width"
 _WIDTH_FLAG = f"--{_WIDTH_OPTION}=512"
 _DEVICE_FLAG = "xla_force_host_platform_device_count"
+# A Python thread that starts computations on several devices faster than they end, 32 on each, holds a thread of the
+# pool for each device until one ends. XLA makes a thread for each core, and where all are held, the part of an
+# all-gather that another one waits for never begins. Of these, one for each device runs kernels, and three Python
+# threads may hold the others.
+_POOL_VARIABLE, _POOL_OF_A_DEVICE = "PJRT_NPROC", 4
+# Of an all-gather XLA aborts where the last part comes a minute after the first: of two devices one may have the longer
+# half of an image, or a busy core. These are three years; jaxlib 0.7 does not know the flags.
+_PATIENCE_OPTION = "xla_cpu_collective_call"
+_PATIENCE_FLAGS = " ".join(
+    f"--{_PATIENCE_OPTION}_{what}_timeout_seconds={10**8}"
+    for what in ("warn_stuck", "terminate")
+    if tuple(map(int, jaxlib.__version__.split(".")[:2])) >= (0, 8)
+)
 # Items that a native loop takes at once: enough that loops over them vectorise and their overheads vanish, few enough
 # that what they keep stays in the nearest caches. Few items would leave most of the lanes idle.
 _LANES, _FEW_LANES = 256, 64
@@ -58,8 +76,11 @@ def _set_up() -> None:
     wanted = native and _OPTION not in flags
     if wanted:
         width = "" if _WIDTH_OPTION in flags else _WIDTH_FLAG
-        os.environ["XLA_FLAGS"] = " ".join(filter(None, (flags, _FLAG, width)))
+        patience = "" if _PATIENCE_OPTION in flags else _PATIENCE_FLAGS
+        os.environ["XLA_FLAGS"] = " ".join(filter(None, (flags, _FLAG, width, patience)))
     devices_chosen = _DEVICE_FLAG in flags or jax.config.jax_num_cpu_devices >= 0
+    devices = max(_cores(), jax.config.jax_num_cpu_devices, *map(int, re.findall(rf"{_DEVICE_FLAG}=(\d+)", flags)))
+    os.environ.setdefault(_POOL_VARIABLE, str(_POOL_OF_A_DEVICE * devices))
     try:
         if not devices_chosen:
             jax.config.update("jax_num_cpu_devices", _cores())

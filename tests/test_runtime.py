@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
 import threading
@@ -24,7 +25,8 @@ def python(root):
     """(code, **environment) -> what it prints as JSON on its last line, and its stderr; in a process of its own."""
 
     def run(code, **environment):
-        kept = {name: value for name, value in os.environ.items() if not name.startswith(("XLA_", "JAX_", "PATHJAX_"))}
+        ours = "XLA_", "JAX_", "PATHJAX_", "PJRT_"
+        kept = {name: value for name, value in os.environ.items() if not name.startswith(ours)}
         kept["PYTHONPATH"] = os.pathsep.join(filter(None, [str(root), os.environ.get("PYTHONPATH")]))
         command = [sys.executable, "-c", "import json\n" + code]
         done = subprocess.run(command, capture_output=True, text=True, timeout=120, env=kept | environment)
@@ -127,6 +129,80 @@ def test_renders_are_right_without_native_loops(python, root, opted_out):
     assert ("UserWarning" in err) == (not opted_out)
     rho = np.array([0.2, 0.5, 0.8])
     np.testing.assert_allclose(image, np.broadcast_to((1 - rho**4) / (1 - rho), (4, 4, 3)), rtol=1e-5)
+
+
+def test_parts_of_a_kernel_may_end_long_after_each_other(python):
+    """XLA takes such a time for a hanging program's, and aborts; of jaxlib 0.7 nobody can ask for more."""
+    (flags, _, _), _ = python(FLAGS_AND_DEVICES)
+    if "terminate_timeout" not in runtime._PATIENCE_FLAGS:
+        pytest.skip("this jaxlib has no such flag")
+    year = 365 * 86400
+    assert all(int(seconds) > year for seconds in re.findall(r"collective_call_\w+_timeout_seconds=(\d+)", flags))
+    assert len(re.findall("collective_call", flags)) == 2
+    mine = "--xla_cpu_collective_call_terminate_timeout_seconds=50"
+    (flags, _, _), _ = python(FLAGS_AND_DEVICES, XLA_FLAGS=mine)
+    assert flags.startswith(mine) and flags.count("collective_call") == 1
+
+
+UNEVEN = """
+import jax, jax.numpy as jnp
+from pathjax.runtime import native_map
+
+def spin(item, times):
+    def turn(state):
+        return state[0] + 1, jnp.sin(state[1]) + 1
+    return jax.lax.while_loop(lambda state: state[0] < jnp.where(item == 1, times, 1), turn, (0, 0.0))[1]
+
+run = jax.jit(lambda times: native_map(spin, jnp.arange(2), times))
+"""
+
+
+@pytest.mark.slow
+def test_one_device_may_need_minutes_longer_than_the_other(python):
+    code = UNEVEN + "import time\nrun(1)\nbegin, times = time.time(), 1 << 24\n"
+    code += "while time.time() < begin + 1: run(times).block_until_ready(); times *= 2\n"
+    code += "begin = time.time(); run(times).block_until_ready(); each = (time.time() - begin) / times\n"
+    code += "print(json.dumps(run(int(70 / each)).tolist()))"
+    python(code, JAX_NUM_CPU_DEVICES="2")
+
+
+AHEAD = """
+import os
+import jax, jax.numpy as jnp, numpy as np
+from functools import partial
+from jax.sharding import Mesh, PartitionSpec as P
+from pathjax.runtime import native_map
+
+@jax.jit
+@partial(jax.shard_map, mesh=Mesh(np.array(jax.devices()), "d"), in_specs=(P("d"), P()), out_specs=P("d"))
+def late_on_one(device, times):
+    def turn(state):
+        return state[0] + 1, jnp.sin(state[1]) + 1
+    return jax.lax.while_loop(lambda state: state[0] < device[0] * times, turn, (0 * device[0], 0.0 * device))[1]
+
+kernel = jax.jit(lambda xs: native_map(jnp.sin, xs))
+devices, xs = jnp.arange(2), jnp.arange(64.0)
+for _ in range(40):
+    late_on_one(devices, 1 << 20)
+    y = kernel(xs)
+    for _ in range(70):
+        y = y + y
+    y.block_until_ready()
+print(json.dumps(len(jax.devices())))
+"""
+
+
+def test_many_operations_may_wait_for_a_kernel_on_several_devices(python):
+    """XLA holds those beyond 32 in the threads that the kernel needs. Some jaxlib then wait for ever in one of some ten
+    of these rounds; XLA ends that after its limit on the time, here 20 seconds.
+    """
+    limits = "".join(f" --xla_cpu_collective_call_{what}_timeout_seconds=10" for what in ("warn_stuck", "terminate"))
+    python(AHEAD, JAX_NUM_CPU_DEVICES="2", XLA_FLAGS=limits if runtime._PATIENCE_FLAGS else "")
+
+
+def test_users_number_of_threads_is_kept(python):
+    number, _ = python("import os, pathjax\nprint(json.dumps(os.environ['PJRT_NPROC']))", PJRT_NPROC="3")
+    assert number == "3"
 
 
 IMPORTS = """

@@ -62,11 +62,16 @@ def image(scene: Scene, light: Radiosity, spp: int = 16, seed: int = 0) -> jax.A
             "this scene hides its emitters from the camera, and patches show them; load it with hide_emitters false"
         )
     pixels = jnp.arange(film.pixel_count(scene.film), dtype=jnp.int32)
-    total = 0
+    total = jnp.zeros((len(pixels), 3), light.L.dtype)
     for number in range(spp):
-        patch, weight = _seen(replace(scene, about=None), light.patches, pixels, jnp.uint32(number), jnp.uint32(seed))
-        total = total + weight[:, None] * light.L[patch]
+        total = _with_sample(total, replace(scene, about=None), light, pixels, jnp.uint32(number), jnp.uint32(seed))
     return (total / spp).reshape(*film.image_shape(scene.film), 3)
+
+
+@jax.jit
+def _with_sample(total, scene, light, pixels, number, seed):
+    patch, weight = _seen(scene, light.patches, pixels, number, seed)
+    return total + weight[:, None] * light.L[patch]
 
 
 @partial(jax.jit, static_argnames=("form", "devices"))
