@@ -48,8 +48,8 @@ def with_fresnel(materials: Materials, fresnel: str) -> Materials:
 
 
 def select(materials: Materials, shape, front):
-    """Kind and row, () int32 each, of the side of a shape."""
-    kind, row = at(materials.sides, shape, jnp.where(front, 0, 1))
+    """Kind and row, () int32 each, of the side of a shape; where there is none, -1, those of some shape."""
+    kind, row = at(materials.sides, jnp.maximum(shape, 0), jnp.where(front, 0, 1))
     return kind, row
 
 
