@@ -238,6 +238,23 @@ def test_metals(make_scene, angle):
         np.testing.assert_allclose(J[name], wanted, rtol=1e-4, atol=2e-6)
 
 
+@pytest.mark.parametrize("angle", [0, 40, 75])
+def test_metals_of_next_to_no_eta(make_scene, angle):
+    """They reflect nearly all, and dI/deta is that at eta = 0, where 1 - F = eta times a closed form."""
+    k, s = np.array([0.5, 2, 30]), np.array([0.9, 0.8, 0.7])
+    scene = metal_sheet(make_scene, angle)
+    cos, sin = np.cos(np.radians(angle)), np.sin(np.radians(angle))
+    b = np.hypot(k, sin)
+    slope = -2 * k * cos / (b * (cos**2 + b**2)) * (1 + (b**2 + sin**2) / (sin**4 + (b * cos) ** 2))
+    for eta in (0, 1e-9, 1e-4):
+        changed = pj.with_parameters(scene, {"metal.eta": [eta] * 3, "metal.k": k})
+        image, J = pj.jacobian(changed, ["metal.eta"], 1)
+        np.testing.assert_allclose(image, np.broadcast_to(2 * s * (1 + eta * slope), (8, 8, 3)), rtol=1e-5)
+        # Pixels see the sheet under slightly other angles; and the slope itself changes by a few eta.
+        expected = np.broadcast_to(np.diag(2 * s * slope), (8, 8, 3, 3))
+        np.testing.assert_allclose(J["metal.eta"], expected, rtol=1e-4 + 10 * eta, atol=1e-9)
+
+
 def test_checkerboard_colours(shipped):
     """Up to depth 5 the screen is met twice at most, so a sample is quadratic in its colours, and central differences
     with the same seed are exact."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 
-from pathjax.core.math import larger, safe_sqrt, smaller
+from pathjax.core.math import safe_sqrt, smaller
 
 
 def dielectric(cos_i, eta):
@@ -49,22 +49,45 @@ def _refraction(cos_i, eta):
 def conductor(cos_i, eta, k):
     """Reflectance of a metal of complex IOR eta + i k, per channel (Born and Wolf; PBRT 4 ed., 9.3.6).
 
+    With a + i b = sqrt((eta + i k)^2 - sin^2), of one polarisation 4 a cos / |a + i b + cos|^2 is not reflected, and of
+    the other (a^2 + b^2 + sin^2) / |(a + i b) cos + sin^2|^2 times that: sums of positive terms, so that neither it nor
+    its derivatives lose digits where nearly all is reflected. Where little is, squares of differences keep them.
+
     Args:
-        cos_i: () in [0, 1]; eta, k: (3,).
+        cos_i: () in [0, 1]; eta, k: (3,) in [0, 1e6].
     Returns:
-        (3,).
+        (3,) in [0, 1].
+    Derivatives are right to rounding, at eta = 0 and k = 0 too, but for points where they are infinite and 0 stands:
+    the critical angle of a medium that does not absorb.
     """
     cos2, sin2 = cos_i * cos_i, (1 - cos_i) * (1 + cos_i)
-    t0 = eta * eta - k * k - sin2
-    a2_b2 = safe_sqrt(t0 * t0 + 4 * eta * eta * k * k)
-    a = safe_sqrt((a2_b2 + t0) / 2)
-    t1, t2 = a2_b2 + cos2, 2 * cos_i * a
-    r_s = _ratio(t1 - t2, t1 + t2)
-    t3, t4 = cos2 * a2_b2 + sin2 * sin2, t2 * sin2
-    r_p = r_s * _ratio(t3 - t4, t3 + t4)
-    return larger((r_s + r_p) / 2, jnp.zeros_like(r_s))
+    # Nothing cancels, be (eta + i k)^2 near 0 or near 1.
+    contrast = (eta - 1) * (eta + 1) - k * k
+    a, b = _complex_sqrt(jnp.where(eta < 0.5, (eta - k) * (eta + k) - sin2, contrast + cos2), 2 * eta * k)
+    b2 = b * b
+    s, p = a + cos_i, a * cos_i + sin2
+    d_s, d_p = s * s + b2, p * p + b2 * cos2
+    absorbed = _ratio(4 * a * cos_i, d_s) * (1 + _ratio(a * a + b2 + sin2, d_p)) / 2
+    little = absorbed > 0.5
+    # cos - a of cos^2 - a^2, which is exact where they are nearly equal.
+    s, p = (contrast + b2) / jnp.where(little, s, 1), a * cos_i - sin2
+    reflected = _ratio(s * s + b2, d_s) * (1 + _ratio(p * p + b2 * cos2, d_p)) / 2
+    return jnp.where(little, reflected, 1 - absorbed)
+
+
+def _complex_sqrt(x, y):
+    """Real and imaginary part of sqrt(x + i y), y >= 0, with derivatives 0 at 0."""
+    right = x >= 0
+    size = jnp.where(right, x, -x)
+    steep = y > size
+    low, high = jnp.where(steep, size, y), jnp.where(steep, y, size)
+    modulus = high * jnp.sqrt(1 + _ratio(low, high) ** 2)
+    large = safe_sqrt((modulus + size) / 2)
+    small = _ratio(y, 2 * large)
+    return jnp.where(right, large, small), jnp.where(right, small, large)
 
 
 def _ratio(a, b):
-    positive = b > 0
-    return jnp.where(positive, a / jnp.where(positive, b, 1), 1)
+    """a / b, and 0 with derivative 0 where the square of b, by which derivatives divide, is 0."""
+    usable = b * b > 0
+    return jnp.where(usable, a / jnp.where(usable, b, 1), 0)

@@ -251,8 +251,48 @@ def test_conductor_derivatives_are_the_analytic_ones(x64):
             np.testing.assert_allclose(slopes, numeric, rtol=1e-6, atol=1e-8)
 
 
+def exact_conductor_slopes(cos_i, eta, k):
+    """Value and derivatives in eta and k, by complex analysis, in the widest floats there are; eta + i k is not 0."""
+    cos_i, eta, k = (np.asarray(x, np.longdouble) for x in (cos_i, eta, k))
+    n = eta + 1j * k
+    w = np.sqrt(np.where(eta < 0.5, n * n - (1 - cos_i) * (1 + cos_i), (n - 1) * (n + 1) + cos_i**2))
+    dw = n / w
+    r_s, dr_s = (cos_i - w) / (cos_i + w), -2 * cos_i * dw / (cos_i + w) ** 2
+    r_p, dr_p = (n * n * cos_i - w) / (n * n * cos_i + w), 2 * n * cos_i * (2 * w - n * dw) / (n * n * cos_i + w) ** 2
+    slope = np.conj(r_s) * dr_s + np.conj(r_p) * dr_p  # |r|^2 changes by 2 Re(conj(r) dr), dn is 1 or i
+    return (abs(r_s) ** 2 + abs(r_p) ** 2) / 2, slope.real, -slope.imag
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_conductor_and_its_derivatives_keep_their_digits(x64, dtype):
+    """From eta or k = 0 to 1e6, from normal to grazing incidence, where next to all is reflected or next to nothing."""
+    numbers = [0, *np.geomspace(1e-7, 1e6, 14), 0.999, 1.001, 1.5, 2, 3.9]
+    cosines = [*np.geomspace(1e-6, 0.1, 6), 0.3, 0.5, 0.7, 0.9, 0.99, 0.9999, 1]
+    c, e, k = (x.ravel().astype(dtype) for x in np.meshgrid(cosines, numbers, numbers))
+    c, e, k = (x[(e > 0) | (k > 0)] for x in (c, e, k))
+    results = jax.jit(jax.vmap(jax.value_and_grad(fresnel.conductor, (1, 2))))(c, e, k)
+    value, slopes = jax.tree.map(np.asarray, results)
+    exact, *exact_slopes = exact_conductor_slopes(c, e, k)
+    eps = np.finfo(dtype).eps
+    np.testing.assert_allclose(value, exact, rtol=0, atol=4 * eps)
+    # At the angle where a large eta reflects no p-wave, the slope of that is 0 and the rest a small difference.
+    size = np.hypot(*exact_slopes) + np.finfo(dtype).tiny
+    for slope, exact_slope in zip(slopes, exact_slopes, strict=True):
+        error = np.where(np.abs(c * e - 1) < 0.1, 0, np.abs(slope - exact_slope) / size)
+        assert error.max() < 300 * eps, (c[error.argmax()], e[error.argmax()], k[error.argmax()])
+
+
+def test_conductor_derivatives_have_no_seams():
+    """Where cases of the formula meet: the real part of n^2 - sin^2 is 0, or as large as the imaginary part; n is 1."""
+    cases = [(1, 1, 1), (1, 2, 2), (0.6, 1, 0.6), (0.0001, 1, 2), (1, 1 + 2**0.5, 1), (1, 0.5, 0.3), (0.5, 1, 0)]
+    c, e, k = np.float32(cases).T
+    slopes = jax.jit(jax.vmap(jax.grad(fresnel.conductor, (1, 2))))(c, e, k)
+    np.testing.assert_allclose(slopes, exact_conductor_slopes(c, e, k)[1:], rtol=2e-5, atol=1e-7)
+
+
 def test_conductor_derivatives_are_finite_everywhere():
-    cases = [(c, e, k) for c in (0, 1e-20, 1e-3, 0.7, 1) for e in (0, 1e-3, 1, 2.5) for k in (0, 1e-3, 1, 100)]
+    cosines = 0, 1e-20, 1e-15, 1e-10, 1e-3, 0.7, 1
+    cases = [(c, e, k) for c in cosines for e in (0, 1e-3, 1, 2.5) for k in (0, 1e-3, 1, 100)]
     # k = 0 at the critical angle, where the medium turns from transparent to totally reflecting.
     cases += [(critical_cos(0.6), 0.6, 0.0), (0.8, 0.6, 0.0)]
     c, e, k = np.float32(cases).T
