@@ -309,7 +309,8 @@ def _mean_and_differences(work, scene, choice, steps, rows, strategy, derivative
             bias = pixel.add_compensated(bias, jnp.where(mine & again, doubled, 0))
             # Shifts of this sample that are still to do are the bits of `todo`.
             touched = (jnp.right_shift(now.glass, rows % 31) & 1) == 1
-            wanted = jnp.repeat(touched, 4, total_repeat_length=len(shifts)) & ((shifts % 4 < 2) | again)
+            touched = jnp.broadcast_to(touched[:, None], (len(rows), 4)).reshape(shifts.shape)  # for each shift
+            wanted = touched & ((shifts % 4 < 2) | again)
             bits = jnp.sum(jnp.where(wanted, jnp.left_shift(jnp.int32(1), shifts), 0), dtype=jnp.int32)
             left = jnp.where(shift < 0, bits, todo)
             next_shift = jnp.where(left == 0, -1, lax.population_count(~left & (left - 1)))

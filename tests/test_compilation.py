@@ -2,18 +2,23 @@
 
 import re
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.extend import source_info_util
 
 import pathjax as pj
-from pathjax import aovs, query, runtime
+from pathjax import aovs, bounces, gradient, ior_step, query, replicates, runtime
 from pathjax.film import pixel_count
 from pathjax.integrators import pixel
+from pathjax.lanes import lanes
+from pathjax.lanes.machine import Lanes
 from pathjax.render import pixel_means
+from pathjax.transport import control, factors, patches, rays, view
 
 ROOT = Path(__file__).resolve().parents[1]
 NAMES = sorted(path.stem for path in (*ROOT.glob("scenes/*.xml"), *ROOT.glob("tests/scenes/*.xml")))
@@ -126,6 +131,99 @@ def test_no_derivative_of_a_million_paths_is_nan(jacobian_kernel_of, name):
     kernel = jacobian_kernel_of(name, which)
     parts = kernel(spp=10**6 // pixel_count(kernel.scene.film), seed=2)
     assert all(np.isfinite(part).all() for part in parts)
+
+
+# ---- nothing that lanes leave to vmap -------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def left_to_vmap(monkeypatch):
+    """What lanes leave to vmap, which costs them their registers, while they are traced: "primitive at file:line"."""
+    found, within = set(), []
+    apply, by_vmap = Lanes.apply, Lanes.by_vmap
+
+    def applied(self, eqn, *rest):
+        within.append(source_info_util.summarize(eqn.source_info))
+        try:
+            return apply(self, eqn, *rest)
+        finally:
+            within.pop()
+
+    def recorded(self, eqn, inputs):
+        place = next(filter(None, reversed(within)), "unknown")  # JAX's own functions have no place but their caller's
+        found.add(f"{eqn.primitive.name} at {place}")
+        return by_vmap(self, eqn, inputs)
+
+    monkeypatch.setattr(Lanes, "apply", applied)
+    monkeypatch.setattr(Lanes, "by_vmap", recorded)
+    return found
+
+
+def trace(kernel, *arguments, **static):
+    """Trace a jitted function anew, whatever JAX has kept of it."""
+    jax.make_jaxpr(partial(kernel.__wrapped__, **static))(*arguments)
+
+
+def test_what_lanes_leave_to_vmap_is_told_with_its_place(left_to_vmap):
+    def f(x):
+        return jnp.sort(x), jnp.repeat(x, 2, total_repeat_length=6)
+
+    jax.make_jaxpr(lanes(f, 4))(jnp.ones((8, 3)))
+    assert {entry.partition(" at ")[0] for entry in left_to_vmap} == {"sort", "gather"}
+    assert all(f"/{Path(__file__).name}:" in entry for entry in left_to_vmap)
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_no_primitive_of_an_image_is_left_to_vmap(shipped, left_to_vmap, name):
+    """What JAX unpacks arrays by, from one version to the next, must have a rule, or all kernels are slower."""
+    scene = replace(shipped(name, res=16), about=None)
+    pixels = jnp.arange(256, dtype=jnp.int32)
+    work = pixels, *pixel.numbers(pixels, 0, 4, 1)
+    for how in ({"strategy": "mis"}, {"strategy": "light", "split_depth": 2, "sampler": "subpixel"}):
+        trace(pixel_means, scene, *work, **how)
+    trace(aovs._render_aovs, scene, *work)
+    trace(query._closest_hit, scene.geometry, jnp.ones((1000, 3)), jnp.ones((1000, 3)))
+    assert not left_to_vmap
+
+
+def test_no_primitive_of_light_on_patches_is_left_to_vmap(shipped, left_to_vmap):
+    scene = replace(shipped("cornell_box", res=16), about=None)
+    pixels = jnp.arange(256, dtype=jnp.int32)
+    work = pixels, *pixel.numbers(pixels, 0, 4, 1)
+    cells, one, seed = patches.cut(shipped("cornell_box", res=16), 50), jnp.uint32(1), jnp.uint32(2)
+    light = view.radiosity(cells, jnp.ones((cells.count, 3)))
+    trace(pixel_means, scene, *work, control.Control(light, jnp.float32(2)), strategy="mis")
+    trace(view._seen, scene, cells, pixels, one, seed)
+    trace(rays._cast, scene.geometry, cells, pixels, pixels, seed)
+    trace(factors._visibility, scene.geometry, cells, pixels % 50, pixels % 49, jnp.int32(8), seed)
+    assert not left_to_vmap
+
+
+QUICK_DERIVATIVES = ("furnace", "glass_ball")
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=() if name in QUICK_DERIVATIVES else pytest.mark.slow) for name in NAMES]
+)
+def test_no_primitive_of_a_derivative_is_left_to_vmap(shipped, left_to_vmap, name):
+    """Nor of the terms of the series, from which derivatives are taken too, nor of the step of an IOR."""
+    scene = shipped(name, res=16)
+    parameters = scene.about.parameters.values()
+    colors = tuple((p.path, p.index) for p in parameters if not gradient.is_glass(p))
+    glass = sorted({p.index[0] for p in parameters if gradient.is_glass(p)})
+    scene, pixels = replace(scene, about=None), jnp.arange(256, dtype=jnp.int32)
+    work = pixels, *pixel.numbers(pixels, 0, 4, 1)
+    wanted = gradient.Wanted(colors, tuple(glass))
+    trace(gradient._jacobians, scene, *work, jnp.full(len(glass), 0.02), wanted=wanted, strategy="mis")
+    series = pixels, jnp.uint32(0), jnp.ones((replicates.COUNT, 256), jnp.uint32), replicates.seeds(1)
+    trace(bounces._kernel, scene, *series, depth=3, strategy="mis", colors=colors)
+    if glass:
+        trace(ior_step.motions, scene, jnp.asarray(glass, jnp.int32))
+        attached = tuple((p.path, p.index) for p in parameters if gradient.is_glass(p))
+        choosing = gradient._choosing_by(scene, glass)
+        wanted = gradient.Wanted(attached, ())
+        trace(gradient._jacobians, choosing, *work, jnp.zeros(0), wanted=wanted, strategy="mis")
+    assert not left_to_vmap
 
 
 # ---- nothing that the scene lacks -----------------------------------------------------------------------------------

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
+import jax
 from jax.extend import core
 
 
@@ -19,6 +21,8 @@ def read_by(eqns) -> set:
 
 def callee(eqn) -> core.ClosedJaxpr | None:
     """What a call runs; None: this is no call."""
+    if eqn.primitive.name == "call_hi_primitive":  # jax 0.12, of what it writes in other primitives
+        return jax.make_jaxpr(partial(eqn.primitive.to_lojax, **eqn.params))(*(v.aval for v in eqn.invars))
     for key in ("jaxpr", "call_jaxpr"):
         if key in eqn.params:
             program = eqn.params[key]

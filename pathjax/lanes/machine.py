@@ -146,7 +146,7 @@ class Lanes:
         if name in RULES:
             result = RULES[name](self, inputs, eqn.params, shape)
             if result is not None:
-                return [result]
+                return list(result) if eqn.primitive.multiple_results else [result]
         elif len(eqn.outvars) == 1 and all(fits(v.aval.shape, shape) for v in eqn.invars):
             return [self.each(partial(eqn.primitive.bind, **eqn.params), inputs, shape)]
         return self.by_vmap(eqn, inputs)

@@ -1,6 +1,7 @@
 """Structure, which costs nothing.
 
-Rules are (lanes, inputs, params, shape of the result) -> value, or None: not by this rule.
+Rules are (lanes, inputs, params, shape of the first result) -> value, or values where the primitive has several, or
+None: not by this rule.
 """
 
 from __future__ import annotations
@@ -25,6 +26,11 @@ def _slice(lanes, inputs, params, shape):
     strides = params["strides"] or [1] * len(shape)
     limits = zip(params["start_indices"], params["limit_indices"], strides, strict=True)
     return inputs[0][tuple(slice(*limit) for limit in limits)]
+
+
+def _unstack(lanes, inputs, params, shape):
+    axis = params["axis"]
+    return [part.reshape(shape) for part in np.split(inputs[0], inputs[0].shape[axis], axis)]
 
 
 def _reduce(op):
@@ -124,6 +130,8 @@ RULES = {
     "slice": _slice,
     "concatenate": lambda lanes, x, params, shape: np.concatenate(list(map(components, x)), params["dimension"]),
     "stack": lambda lanes, x, params, shape: np.stack(list(map(components, x)), params["axis"]),
+    "unstack": _unstack,
+    "split": lambda lanes, x, params, shape: np.split(x[0], np.cumsum(params["sizes"])[:-1], params["axis"]),
     "select_n": lambda lanes, x, params, shape: lanes.each(lax.select_n, x, shape),
     "reduce_sum": _reduce(lax.add),
     "reduce_max": _reduce(lax.max),
