@@ -21,6 +21,7 @@ __all__ = [
     "Jacobian",
     "RenderResult",
     "Scene",
+    "Target",
     "__version__",
     "check_gradient",
     "closest_hit",
@@ -28,6 +29,7 @@ __all__ = [
     "jacobian",
     "load_scene",
     "parameters",
+    "read_target",
     "render",
     "render_aovs",
     "render_bounces",
@@ -57,7 +59,7 @@ def load_scene(file, **parameters) -> Scene:
 
 def __getattr__(name):
     # What needs optimistix or scipy.stats, half a second of imports, is loaded when it is asked for.
-    if name in ("Fit", "fit"):
+    if name in ("Fit", "Target", "fit", "read_target"):
         from pathjax import inverse
 
         return getattr(inverse, name)

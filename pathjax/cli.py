@@ -292,7 +292,7 @@ def _fit(options, output: Output) -> int:
         names.append(name)
         if equals:
             start[name] = _numbers("--param", name, value)
-    target = files.read_rgb(options.target)
+    target = inverse.read_target(options.target)
     scene = _load(options)
     console = Console(stderr=True)
     with console.status("compiling") as status:
@@ -306,7 +306,7 @@ def _fit(options, output: Output) -> int:
     with Interrupts():
         output.file(table, lambda path: write_text(path, json.dumps(facts, indent=1) + "\n"))
         if fit.images:
-            output.file(picture, lambda path: files.write_png(path, report.picture(fit, [target])))
+            output.file(picture, lambda path: files.write_png(path, report.picture(fit, [target.image])))
         output.text(json.dumps(facts) if options.json else report.text(fit))
     return DONE if fit.converged else FAILED
 

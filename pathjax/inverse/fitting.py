@@ -43,6 +43,9 @@ SMALL_STEP, LARGE_STEP = 0.3, 0.3
 NOISE_SPP = 8
 # Variances are floored at this part of their mean, so that no pixel weighs beyond measure.
 NOISE_FLOOR = 0.05
+# Pixels are left out that lie this many standard deviations of noise or less below the level where the target is
+# clipped: what is then lost of normal noise moves their mean by 1e-4 standard deviations.
+CLIP_MARGIN = 4
 # What float32 leaves of the mean of a pixel; scenes without noise are fitted to that.
 ROUNDING = 1e-5
 # Relative indices of refraction to try before a local method begins, from almost none to diamond's; a few at a time.
@@ -66,7 +69,7 @@ class Fit:
     converged: bool
     message: str  # why it ended, and what to mind
     images: list[np.ndarray]  # of each view (H, W, 3), at the end
-    residuals: list[np.ndarray]  # of each view (H, W, 3): image - target, in standard deviations of their difference
+    residuals: list[np.ndarray]  # of each view (H, W, 3): image - target, in standard deviations; nan where left out
     history: list[dict]  # of each step: stage, spp, values, loss, seconds
     compile_seconds: float
     run_seconds: float
@@ -101,8 +104,8 @@ def fit(
 
     Args:
         scene: a scene, or a list of views; views share parameters by name.
-        target: linear RGB (H, W, 3), or a list of them, one for each view. Its noise must be independent from pixel to
-            pixel; how large it is, the fit finds out.
+        target: linear RGB (H, W, 3) or a `Target`, as `read_target` returns it; or a list of them, one for each view.
+            Its noise must be independent from pixel to pixel; how large it is, the fit finds out.
         names: parameters to recover, of `parameters`.
         start: values to begin with; default: the scene's.
         spp: samples per pixel of each of the two independent renders of the last stage.
@@ -113,11 +116,13 @@ def fit(
         Fit. Ctrl-C ends it with what it has, marked as not converged.
     Raises:
         InputError: an unknown or repeated name, a start outside its bounds, a target of another size, with negative or
-            non-finite values, fewer pixels than unknowns.
-    Standard errors come from the scatter of the scores over pixels (White 1980). They hold the noise of target, renders
-    and Jacobians, and suppose that the scene can look like the target: `converged` is False where neighbouring
-    residuals agree too well for noise. The differences that stand for derivatives in an IOR have a bias (`jacobian`),
-    which does not move the root of the score.
+            non-finite values, fewer measured pixels than unknowns.
+    Standard errors come from the scatter of the scores over pixels (White 1980). They hold the noise of target, its
+    rounding, renders and Jacobians, and suppose that the scene can look like the target: `converged` is False where
+    neighbouring residuals agree too well for noise (`uncertainty.structure`). The differences that stand for
+    derivatives in an IOR have a bias (`jacobian`), which does not move the root of the score.
+    Clipped pixels are left out, and so are those that noise may have clipped: to leave out only those that it did clip
+    would keep the darker ones. Which these are is told by renders and the noise around, never by the pixel itself.
     """
     if not isinstance(spp, int) or not 1 <= spp < 2**31:
         raise InputError(f"spp = {spp}; it must be an integer in [1, 2^31)")
@@ -154,7 +159,10 @@ class _Run:
         self.started, self.compile_seconds = time.perf_counter(), 0.0
         self.evidence: Evidence | None = None
         self.weights = [jnp.ones_like(views.targets) for views in self.groups]
+        self.noise: list[np.ndarray] = []  # of each view (H, W, 3) variance, in the caller's order
         self._scan = self._approach = self._refine = self.solution = None
+        brightness = np.concatenate([target.image[target.usable] for target in problem.targets]).mean()
+        self.brightness = max(brightness, np.finfo(np.float32).tiny ** 0.25)
         self.free, self.scale = np.ones(self.n, bool), self.coordinates.scale(self.v)
 
     def run(self, scan: bool) -> Fit:
@@ -170,28 +178,28 @@ class _Run:
         for v in candidates:
             # A local method ends in the nearest minimum; a wrong one shows in its residuals.
             self.v = v
-            self._weigh()
             self._approach_with(min(APPROACH_SPP, self.spp))
-            self._weigh()
-            share, structured = self._structure()
-            if best is None or share < best[0]:
-                best = share, self.v
+            self._weigh(self.spp, refining=True)
+            agreement, structured = self._structure()
+            if best is None or agreement < best[0]:
+                best = agreement, self.v
             if not structured:
                 break
         if self.v is not best[1]:
             self.v = best[1]
-            self._weigh()
+            self._weigh(self.spp, refining=True)
         return self._refined()
 
     # ---- approach: least squares with a fixed seed ------------------------------------------------------------------
 
     def _approach_with(self, spp):
+        self._weigh(spp)
         x = jnp.asarray(self.coordinates.unbounded(self.v), self.dtype)
         # In units of the noise at this level; but a start far off is no more than 1 on average, since the first steps
         # of solvers suppose numbers of that size.
         squares = self._flat_weights() * self.evidence.residuals[0] ** 2
-        shrink = 1 / max(1, float(squares.mean()) * spp / NOISE_SPP)
-        weights = [weight * (shrink * spp / NOISE_SPP) for weight in self.weights]
+        shrink = 1 / max(1, float(squares.mean()))
+        weights = [weight * shrink for weight in self.weights]
         arguments = self.groups, weights, jnp.uint32(spp), self.seed, self._next_draw()
         if self._approach is None:
             least_squares = isinstance(self.solver, optx.AbstractLeastSquaresSolver)
@@ -230,10 +238,10 @@ class _Run:
         # Where a bound holds a component, the curvature still says how well it is known.
         everything = np.ones(self.n, bool)
         self.solution = uncertainty.solve(self.evidence, self._flat_weights(), self.scale, everything)
-        share, structured = self._structure()
+        agreement, structured = self._structure()
         if structured:
             return False, (
-                f"the residuals have structure: neighbouring pixels share {share:.0%} of their variance. This is a "
+                f"the residuals have structure: neighbouring pixels are correlated by {agreement:.0%}. This is a "
                 "local minimum, or the scene cannot look like the target; try other starts, and look at the residuals"
             )
         if not converged:
@@ -273,18 +281,34 @@ class _Run:
         self.evidence = jax.tree.map(np.asarray, evidence)
         return np.asarray(moved, float)
 
-    def _weigh(self):
-        """Weights from the variance of a render at the current values, smoothed over neighbours."""
+    def _weigh(self, spp, refining=False):
+        """Weights from the noise of renders of `spp` samples at the current values, and of the target's rounding.
+
+        The target's own noise is taken to be like that of the renders. While the values are approached, clipped pixels
+        have no weight; when they are refined, neither have those that noise may have clipped.
+        """
         zero, scale, nowhere = np.zeros(self.n), self.coordinates.scale(self.v), np.zeros((self.n, self.n))
         self._newton_step(zero, self.v, scale, nowhere, NOISE_SPP, self._next_draw())
-        a, b = self.evidence.residuals
-        weights = []
-        targets = self._by_view(self._flat_targets())
-        brightness = max(np.mean([target.mean() for target in targets]), np.finfo(np.float32).tiny ** 0.25)
-        for squares in self._by_view((a - b) ** 2 / 2):
-            variance = ndimage.uniform_filter(squares.mean(-1, keepdims=True), (3, 3, 1))
-            floor = NOISE_FLOOR * variance.mean() + (ROUNDING * brightness) ** 2
-            weights.append(np.broadcast_to(1 / (variance + floor), squares.shape))
+        targets = self.problem.targets
+        halves = list(zip(*map(self._by_view, self.evidence.residuals), strict=True))
+        variances, ratios = [], []
+        for (a, b), target in zip(halves, targets, strict=True):
+            squares = ((a - b) ** 2).mean(-1, keepdims=True) / 2
+            variance = ndimage.uniform_filter(squares, (3, 3, 1)) * (NOISE_SPP / spp)
+            variances.append(variance + NOISE_FLOOR * variance.mean() + (ROUNDING * self.brightness) ** 2)
+            ratios.append((a * b / variances[-1])[target.usable])
+        self.noise = [v + target.step**2 / 12 for v, target in zip(variances, targets, strict=True)]
+        usable = [target.usable for target in targets]
+        if refining:
+            # The target's variance over that of such a render: an upper bound, but no more than one sample's.
+            ratios = np.concatenate(ratios)
+            ratio = np.clip(ratios.mean() + 2 * ratios.std() / np.sqrt(ratios.size), 0, spp)
+            for i, ((a, b), target) in enumerate(zip(halves, targets, strict=True)):
+                # The image is known by two renders and three by three pixels.
+                image = ndimage.uniform_filter((a + b) / 2 + target.image, (3, 3, 1))
+                variance = variances[i] * (ratio + spp / NOISE_SPP / 18) + target.step**2 / 12
+                usable[i] = usable[i] & (image + CLIP_MARGIN * np.sqrt(variance) < target.ceiling)
+        weights = [u / noise for u, noise in zip(usable, self.noise, strict=True)]
         self.weights = [jnp.asarray(np.stack([weights[i] for i in views.numbers]), self.dtype) for views in self.groups]
 
     # ---- scan: where a local method should begin --------------------------------------------------------------------
@@ -294,11 +318,10 @@ class _Run:
         names = [name for name, p in self.coordinates.parameters if is_glass(p)]
         candidates = [self.v]
         if names:
-            self._weigh()
             if len(names) < len(self.coordinates.parameters):
                 # Colours first: a wrong index of refraction leaves them nearly right, and wrong ones may hide it.
                 self._approach_with(min(APPROACH_SPP, self.spp))
-                self._weigh()
+            self._weigh(SCAN_SPP)
         for name in names * min(len(names), 2):
             tried = np.stack([self._at_ratio(name, ratio) for ratio in SCAN])
             misfits = np.concatenate([self._misfits(chunk) for chunk in np.split(tried, len(SCAN) // SCAN_CHUNK)])
@@ -369,13 +392,16 @@ class _Run:
         return (self._flat_weights() * a * b).sum() / 2
 
     def _structure(self):
-        """Share of the residuals' variance that neighbouring pixels have in common, and whether that is no chance."""
-        pairs = [np.stack(pair) for pair in zip(*map(self._by_view, self.evidence.residuals), strict=True)]
-        share, significance = uncertainty.structure(pairs, self._by_view(self._flat_weights()))
-        rms = np.sqrt(np.mean(self.evidence.residuals.mean(0) ** 2))
-        more_than_rounding = rms > ROUNDING * self._flat_targets().mean()
-        certain = share > uncertainty.STRUCTURE_SHARE and significance > uncertainty.STRUCTURE_SIGNIFICANCE
-        return share, certain and more_than_rounding
+        """How well neighbouring residuals agree, and whether that is no chance."""
+        differences, misfits = [], []
+        means = self._by_view(self.evidence.residuals.mean(0))
+        for mean, target, noise in zip(means, self.problem.targets, self.noise, strict=True):
+            differences.append(np.where(target.usable, mean / np.sqrt(noise), np.nan))
+            misfits.append(target.misfit(target.image + mean) / np.sqrt(noise))
+        agreement, significance = uncertainty.structure(differences, misfits)
+        used = np.concatenate([mean[target.usable] for mean, target in zip(means, self.problem.targets, strict=True)])
+        more_than_rounding = np.sqrt(np.mean(used**2)) > ROUNDING * self.brightness
+        return agreement, significance > uncertainty.STRUCTURE_SIGNIFICANCE and more_than_rounding
 
     def _result(self, converged, message) -> Fit:
         labels, values = self.coordinates.labels, self.coordinates.unpack(self.v)
@@ -393,12 +419,13 @@ class _Run:
         scenes = [self._at_values(scene, values) for scene in self.problem.scenes]
         images, residuals = [], []
         if self.evidence is not None:
-            (a, b), targets = map(self._by_view, self.evidence.residuals), self._by_view(self._flat_targets())
-            for x, y, target, weight in zip(a, b, targets, self._by_view(self._flat_weights()), strict=True):
-                images.append((x + y) / 2 + target)
+            means = self._by_view(self.evidence.residuals.mean(0))
+            for mean, target, noise in zip(means, self.problem.targets, self.noise, strict=True):
+                images.append(mean + target.image)
                 # Of both: the scatter of the residuals themselves says how noisy the target is.
-                relative = (x + y) / 2 * np.sqrt(weight)
-                residuals.append(relative / max(relative.std(), np.finfo(float).tiny))
+                relative = np.where(target.usable, mean / np.sqrt(noise), np.nan)
+                spread = np.nanstd(relative) if target.usable.any() else 1.0
+                residuals.append(relative / max(spread, np.finfo(float).tiny))
         seconds = time.perf_counter() - self.started
         return Fit(
             values,
@@ -416,6 +443,3 @@ class _Run:
             seconds - self.compile_seconds,
             scenes,
         )
-
-    def _flat_targets(self):
-        return np.concatenate([np.asarray(views.targets).reshape(-1, 3) for views in self.groups])

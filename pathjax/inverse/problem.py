@@ -11,6 +11,7 @@ import numpy as np
 from pathjax import film, named
 from pathjax.errors import InputError
 from pathjax.inverse.coordinates import Coordinates
+from pathjax.inverse.target import Target
 from pathjax.scene import Scene
 
 
@@ -51,6 +52,7 @@ class Views:
 @dataclass(frozen=True)
 class Problem:
     scenes: list[Scene]
+    targets: list[Target]  # of arrays (H, W, 3) throughout; the image is 0 where it is not measured
     groups: list[Views]
     coordinates: Coordinates
     start: np.ndarray  # (n,) values
@@ -81,24 +83,37 @@ def build(scene, target, names, start) -> Problem:
         values[name] = named.checked(f"start of {name}:", value, found[name], dtype)
     targets = [_target(s, t, i, len(scenes)) for i, (s, t) in enumerate(zip(scenes, targets, strict=True))]
     coordinates = Coordinates(tuple(found.items()))
-    pixels, unknowns = sum(t[..., 0].size for t in targets), len(coordinates.labels)
+    pixels, unknowns = sum(int(t.usable.any(-1).sum()) for t in targets), len(coordinates.labels)
+    if not pixels:
+        raise InputError("every pixel of the target is clipped or left out; give one that is exposed for the scene")
     if pixels < unknowns:
         raise InputError(f"{pixels} pixels cannot tell {unknowns} numbers; give larger targets or more views")
-    return Problem(scenes, _groups(scenes, targets, names), coordinates, coordinates.pack(values))
+    return Problem(scenes, targets, _groups(scenes, targets, names), coordinates, coordinates.pack(values))
 
 
-def _target(scene, target, number, count) -> np.ndarray:
+def _target(scene, target, number, count) -> Target:
     which = "the target" if count == 1 else f"target {number}"
-    target = np.asarray(target, np.float64)
-    wanted = (*film.image_shape(scene.film), 3)
-    if target.shape != wanted:
-        raise InputError(f"{which} has the shape {target.shape}; its scene renders {wanted}")
-    if not np.isfinite(target).all():
-        lost = int((~np.isfinite(target)).sum())
-        raise InputError(f"{which} holds {lost} values that are not finite; mend or crop it")
-    if (target < 0).any():
-        raise InputError(f"{which} holds {int((target < 0).sum())} negative values; it must be linear radiance")
-    return target
+    target = target if isinstance(target, Target) else Target(target)
+    image, wanted = np.minimum(np.asarray(target.image, np.float64), target.ceiling), (*film.image_shape(scene.film), 3)
+    if image.shape != wanted:
+        raise InputError(f"{which} has the shape {image.shape}; its scene renders {wanted}")
+    try:
+        step = np.broadcast_to(np.asarray(target.step, np.float64), wanted)
+        measured = np.broadcast_to(np.asarray(target.measured, bool), wanted)
+    except ValueError:
+        raise InputError(f"{which}: step and measured must be one for all, or of the shape {wanted}") from None
+    if not target.ceiling > 0 or not (np.isfinite(step) & (step >= 0))[measured].all():
+        raise InputError(f"{which}: its ceiling must be above 0, and its steps finite and not negative")
+    lost = measured & ~np.isfinite(image)
+    if lost.any():
+        raise InputError(
+            f"{which} holds {int(lost.sum())} values that are not finite; mend it, or leave them out by "
+            "Target(image, measured=...)"
+        )
+    negative = int((image[measured] < 0).sum())
+    if negative:
+        raise InputError(f"{which} holds {negative} negative values; it must be linear radiance")
+    return Target(np.where(measured, image, 0), np.where(measured, step, 0), target.ceiling, measured)
 
 
 def _groups(scenes, targets, names) -> list[Views]:
@@ -120,6 +135,6 @@ def _groups(scenes, targets, names) -> list[Views]:
         first = scenes[numbers[0]]
         scene = jax.tree.unflatten(jax.tree.structure(first), stacked)
         dtype = first.camera.origin.dtype
-        here = jnp.asarray(np.stack([targets[i] for i in numbers]), dtype)
+        here = jnp.asarray(np.stack([targets[i].image for i in numbers]), dtype)
         views.append(Views(scene, here, held, tuple(axes), numbers))
     return views

@@ -14,8 +14,8 @@ MIN_SIGNIFICANCE = 4
 MAX_RELATIVE_ERROR = 0.25
 # Shares of an undetermined direction below which a component is not named, and not given an infinite error.
 NAMED_SHARE, TOUCHED_SHARE = 0.2, 0.03
-# Residuals have structure if neighbours share this part of their variance, with this significance.
-STRUCTURE_SHARE, STRUCTURE_SIGNIFICANCE = 0.15, 5
+# Residuals have structure if they agree with this significance, those beyond the clip being clipped.
+STRUCTURE_SIGNIFICANCE, STRUCTURE_CLIP = 6, 5
 
 
 class Evidence(NamedTuple):
@@ -75,22 +75,32 @@ def solve(evidence: Evidence, weights, scale, free) -> Solution:
     return Solution(inside @ inside.T, covariance, everywhere[:, ~kept], -inside @ (inverse * along.sum(0))[kept])
 
 
-def structure(residuals: list[np.ndarray], weights: list[np.ndarray]) -> tuple[float, float]:
-    """Share of the residuals' variance that neighbouring pixels have in common, and its significance.
+def structure(differences: list[np.ndarray], misfits: list[np.ndarray]) -> tuple[float, float]:
+    """Moran's I of the residuals, -1 to 1, and its significance.
 
     Noise is independent from pixel to pixel, and a wrong image is not: this tells a local minimum, or a scene that
     cannot look like its target, from the answer, however large the noise.
 
+    Their unit is the residuals' median, and the rare large ones count for `STRUCTURE_CLIP` units. So a misfit of a few
+    neighbours, as of a lamp that is wrong, does not hide itself by its own size, and a firefly does not count for many.
+
     Args:
-        residuals: of each view (2, H, W, 3), of two independent renders; weights: of each view (H, W, 3).
+        differences: of each view (H, W, 3) image - target, in any unit in which noise is alike everywhere; nan where
+            the target gives no value.
+        misfits: the same, but 0 where the target may look so, and nan where it says nothing.
     """
-    products, total = [], 0.0
-    for (a, b), weight in zip(residuals, weights, strict=True):
-        a, b = a * np.sqrt(weight), b * np.sqrt(weight)
-        total += (a * b).sum()
-        for x, y in ((a[1:], b[:-1]), (a[:-1], b[1:]), (a[:, 1:], b[:, :-1]), (a[:, :-1], b[:, 1:])):
-            products.append((x * y).sum(-1).ravel() / 4)
-    products = np.concatenate(products)
-    spread = products.std() * np.sqrt(len(products))
-    shared = products.sum()
-    return float(shared / max(total, spread, np.finfo(float).tiny)), float(shared / max(spread, np.finfo(float).tiny))
+    sizes = np.concatenate([np.abs(d[np.isfinite(d)]) for d in differences])
+    # Of normal noise half lies below 0.6745 standard deviations.
+    unit = max(np.median(sizes) / 0.6745, np.finfo(float).tiny)
+    pairs, squares, pixels = [], 0.0, 0
+    for misfit in misfits:
+        known = np.isfinite(misfit).any(-1)
+        f = np.clip(np.nan_to_num(misfit / unit), -STRUCTURE_CLIP, STRUCTURE_CLIP)
+        squares, pixels = squares + np.einsum("hwc,hwd->cd", f, f), pixels + known.sum()
+        for here, there in ((np.s_[1:], np.s_[:-1]), (np.s_[:, 1:], np.s_[:, :-1])):
+            pairs.append((f[here] * f[there]).sum(-1)[known[here] & known[there]])
+    pairs, squares = np.concatenate(pairs), np.maximum(squares / max(pixels, 1), np.finfo(float).tiny)
+    # Of independent pixels: channels of one pixel share their noise.
+    deviation = np.sqrt((squares**2).sum() / max(len(pairs), 1))
+    mean = pairs.sum() / max(len(pairs), 1)
+    return float(mean / np.trace(squares)), float(mean / deviation)

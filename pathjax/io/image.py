@@ -138,7 +138,34 @@ def read_stored(path: str | Path) -> np.ndarray:
     return np.repeat(stored, 3 // channels, axis=-1)
 
 
+def png_storage(path: str | Path) -> tuple[int, np.ndarray]:
+    """Levels above black of a PNG that `read_rgb` has read (255 for 8 bits), and (H, W) bool: which pixels are opaque.
+
+    Raises:
+        InputError: a palette, which holds the nearest of few colours.
+    """
+    with open(path, "rb") as file:
+        bits, color_type = file.read(26)[24:]  # of the header, which comes first
+    if color_type == 3:
+        raise InputError(f"{path}: a palette holds the nearest of few colours; write the image as RGB")
+    with _opened(path) as image:
+        spec = image.spec()
+        if spec.alpha_channel < 0:
+            return 2**bits - 1, np.ones((spec.height, spec.width), bool)
+        alpha = _read(image, 0, spec.alpha_channel, spec.alpha_channel + 1, spec.format)[..., 0]
+    return 2**bits - 1, alpha == np.iinfo(alpha.dtype).max
+
+
 # ---- OpenEXR ------------------------------------------------------------------------------------------------------
+
+
+def exr_storage(path: str | Path) -> tuple[str, bool]:
+    """Compression of an EXR that `read_rgb` has read, by OpenEXR's name, and whether it holds 16-bit floats."""
+    with _opened(path) as image:
+        parts = _parts(image)
+        part, _, indices = _find_colors(parts)
+        compression, *_ = (parts[part].getattribute("compression") or "none").split(":")  # a level may follow
+        return compression.upper(), "half" in {_number(parts[part], i) for i in indices}
 
 
 def read_exr(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, str | int | float]]:

@@ -1,0 +1,74 @@
+"""Images to fit to, and what is known of how they were stored."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from pathjax.errors import InputError
+from pathjax.io import image as files
+
+# What EXR files of these compressions hold differs from what was written, alike in neighbouring pixels.
+_LOSSY = ("B44", "B44A", "DWAA", "DWAB")
+
+
+@dataclass(frozen=True)
+class Target:
+    """An image to fit to. Where a file rounds and clips, `read_target` knows how; arrays of your own may say it here.
+
+    Args:
+        image: (H, W, 3) linear RGB.
+        step: how far apart stored values lie, (H, W, 3) or one for all, in the units of the image; 0: not rounded.
+        ceiling: values at or above it are clipped, and say no more than that.
+        measured: (H, W, 3) or (H, W, 1) bool; the others are left out, whatever they hold, nan included.
+    """
+
+    image: np.ndarray
+    step: np.ndarray | float = 0.0
+    ceiling: float = np.inf
+    measured: np.ndarray | bool = True
+
+    @property
+    def usable(self) -> np.ndarray:
+        """(H, W, 3) bool: neither clipped nor left out."""
+        return self.measured & (self.image < self.ceiling)
+
+    def misfit(self, image: np.ndarray) -> np.ndarray:
+        """(H, W, 3) how far an image is from all that may look like this target; nan where nothing is measured."""
+        difference = image - self.image
+        beyond = difference - np.clip(difference, -self.step / 2, self.step / 2)
+        beyond = np.where(self.usable, beyond, np.minimum(difference, 0))
+        return np.where(self.measured, beyond, np.nan)
+
+
+def read_target(path: str | Path) -> Target:
+    """Read an OpenEXR or PNG file as a target.
+
+    PNG is taken for sRGB. Its rounding is a noise of known size; full scale is clipped, since what is brighter looks
+    the same, and pixels that are not opaque are not measured. A stored 0 is a measurement: radiance is not negative,
+    so it lies within half a step. OpenEXR is linear; halves are rounded too, and end at 65504.
+
+    Raises:
+        InputError: no such file, another format or a damaged one, or one whose compression changes its pixels.
+    """
+    found = files.file_format(path)
+    if found not in ("OpenEXR", "PNG"):
+        raise InputError(f"{path}: {found} changes the pixels that it is given; use OpenEXR or PNG for targets")
+    image = files.read_rgb(path).astype(np.float64)
+    if found == "OpenEXR":
+        compression, half = files.exr_storage(path)
+        if compression in _LOSSY:
+            raise InputError(f"{path}: {compression} compression changes pixels; write the file with ZIP, or none")
+        if not half:
+            return Target(image)
+        largest = float(np.finfo(np.float16).max)
+        step = np.spacing(np.clip(np.abs(image), 0, largest).astype(np.float16)).astype(np.float64)
+        return Target(image, np.nan_to_num(step), largest)
+    levels, opaque = files.png_storage(path)
+    code = np.rint(files.linear_to_srgb(image) * levels)
+    low, high = (files.srgb_to_linear(np.clip((code + half) / levels, 0, None)) for half in (-0.5, 0.5))
+    # Of 0 too the noise is that of a whole step: all of its half lies on one side.
+    step = np.where(code > 0, high - low, 2 * high)
+    return Target(image, step, float(files.srgb_to_linear(1 - 0.5 / levels)), opaque[..., None])
