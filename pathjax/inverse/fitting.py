@@ -159,7 +159,8 @@ class _Run:
         self.started, self.compile_seconds = time.perf_counter(), 0.0
         self.evidence: Evidence | None = None
         self.weights = [jnp.ones_like(views.targets) for views in self.groups]
-        self.noise: list[np.ndarray] = []  # of each view (H, W, 3) variance, in the caller's order
+        # Of each view the variance of a render, and with that of the target's rounding.
+        self.noise = self.variances = [np.ones(target.image.shape) for target in problem.targets]
         self._scan = self._approach = self._refine = self.solution = None
         brightness = np.concatenate([target.image[target.usable] for target in problem.targets]).mean()
         self.brightness = max(brightness, np.finfo(np.float32).tiny ** 0.25)
@@ -237,7 +238,8 @@ class _Run:
             converged = False
         # Where a bound holds a component, the curvature still says how well it is known.
         everything = np.ones(self.n, bool)
-        self.solution = uncertainty.solve(self.evidence, self._flat_weights(), self.scale, everything)
+        solution = uncertainty.solve(self.evidence, self._flat_weights(), self.scale, everything)
+        self.solution = solution._replace(covariance=solution.covariance + self._rounding_covariance(solution))
         agreement, structured = self._structure()
         if structured:
             return False, (
@@ -289,27 +291,36 @@ class _Run:
         """
         zero, scale, nowhere = np.zeros(self.n), self.coordinates.scale(self.v), np.zeros((self.n, self.n))
         self._newton_step(zero, self.v, scale, nowhere, NOISE_SPP, self._next_draw())
-        targets = self.problem.targets
-        halves = list(zip(*map(self._by_view, self.evidence.residuals), strict=True))
-        variances, ratios = [], []
-        for (a, b), target in zip(halves, targets, strict=True):
+        targets, variances = self.problem.targets, []
+        for a, b in self._halves():
             squares = ((a - b) ** 2).mean(-1, keepdims=True) / 2
             variance = ndimage.uniform_filter(squares, (3, 3, 1)) * (NOISE_SPP / spp)
             variances.append(variance + NOISE_FLOOR * variance.mean() + (ROUNDING * self.brightness) ** 2)
-            ratios.append((a * b / variances[-1])[target.usable])
+        self.variances = variances
         self.noise = [v + target.step**2 / 12 for v, target in zip(variances, targets, strict=True)]
         usable = [target.usable for target in targets]
         if refining:
-            # The target's variance over that of such a render: an upper bound, but no more than one sample's.
-            ratios = np.concatenate(ratios)
-            ratio = np.clip(ratios.mean() + 2 * ratios.std() / np.sqrt(ratios.size), 0, spp)
-            for i, ((a, b), target) in enumerate(zip(halves, targets, strict=True)):
+            ratio = self._target_ratio(2)
+            for i, ((a, b), target) in enumerate(zip(self._halves(), targets, strict=True)):
                 # The image is known by two renders and three by three pixels.
                 image = ndimage.uniform_filter((a + b) / 2 + target.image, (3, 3, 1))
                 variance = variances[i] * (ratio + spp / NOISE_SPP / 18) + target.step**2 / 12
                 usable[i] = usable[i] & (image + CLIP_MARGIN * np.sqrt(variance) < target.ceiling)
         weights = [u / noise for u, noise in zip(usable, self.noise, strict=True)]
         self.weights = [jnp.asarray(np.stack([weights[i] for i in views.numbers]), self.dtype) for views in self.groups]
+
+    def _target_ratio(self, errors) -> float:
+        """Variance of the targets over that of renders of `spp` samples, and so many of its standard errors.
+
+        At most that of one sample per pixel: what is more is a misfit.
+        """
+        ratios = np.concatenate(
+            [
+                ((a * b - target.step**2 / 12) / variance)[target.usable]
+                for (a, b), target, variance in zip(self._halves(), self.problem.targets, self.variances, strict=True)
+            ]
+        )
+        return float(np.clip(ratios.mean() + errors * ratios.std() / np.sqrt(ratios.size), 0, self.spp))
 
     # ---- scan: where a local method should begin --------------------------------------------------------------------
 
@@ -386,22 +397,46 @@ class _Run:
             first += size
         return [images[i] for i in range(len(images))]
 
+    def _flat(self, by_view):
+        """The inverse of `_by_view`."""
+        return np.concatenate([by_view[i].reshape(-1, 3) for views in self.groups for i in views.numbers])
+
+    def _halves(self):
+        """Residuals of the two renders, (H, W, 3) each, of each view."""
+        return list(zip(*map(self._by_view, self.evidence.residuals), strict=True))
+
     def _mean_product(self):
         """Half the weighted product of the two renders' residuals: the misfit without the renders' noise."""
         a, b = self.evidence.residuals
         return (self._flat_weights() * a * b).sum() / 2
 
+    def _rounding_covariance(self, solution):
+        """(n, n) of the error that rounded pixels have in common, in units of the scale; noise hides it."""
+        if not any(target.step.any() for target in self.problem.targets):
+            return np.zeros((self.n, self.n))
+        steps, phases, noises, ratio = [], [], [], self._target_ratio(-2)
+        for (a, b), target, variance in zip(self._halves(), self.problem.targets, self.variances, strict=True):
+            step = np.where(target.step > 0, target.step, np.inf)
+            # Neighbours are of nearly equal value where this matters, and their mean is less noisy.
+            image = ndimage.uniform_filter((a + b) / 2 + target.image, (5, 5, 1))
+            steps.append(target.step)
+            phases.append((image - target.image) / step)
+            noises.append(np.sqrt(ratio * variance) / step)
+        jacobian = self.evidence.jacobians.mean(0) * self._flat_weights()[..., None] * self.scale
+        return uncertainty.rounding_covariance(
+            jacobian @ solution.inverse, *(self._flat(parts) for parts in (steps, phases, noises))
+        )
+
     def _structure(self):
         """How well neighbouring residuals agree, and whether that is no chance."""
         differences, misfits = [], []
-        means = self._by_view(self.evidence.residuals.mean(0))
-        for mean, target, noise in zip(means, self.problem.targets, self.noise, strict=True):
-            differences.append(np.where(target.usable, mean / np.sqrt(noise), np.nan))
+        for (a, b), target, noise in zip(self._halves(), self.problem.targets, self.noise, strict=True):
+            mean, rounding = (a + b) / 2, ROUNDING * self.brightness
+            mean = np.where(np.abs(mean) > rounding, mean, 0)
+            differences.append(np.where(target.usable, mean, 0) / np.sqrt(noise))
             misfits.append(target.misfit(target.image + mean) / np.sqrt(noise))
         agreement, significance = uncertainty.structure(differences, misfits)
-        used = np.concatenate([mean[target.usable] for mean, target in zip(means, self.problem.targets, strict=True)])
-        more_than_rounding = np.sqrt(np.mean(used**2)) > ROUNDING * self.brightness
-        return agreement, significance > uncertainty.STRUCTURE_SIGNIFICANCE and more_than_rounding
+        return agreement, significance > uncertainty.STRUCTURE_SIGNIFICANCE
 
     def _result(self, converged, message) -> Fit:
         labels, values = self.coordinates.labels, self.coordinates.unpack(self.v)
@@ -419,8 +454,8 @@ class _Run:
         scenes = [self._at_values(scene, values) for scene in self.problem.scenes]
         images, residuals = [], []
         if self.evidence is not None:
-            means = self._by_view(self.evidence.residuals.mean(0))
-            for mean, target, noise in zip(means, self.problem.targets, self.noise, strict=True):
+            for (a, b), target, noise in zip(self._halves(), self.problem.targets, self.noise, strict=True):
+                mean = (a + b) / 2
                 images.append(mean + target.image)
                 # Of both: the scatter of the residuals themselves says how noisy the target is.
                 relative = np.where(target.usable, mean / np.sqrt(noise), np.nan)

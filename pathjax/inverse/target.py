@@ -36,11 +36,11 @@ class Target:
         return self.measured & (self.image < self.ceiling)
 
     def misfit(self, image: np.ndarray) -> np.ndarray:
-        """(H, W, 3) how far an image is from all that may look like this target; nan where nothing is measured."""
+        """(H, W, 3) how far an image is from all that may look like this target; 0 where nothing is measured."""
         difference = image - self.image
         beyond = difference - np.clip(difference, -self.step / 2, self.step / 2)
         beyond = np.where(self.usable, beyond, np.minimum(difference, 0))
-        return np.where(self.measured, beyond, np.nan)
+        return np.where(self.measured, beyond, 0)
 
 
 def read_target(path: str | Path) -> Target:
@@ -63,9 +63,10 @@ def read_target(path: str | Path) -> Target:
             raise InputError(f"{path}: {compression} compression changes pixels; write the file with ZIP, or none")
         if not half:
             return Target(image)
-        largest = float(np.finfo(np.float16).max)
-        step = np.spacing(np.clip(np.abs(image), 0, largest).astype(np.float16)).astype(np.float64)
-        return Target(image, np.nan_to_num(step), largest)
+        largest = np.finfo(np.float16).max
+        below = np.minimum(np.abs(image), np.nextafter(largest, np.float16(0)))
+        step = np.spacing(below.astype(np.float16)).astype(np.float64)
+        return Target(image, np.nan_to_num(step), float(largest))
     levels, opaque = files.png_storage(path)
     code = np.rint(files.linear_to_srgb(image) * levels)
     low, high = (files.srgb_to_linear(np.clip((code + half) / levels, 0, None)) for half in (-0.5, 0.5))

@@ -1,5 +1,6 @@
 """Parameters from images: recovery, bounds, what is not determined, views, solvers, interruptions, bad input."""
 
+import functools
 import json
 
 import jax
@@ -8,7 +9,8 @@ import optimistix as optx
 import pytest
 
 import pathjax as pj
-from pathjax.inverse import report
+from pathjax.inverse import fitting, report
+from pathjax.io.image import read_rgb, write_exr, write_png
 
 # A floor and a wall that light each other under a sky.
 ROOM = """
@@ -30,13 +32,50 @@ def room(make_scene):
 
 
 @pytest.fixture(scope="module")
-def target(room):
+def target_image(room):
     return np.asarray(pj.render(room, 1024, seed=1))
 
 
+# Not of the module, so that tests of both kinds follow each other, and share what is compiled.
+@pytest.fixture(params=["exr", "png"])
+def kind(request):
+    return request.param
+
+
+def stored(image, path):
+    """The target that is read back from a file of the kind that its name says."""
+    image = np.asarray(image)
+    if path.suffix == ".exr":
+        write_exr(path, {name: image[..., i] for i, name in enumerate("RGB")}, {})
+    else:
+        write_png(path, image)
+    return pj.read_target(path)
+
+
+@pytest.fixture
+def store(kind, tmp_path):
+    return lambda image: stored(image, tmp_path / f"target.{kind}")
+
+
+@pytest.fixture
+def target(target_image, store):
+    return store(target_image)
+
+
 @pytest.fixture(scope="module")
-def fitted(room, target):
-    return pj.fit(room, target, NAMES, start=START, spp=32)
+def fit_of(room, target_image, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("targets")
+
+    @functools.cache
+    def fit(kind):
+        return pj.fit(room, stored(target_image, folder / f"target.{kind}"), NAMES, start=START, spp=32)
+
+    return fit
+
+
+@pytest.fixture
+def fitted(fit_of, kind):
+    return fit_of(kind)
 
 
 def z_scores(fit, truth):
@@ -63,19 +102,19 @@ def test_the_fit_tells_its_history_and_its_scene(fitted, room):
 
 
 @pytest.mark.slow
-def test_stated_errors_match_the_errors_made(room):
+def test_stated_errors_match_the_errors_made(room, store):
     """20 seeds and targets, 6 numbers: the mean square of z is known to 0.13 if all are independent, 0.3 if channels
     are one."""
     z = []
     for seed in range(20):
-        target = np.asarray(pj.render(room, 256, seed=100 + seed))
+        target = store(pj.render(room, 256, seed=100 + seed))
         z.append(z_scores(pj.fit(room, target, NAMES, start=START, spp=32, seed=seed), pj.parameters(room)))
     assert 0.7 < np.sqrt(np.mean(np.square(z))) < 1.4
 
 
-def test_values_at_their_bounds_are_reached_and_told(room):
+def test_values_at_their_bounds_are_reached_and_told(room, store):
     truth = {"floor.reflectance": [1.0, 0.5, 0.0], "wall.reflectance": [0.0, 0.0, 1.0]}
-    target = np.asarray(pj.render(pj.with_parameters(room, truth), 1024, seed=1))
+    target = store(pj.render(pj.with_parameters(room, truth), 1024, seed=1))
     fit = pj.fit(room, target, NAMES, start=START, spp=32)
     assert fit.converged
     for name, value in truth.items():
@@ -85,10 +124,10 @@ def test_values_at_their_bounds_are_reached_and_told(room):
     assert set(fit.at_bound) <= {f"{n}.{c}" for n in NAMES for c in "rgb"} - {"floor.reflectance.g"}
 
 
-def test_what_images_do_not_determine_is_named(make_scene):
+def test_what_images_do_not_determine_is_named(make_scene, store):
     """One bounce under a sky that is not seen: only the product of its radiance and the albedo shows."""
     scene = make_scene(ROOM, res=16, depth=2, origin="0, 0.5, 3", fov=50, hide="true")
-    target = np.asarray(pj.render(scene, 256, seed=1))
+    target = store(pj.render(scene, 256, seed=1))
     fit = pj.fit(scene, target, ["sky.radiance", *NAMES], start={"sky.radiance": 0.5, **START}, spp=32)
     assert "do not determine" in fit.message
     assert len(fit.undetermined) == 3
@@ -100,17 +139,18 @@ def test_what_images_do_not_determine_is_named(make_scene):
     json.dumps(report.facts(fit), allow_nan=False)
 
 
-def test_a_parameter_that_does_not_show_is_named(make_scene):
+def test_a_parameter_that_does_not_show_is_named(make_scene, store):
     body = ROOM + """<bsdf type="diffuse" id="hidden"><rgb name="reflectance" value="0.5"/></bsdf>
 <shape type="sphere"><point name="center" x="0" y="0" z="90"/><ref id="hidden"/></shape>"""
     scene = make_scene(body, res=16, depth=2, origin="0, 0.5, 3", fov=50)
-    target = np.asarray(pj.render(scene, 256, seed=1))
+    target = store(pj.render(scene, 256, seed=1))
     fit = pj.fit(scene, target, ["floor.reflectance", "hidden.reflectance"], spp=32)
     assert np.isinf(fit.standard_errors["hidden.reflectance"]).all()
     assert np.isfinite(fit.standard_errors["floor.reflectance"]).all()
 
 
 def test_views_share_parameters_and_know_more_together(write_scene, room, target, fitted):
+    """The second target is an array, whatever the first is."""
     other = pj.load_scene(write_scene(ROOM, res=16, depth=5, origin="1, 1, 2.5", fov=50))
     both = pj.fit([room, other], [target, np.asarray(pj.render(other, 1024, seed=2))], NAMES, start=START, spp=32)
     assert both.converged and len(both.images) == len(both.scenes) == 2
@@ -131,8 +171,9 @@ def test_other_solvers_approach_the_same_answer(room, target, solver):
     assert np.abs(z_scores(fit, pj.parameters(room))).max() < 4.5
 
 
-def test_a_second_fit_of_the_problem_does_not_compile(room, target, fitted):
-    again = pj.fit(room, target, NAMES, start=START, spp=32, seed=5)
+def test_a_second_fit_of_the_problem_does_not_compile(room, target_image, fit_of):
+    fitted = fit_of("exr")
+    again = pj.fit(room, target_image, NAMES, start=START, spp=32, seed=5)
     assert again.compile_seconds < fitted.compile_seconds / 10
     assert again.values[NAMES[0]].tolist() != fitted.values[NAMES[0]].tolist()
 
@@ -159,9 +200,86 @@ def test_a_scene_without_noise_is_fitted_to_rounding(make_scene, start):
     np.testing.assert_allclose(fit.values["lamp.radiance"], [2, 0.5, 1], rtol=1e-5)
 
 
-def test_a_scene_that_cannot_look_like_its_target_is_told(room, target):
-    fit = pj.fit(room, target[::-1], NAMES, start=START, spp=32)
+def test_what_a_file_rounds_in_a_scene_without_noise_is_in_the_errors(make_scene, tmp_path):
+    """All pixels are rounded alike, by up to half a step; 48 values do not know more than 3."""
+    lamp = '<emitter type="area" id="lamp"><rgb name="radiance" value="0.2, 0.5, 0.8"/></emitter>'
+    scene = make_scene(f'<shape type="rectangle">{lamp}</shape>', res=4, depth=1, fov=20)
+    write_png(tmp_path / "a.png", np.broadcast_to([0.2, 0.5, 0.8], (4, 4, 3)))
+    fit = pj.fit(scene, pj.read_target(tmp_path / "a.png"), ["lamp.radiance"], start={"lamp.radiance": 1.0})
+    assert fit.converged
+    errors = fit.standard_errors["lamp.radiance"]
+    # Uniform over a step: never beyond sqrt(3) standard errors.
+    assert (np.abs(fit.values["lamp.radiance"] - [0.2, 0.5, 0.8]) < 1.8 * errors).all()
+    assert (errors < 4e-3).all()
+
+
+def test_a_scene_that_cannot_look_like_its_target_is_told(room, target_image, store):
+    fit = pj.fit(room, store(target_image[::-1]), NAMES, start=START, spp=32)
     assert not fit.converged and "structure" in fit.message
+
+
+# ---- clipped and rounded targets ------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def cornell(shipped):
+    return shipped("cornell_box", res=32)
+
+
+WHITE = {"white.reflectance": 0.5}
+
+
+@pytest.fixture(scope="module")
+def cornell_image(cornell):
+    return np.asarray(pj.render(cornell, 1024, seed=7))
+
+
+def test_a_lamp_that_is_clipped_does_not_move_the_answer(cornell, cornell_image, store):
+    target = store(cornell_image)
+    fit = pj.fit(cornell, target, list(WHITE), start=WHITE)
+    assert fit.converged
+    # 3 numbers beyond 4.5 sigma by chance: 2e-5.
+    assert np.abs(z_scores(fit, pj.parameters(cornell))).max() < 4.5
+    assert (fit.standard_errors["white.reflectance"] < 2e-3).all()
+
+
+def test_a_clipped_image_of_which_nothing_is_known_is_told(cornell, cornell_image, tmp_path):
+    """The same image as an array: the lamp seems to be 1, and no white makes it so."""
+    write_png(tmp_path / "a.png", cornell_image)
+    fit = pj.fit(cornell, read_rgb(tmp_path / "a.png"), list(WHITE), start=WHITE)
+    assert np.abs(fit.values["white.reflectance"] - pj.parameters(cornell)["white.reflectance"]).max() > 0.1
+    assert not fit.converged and "structure" in fit.message
+
+
+def test_a_clipped_pixel_says_that_no_darker_image_fits(room, target_image):
+    """Only the floor is measured, and the rest is brighter than the scene can be."""
+    image = np.where(np.arange(16)[:, None, None] < 10, 2.0, target_image)
+    fit = pj.fit(room, pj.Target(image, ceiling=1.5), NAMES, start=START, spp=32)
+    assert not fit.converged and "structure" in fit.message
+
+
+@pytest.mark.parametrize("margin", [fitting.CLIP_MARGIN, pytest.param(-np.inf, marks=pytest.mark.xfail(strict=True))])
+def test_noise_that_is_clipped_does_not_move_the_answer(room, monkeypatch, margin):
+    """Targets of 4 spp, of whose brighter half a third is clipped: with pixels left out by their own noise the mean z
+    of 12 fits is far off; else it is known to 0.3, and one of 6 lies beyond 1.4 with a chance of 1e-5."""
+    monkeypatch.setattr(fitting, "CLIP_MARGIN", margin)
+    truth, z = pj.parameters(room), []
+    for seed in range(12):
+        image = np.asarray(pj.render(room, 4, seed=50 + seed))
+        target = pj.Target(image, ceiling=float(np.median(image)))
+        z.append(z_scores(pj.fit(room, target, NAMES, start=START, spp=32, seed=seed), truth))
+    assert np.abs(np.mean(z, 0)).max() < 1.4
+
+
+def test_pixels_that_are_left_out_may_hold_anything(room, target_image):
+    measured = np.ones((16, 16, 1), bool)
+    measured[3:6, 4:9] = False
+    damaged = np.where(measured, target_image, np.nan)
+    fit = pj.fit(room, pj.Target(damaged, measured=measured), NAMES, start=START, spp=32)
+    assert fit.converged
+    assert np.abs(z_scores(fit, pj.parameters(room))).max() < 4.5
+    np.testing.assert_array_equal(np.isnan(fit.residuals[0]), np.broadcast_to(~measured, (16, 16, 3)))
+    report.picture(fit, [damaged])
 
 
 # ---- glass ----------------------------------------------------------------------------------------------------------
@@ -173,8 +291,13 @@ def ball(shipped):
 
 
 @pytest.fixture(scope="module")
-def ball_target(ball):
+def ball_image(ball):
     return np.asarray(pj.render(ball, 512, seed=1))
+
+
+@pytest.fixture
+def ball_target(ball_image, store):
+    return store(ball_image)
 
 
 @pytest.mark.parametrize("start", [1.2, *(pytest.param(far, marks=pytest.mark.slow) for far in (1.05, 2.5))])
@@ -213,6 +336,12 @@ def test_ior_and_colours_are_recovered_together(ball, ball_target):
         ({"target": np.ones((8, 16, 3))}, "shape"),
         ({"target": np.full((16, 16, 3), np.nan)}, "not finite"),
         ({"target": np.full((16, 16, 3), -1.0)}, "negative"),
+        ({"target": pj.Target(np.ones((16, 16, 3)), ceiling=1.0)}, "clipped or left out"),
+        ({"target": pj.Target(np.ones((16, 16, 3)), measured=False)}, "clipped or left out"),
+        ({"target": pj.Target(np.ones((16, 16, 3)), measured=np.ones((16, 16)))}, "of the shape"),
+        ({"target": pj.Target(np.ones((16, 16, 3)), step=-1.0)}, "not negative"),
+        ({"target": pj.Target(np.ones((16, 16, 3)), step=np.nan)}, "not negative"),
+        ({"target": pj.Target(np.ones((16, 16, 3)), ceiling=0.0)}, "above 0"),
         ({"scene": []}, "at least one scene"),
         ({"spp": 0}, "spp"),
         ({"seed": -1}, "seed"),

@@ -79,27 +79,103 @@ def test_components_that_are_not_free_stay():
     np.testing.assert_array_equal(solution.projector[1], 0)
 
 
-def residuals(rng, smooth=0.0):
-    """Two renders of a view of 40 x 40 against one target: independent noise, and a smooth misfit common to both."""
-    y, x = np.mgrid[0:40, 0:40] / 6
+def test_where_nothing_is_free_nothing_moves():
+    solution = uncertainty.solve(evidence(np.random.default_rng(5)), WEIGHTS, np.ones(3), np.zeros(3, bool))
+    assert not solution.step.any() and not solution.covariance.any()
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.2, 1.0])
+@pytest.mark.parametrize("pattern", ["flat", "gradient", "patches"])
+def test_errors_of_rounding_are_as_stated(pattern, noise):
+    """Of a level that is the mean of 400 rounded values, whatever they have in common: 400 levels, steps of 1.
+
+    The mean square of z is known to 7 %. It is too small where errors cancel over a gradient without noise, of which
+    scatter over pixels knows nothing.
+    """
+    rng = np.random.default_rng(12)
+    shapes = {"flat": [0.0], "gradient": np.linspace(0, 5.3, 400), "patches": [0, 0.3, 1.7, 2.45]}
+    shape = np.repeat(shapes[pattern], 400 // len(shapes[pattern]))
+    influence, z = np.full((400, 1, 1), 1 / 400), []
+    for level in rng.uniform(50, 60, 400):
+        exact = level + shape
+        target = np.rint(exact + noise * rng.normal(size=400))
+        scatter = (target - exact).var() / 400
+        phase, sd = (exact - target)[:, None], np.full((400, 1), noise)
+        common = uncertainty.rounding_covariance(influence, np.ones((400, 1)), phase, sd)[0, 0]
+        z.append((target - exact).mean() / np.sqrt(scatter + common))
+    assert 0.3 < np.mean(np.square(z)) < 1.3
+
+
+def residuals(rng, size=40, smooth=0.0):
+    """Two renders of a view against one target, in the mean: independent noise, and a smooth misfit."""
+    y, x = np.mgrid[0:size, 0:size] / 6
     misfit = smooth * (np.sin(x) * np.cos(y))[..., None]
-    target = rng.normal(size=(40, 40, 3))
-    return np.stack([misfit - target + rng.normal(size=(40, 40, 3)) for _ in range(2)])
+    target = rng.normal(size=(size, size, 3))
+    return misfit - target + rng.normal(size=(2, size, size, 3)).mean(0)
 
 
-def structured(share, significance):
-    return share > uncertainty.STRUCTURE_SHARE and significance > uncertainty.STRUCTURE_SIGNIFICANCE
+def structure(*views):
+    return uncertainty.structure(views, views)
 
 
 def test_noise_has_no_structure():
     rng = np.random.default_rng(6)
-    found = [uncertainty.structure([residuals(rng)], [np.ones((40, 40, 3))]) for _ in range(100)]
-    assert not any(structured(*f) for f in found)
-    z = np.array([significance for _, significance in found])
-    assert abs(z.mean()) < 4 / np.sqrt(len(z))
+    z = np.array([structure(residuals(rng))[1] for _ in range(100)])
+    # Of normal noise these are standard normal numbers: 100 of them beyond 4 by chance: 0.6 %.
+    assert np.abs(z).max() < 4
+    assert abs(z.mean()) < 4 / np.sqrt(len(z)) and abs(z.var() - 1) < 4 * np.sqrt(2 / len(z))
+
+
+def test_noise_that_is_the_same_in_all_channels_has_no_structure():
+    rng = np.random.default_rng(8)
+    z = np.array([structure(np.repeat(residuals(rng)[..., :1], 3, -1))[1] for _ in range(100)])
+    assert abs(z.var() - 1) < 4 * np.sqrt(2 / len(z))
 
 
 def test_a_misfit_of_the_size_of_the_noise_has_structure():
     rng = np.random.default_rng(7)
     for _ in range(20):
-        assert structured(*uncertainty.structure([residuals(rng, smooth=2)], [np.ones((40, 40, 3))]))
+        assert structure(residuals(rng, smooth=2))[1] > 2 * uncertainty.STRUCTURE_SIGNIFICANCE
+
+
+def test_a_misfit_far_below_the_noise_has_structure_in_a_large_image():
+    """It is 1/4 of the noise's standard deviation: 50 standard deviations in the 256 x 256 pixels together."""
+    agreement, significance = structure(residuals(np.random.default_rng(9), size=256, smooth=0.6))
+    assert agreement < 0.1 and significance > uncertainty.STRUCTURE_SIGNIFICANCE
+
+
+@pytest.mark.parametrize("size", [32, 64])
+def test_a_few_neighbours_that_are_far_off_have_structure(size):
+    """A lamp of 1/128 of the image, whose residuals alone are seen in any sum of squares."""
+    for seed in range(10):
+        view = residuals(np.random.default_rng(seed), size)
+        view[2 : 2 + size // 16, 5 : 5 + size // 8] -= 200
+        assert structure(view)[1] > uncertainty.STRUCTURE_SIGNIFICANCE
+
+
+@pytest.mark.parametrize("where", [np.s_[7, 7], np.s_[7, 7:9]], ids=["alone", "side by side"])
+def test_a_firefly_is_no_structure(where):
+    for seed in range(10):
+        view = residuals(np.random.default_rng(seed), 16)
+        view[where] = -1000
+        assert structure(view)[1] < uncertainty.STRUCTURE_SIGNIFICANCE
+
+
+def test_pixels_without_noise_do_not_matter():
+    """A small object before a black background, say."""
+    view = residuals(np.random.default_rng(10))
+    wide = np.zeros((40, 400, 3))
+    wide[:, :40] = view
+    np.testing.assert_allclose(structure(wide), structure(view))
+    assert structure(np.zeros((40, 40, 3))) == (0, 0)
+
+
+def test_a_lamp_may_be_known_by_one_side_only():
+    """A clipped lamp gives no value, but a render that is darker there does not fit."""
+    rng = np.random.default_rng(11)
+    difference, misfit = residuals(rng, 32), residuals(rng, 32)
+    lamp = np.s_[2:4, 5:9]
+    difference[lamp] = misfit[lamp] = 0
+    assert uncertainty.structure([difference], [misfit])[1] < uncertainty.STRUCTURE_SIGNIFICANCE
+    misfit[lamp] = -50
+    assert uncertainty.structure([difference], [misfit])[1] > uncertainty.STRUCTURE_SIGNIFICANCE
