@@ -578,17 +578,27 @@ def test_help_is_no_error(run):
 # ---- fit ------------------------------------------------------------------------------------------------------------
 
 
+def write_target(path, **changes):
+    """The furnace's image, of another albedo than its file's."""
+    scene = pj.with_parameters(pj.load_scene(FURNACE, res=8), {"wall.reflectance": [0.3, 0.5, 0.7], **changes})
+    image = np.asarray(pj.render(scene, 256, seed=1))
+    if path.suffix == ".exr":
+        write_exr(path, {c: image[..., i] for i, c in enumerate("RGB")}, {})
+    else:
+        write_png(path, image)
+    return path
+
+
 @pytest.fixture
 def target(tmp_path):
-    """The furnace's image, of another albedo than its file's."""
-    scene = pj.with_parameters(pj.load_scene(FURNACE, res=8), {"wall.reflectance": [0.3, 0.5, 0.7]})
-    image = np.asarray(pj.render(scene, 256, seed=1))
-    write_exr(tmp_path / "target.exr", {c: image[..., i] for i, c in enumerate("RGB")}, {})
-    return tmp_path / "target.exr"
+    return write_target(tmp_path / "target.exr")
 
 
-def test_fit_prints_a_table_and_writes_its_files(run, target, tmp_path):
-    status, out, err = run("fit", FURNACE, target, *SMALL, "--param", "wall.reflectance=0.6", "-o", tmp_path / "f")
+@pytest.mark.parametrize("kind", ["exr", "png"])
+def test_fit_prints_a_table_and_writes_its_files(run, tmp_path, kind):
+    target = write_target(tmp_path / f"target.{kind}", **{"glow.radiance": [0.2, 0.2, 0.2]})
+    start = "--set", "glow.radiance=0.2", "--param", "wall.reflectance=0.6"
+    status, out, err = run("fit", FURNACE, target, *SMALL, *start, "-o", tmp_path / "f")
     assert status == 0
     assert all(f"wall.reflectance.{c}" in out and "+-" in out for c in "rgb")
     facts = json.loads((tmp_path / "f.json").read_text())
@@ -653,6 +663,12 @@ def test_fit_as_json(run, target, tmp_path):
 )
 def test_fits_that_cannot_be(refused, target, tmp_path, arguments, says):
     refused("fit", FURNACE, target, *SMALL, *arguments, "-o", tmp_path / "f", says=says)
+
+
+def test_a_png_that_is_clipped_everywhere_is_refused(refused, tmp_path):
+    target = write_target(tmp_path / "target.png")
+    param = "--param", "wall.reflectance"
+    refused("fit", FURNACE, target, *SMALL, *param, "-o", tmp_path / "f", says=["every pixel", "clipped"])
 
 
 def test_fit_without_a_target_or_a_folder(refused, target, tmp_path):

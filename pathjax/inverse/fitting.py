@@ -142,6 +142,11 @@ def step_text(entry: dict) -> str:
     return f"{entry['stage']}, {entry['spp']} spp: {values}"
 
 
+def _render_variance(a, b) -> np.ndarray:
+    """(H, W, 1) variance of each of two independent renders, or of their residuals, smoothed over neighbours."""
+    return ndimage.uniform_filter(((a - b) ** 2).mean(-1, keepdims=True) / 2, (3, 3, 1))
+
+
 def _tell(entry: dict) -> None:
     with contextlib.suppress(OSError):  # a terminal that is gone costs no fit
         print(step_text(entry), file=sys.stderr)
@@ -249,6 +254,9 @@ class _Run:
         if not converged:
             return False, f"Newton's method did not settle in {MAX_NEWTON_STEPS} steps; try more spp, or another start"
         message = "converged: the last step is small against the standard errors, the residuals are noise"
+        left_out = (self._flat_weights() == 0).mean()
+        if left_out:
+            message += f"; {left_out:.2g} of the target's values are clipped, may be, or are not measured"
         if self.solution.undetermined.size:
             message += "; but the images do not determine all that was asked"
         return True, message
@@ -293,8 +301,7 @@ class _Run:
         self._newton_step(zero, self.v, scale, nowhere, NOISE_SPP, self._next_draw())
         targets, variances = self.problem.targets, []
         for a, b in self._halves():
-            squares = ((a - b) ** 2).mean(-1, keepdims=True) / 2
-            variance = ndimage.uniform_filter(squares, (3, 3, 1)) * (NOISE_SPP / spp)
+            variance = _render_variance(a, b) * (NOISE_SPP / spp)
             variances.append(variance + NOISE_FLOOR * variance.mean() + (ROUNDING * self.brightness) ** 2)
         self.variances = variances
         self.noise = [v + target.step**2 / 12 for v, target in zip(variances, targets, strict=True)]
@@ -430,11 +437,14 @@ class _Run:
     def _structure(self):
         """How well neighbouring residuals agree, and whether that is no chance."""
         differences, misfits = [], []
-        for (a, b), target, noise in zip(self._halves(), self.problem.targets, self.noise, strict=True):
-            mean, rounding = (a + b) / 2, ROUNDING * self.brightness
-            mean = np.where(np.abs(mean) > rounding, mean, 0)
-            differences.append(np.where(target.usable, mean, 0) / np.sqrt(noise))
-            misfits.append(target.misfit(target.image + mean) / np.sqrt(noise))
+        for (a, b), target in zip(self._halves(), self.problem.targets, strict=True):
+            variance = _render_variance(a, b)
+            noise = variance + NOISE_FLOOR * np.median(variance) + target.step**2 / 12
+            noise = np.sqrt(noise + (ROUNDING * self.brightness) ** 2)
+            mean = (a + b) / 2
+            mean = np.where(np.abs(mean) > ROUNDING * self.brightness, mean, 0)
+            differences.append(np.where(target.usable, mean, 0) / noise)
+            misfits.append(target.misfit(target.image + mean) / noise)
         agreement, significance = uncertainty.structure(differences, misfits)
         return agreement, significance > uncertainty.STRUCTURE_SIGNIFICANCE
 
