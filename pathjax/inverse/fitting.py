@@ -436,16 +436,18 @@ class _Run:
 
     def _structure(self):
         """How well neighbouring residuals agree, and whether that is no chance."""
-        differences, misfits = [], []
-        for (a, b), target in zip(self._halves(), self.problem.targets, strict=True):
-            variance = _render_variance(a, b)
-            noise = variance + NOISE_FLOOR * np.median(variance) + target.step**2 / 12
-            noise = np.sqrt(noise + (ROUNDING * self.brightness) ** 2)
-            mean = (a + b) / 2
-            mean = np.where(np.abs(mean) > ROUNDING * self.brightness, mean, 0)
-            differences.append(np.where(target.usable, mean, 0) / noise)
-            misfits.append(target.misfit(target.image + mean) / noise)
-        agreement, significance = uncertainty.structure(differences, misfits)
+        # The noise is that of other renders: a firefly that raised its own would weigh less, and residuals be biased.
+        noises, rounding = [np.sqrt(noise) for noise in self.noise], ROUNDING * self.brightness
+        means = [(a + b) / 2 for a, b in self._halves()]
+        used = [weight > 0 for weight in self._by_view(self._flat_weights())]
+        parts = list(zip(means, noises, used, self.problem.targets, strict=True))
+        unit = uncertainty.deviation(np.concatenate([(m / n)[u & (np.abs(m) > rounding)] for m, n, u, _ in parts]))
+        misfits = []
+        for mean, noise, use, target in parts:
+            # Of pixels that are clipped, or may be, only what is beyond noise is known to be wrong.
+            misfit = target.misfit(target.image + mean, np.where(use, 0, CLIP_MARGIN * noise * unit))
+            misfits.append(np.where(np.abs(mean) > rounding, misfit, 0) / (noise * unit))
+        agreement, significance = uncertainty.structure(misfits)
         return agreement, significance > uncertainty.STRUCTURE_SIGNIFICANCE
 
     def _result(self, converged, message) -> Fit:

@@ -35,11 +35,11 @@ class Target:
         """(H, W, 3) bool: neither clipped nor left out."""
         return self.measured & (self.image < self.ceiling)
 
-    def misfit(self, image: np.ndarray) -> np.ndarray:
-        """(H, W, 3) how far an image is from all that may look like this target; 0 where nothing is measured."""
+    def misfit(self, image: np.ndarray, slack: np.ndarray | float = 0.0) -> np.ndarray:
+        """(H, W, 3) how far beyond `slack` an image is from all that looks like this target; 0 if nothing is known."""
         difference = image - self.image
-        beyond = difference - np.clip(difference, -self.step / 2, self.step / 2)
-        beyond = np.where(self.usable, beyond, np.minimum(difference, 0))
+        high = np.where(self.usable, self.step / 2, np.inf)
+        beyond = difference - np.clip(difference, -self.step / 2 - slack, high + slack)
         return np.where(self.measured, beyond, 0)
 
 

@@ -72,6 +72,17 @@ def test_a_file_of_floats_is_exact(tmp_path):
     assert target.step == 0 and target.ceiling == np.inf and target.measured is True
 
 
+def test_a_misfit_is_what_no_rounding_or_clipping_explains():
+    image = np.array([[[1.0, 1.0, 1.0], [5.0, 5.0, 5.0], [1.0, 1.0, 1.0]]])
+    measured = np.array([[[True], [True], [False]]])
+    target = pj.Target(image, np.full(image.shape, 0.2), 5.0, measured)
+    render = np.array([[[1.05, 1.3, 0.7], [4.7, 5.0, 9.0], [0.0, 1.0, 9.0]]])
+    np.testing.assert_allclose(target.misfit(render)[0, 0], [0, 0.2, -0.2], atol=1e-12)
+    np.testing.assert_allclose(target.misfit(render)[0, 1], [-0.2, 0, 0], atol=1e-12)
+    np.testing.assert_array_equal(target.misfit(render)[0, 2], 0)
+    np.testing.assert_allclose(target.misfit(render, 0.15)[0, :2], [[0, 0.05, -0.05], [-0.05, 0, 0]], atol=1e-12)
+
+
 def palette(path):
     Image.fromarray(np.random.default_rng(3).integers(0, 255, (8, 8, 3), np.uint8)).quantize(4).save(path)
 

@@ -114,8 +114,8 @@ def residuals(rng, size=40, smooth=0.0):
     return misfit - target + rng.normal(size=(2, size, size, 3)).mean(0)
 
 
-def structure(*views):
-    return uncertainty.structure(views, views)
+def structure(view):
+    return uncertainty.structure([view / uncertainty.deviation(view[view != 0])])
 
 
 def test_noise_has_no_structure():
@@ -167,15 +167,4 @@ def test_pixels_without_noise_do_not_matter():
     wide = np.zeros((40, 400, 3))
     wide[:, :40] = view
     np.testing.assert_allclose(structure(wide), structure(view))
-    assert structure(np.zeros((40, 40, 3))) == (0, 0)
-
-
-def test_a_lamp_may_be_known_by_one_side_only():
-    """A clipped lamp gives no value, but a render that is darker there does not fit."""
-    rng = np.random.default_rng(11)
-    difference, misfit = residuals(rng, 32), residuals(rng, 32)
-    lamp = np.s_[2:6, 5:9]
-    difference[lamp] = misfit[lamp] = 0
-    assert uncertainty.structure([difference], [misfit])[1] < uncertainty.STRUCTURE_SIGNIFICANCE
-    misfit[lamp] = -50
-    assert uncertainty.structure([difference], [misfit])[1] > uncertainty.STRUCTURE_SIGNIFICANCE
+    assert uncertainty.structure([np.zeros((40, 40, 3))]) == (0, 0)
