@@ -18,7 +18,7 @@ from urllib.parse import unquote, unquote_to_bytes
 import numpy as np
 
 from pathjax.errors import InputError
-from pathjax.io.mesh.polygons import strips
+from pathjax.io.mesh.polygons import cross, strips
 from pathjax.io.mesh.raw import Raw
 
 COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
@@ -126,17 +126,19 @@ def read(path: Path) -> Raw:
     lacking = sum(len(part.vertices) for part in parts if part.uv is None)
     if lacking and any(part.uv is not None for part in parts):
         notes.append(f"{lacking} vertices without texture coordinates got (0, 0)")
+    if any(part.normals is not None for part in parts):  # the format says that the others are flat
+        parts = [part if part.normals is not None else _flat(part) for part in parts]
     return _joined(parts, tuple(notes))
 
 
 def _opened(path: Path, data: bytes) -> _File:
     chunk = None
     if data[:4] == b"glTF":
-        _, version, _ = struct.unpack_from("<4s2I", data)
+        _, version, total = struct.unpack_from("<4s2I", data)
         if version != 2:
             raise InputError(f"{path}: glTF of version {version} is not supported; export glTF 2.0")
         chunks, at = {}, 12
-        while at + 8 <= len(data):
+        while at + 8 <= total:
             size, kind = struct.unpack_from("<I4s", data, at)
             chunks.setdefault(kind, data[at + 8 : at + 8 + size])
             at += 8 + size
@@ -193,6 +195,8 @@ def _part(file: _File, primitive: dict, matrix: np.ndarray) -> Raw:
     if index.dtype.kind not in "iu":
         raise InputError(f"{file.path}: its indices are not integers")
     index = index.astype(np.int64)
+    if len(index) and not 0 <= index.min() <= index.max() < len(vertices):
+        raise InputError(f"{file.path}: the index {index.max()} does not exist; there are {len(vertices)} positions")
     if mode == TRIANGLES and len(index) % 3 == 0:
         faces = index.reshape(-1, 3)
     elif mode == STRIP:
@@ -224,11 +228,20 @@ def _part(file: _File, primitive: dict, matrix: np.ndarray) -> Raw:
     return Raw(vertices, faces.ravel(), normals=normals, uv=attribute("TEXCOORD_0", 2))
 
 
+def _flat(part: Raw) -> Raw:
+    """Triangles that share no vertices, with their own normals."""
+    vertices = part.vertices[part.corners]
+    a, b, c = (vertices[k::3].T for k in range(3))
+    normals = np.repeat(cross(b - a, c - a).T, 3, axis=0)
+    return Raw(vertices, np.arange(len(vertices)), None, normals, None if part.uv is None else part.uv[part.corners])
+
+
 def _joined(parts: list[Raw], notes: tuple[str, ...]) -> Raw:
-    """One mesh of several; normals or uv that only some have are zeros in the others."""
+    """One mesh of several; uv that only some have are zeros in the others."""
     starts = np.cumsum([0] + [len(part.vertices) for part in parts])
 
-    def column(values: list[np.ndarray | None], width: int) -> np.ndarray | None:
+    def column(name: str, width: int) -> np.ndarray | None:
+        values = [getattr(part, name) for part in parts]
         if all(value is None for value in values):
             return None
         filled = (np.zeros((len(part.vertices), width)) for part in parts)
@@ -238,7 +251,7 @@ def _joined(parts: list[Raw], notes: tuple[str, ...]) -> Raw:
     return Raw(
         np.concatenate([part.vertices for part in [empty, *parts]]),
         np.concatenate([empty.corners, *(part.corners + start for part, start in zip(parts, starts, strict=False))]),
-        normals=column([part.normals for part in parts], 3),
-        uv=column([part.uv for part in parts], 2),
+        normals=column("normals", 3),
+        uv=column("uv", 2),
         notes=notes,
     )

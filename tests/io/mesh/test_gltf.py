@@ -242,15 +242,31 @@ def test_the_default_scene_is_read_and_others_are_noted(load):
     assert load("glb", file.glb()).area == pytest.approx(1 + 4 + 9)
 
 
-def test_parts_without_normals_or_uv_get_smooth_ones_and_zeros_with_a_note(load):
+def test_parts_without_normals_are_flat_and_without_uv_have_zeros_with_a_note(load):
+    """A roof of two triangles that share an edge, beside a square with normals and uv."""
     file = Gltf()
-    file.header["meshes"][0]["primitives"].append({"attributes": {"POSITION": 0}, "indices": 3})
+    file.accessor(np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0), (1, 1, 1)], float), "<f4")
+    file.header["meshes"][0]["primitives"].append({"attributes": {"POSITION": 4}, "indices": 3})
     loaded = load("glb", file.glb())
-    np.testing.assert_allclose(loaded.mesh.normals[4:], [[0, 0, 1]] * 4, atol=1e-12)
-    assert (loaded.mesh.uv[4:] == 0).all()
-    assert any("4 vertices without a normal" in note for note in loaded.notes)
+    normals = loaded.mesh.normals[loaded.mesh.faces[2:]]
+    expected = np.array([(0, 0, 1), (-1, -1, 1)]) / np.sqrt([[1], [3]])
+    np.testing.assert_allclose(normals, np.repeat(expected[:, None], 3, axis=1), atol=1e-12)
+    assert (loaded.mesh.uv[loaded.mesh.faces[2:]] == 0).all()
     assert any("4 vertices without texture coordinates" in note for note in loaded.notes)
     assert any("materials" in note for note in loaded.notes)
+    del file.primitive["attributes"]["NORMAL"]
+    assert load("glb", file.glb()).mesh.normals is None
+
+
+def test_indices_do_not_reach_into_other_parts(refused):
+    file = Gltf()
+    file.accessor(np.array([0, 1, 4]), "<u2")
+    file.header["meshes"][0]["primitives"].insert(0, {"attributes": {"POSITION": 0}, "indices": 4})
+    assert "the index 4 does not exist; there are 4 positions" in refused("glb", file.glb())
+
+
+def test_bytes_behind_the_length_that_a_glb_states_are_not_its_own(load):
+    assert_square(load("glb", Gltf().glb() + b"\xff" * 20))
 
 
 def changed(**entries):
