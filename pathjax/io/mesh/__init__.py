@@ -32,8 +32,9 @@ def load(
     """Read a mesh, carry it to world space, and leave out degenerate triangles.
 
     Shading normals are the file's; where OBJ and PLY have none they are means of the faces around, weighted by angle,
-    as Mitsuba makes them. STL and glTF without normals are flat. A mirroring `to_world` turns faces inside out, as in
-    Mitsuba; where the file has normals those decide, and the order of vertices is reversed to agree with them.
+    as Mitsuba makes them, and where these cancel the faces are flat. STL and glTF without normals are flat. A mirroring
+    `to_world` turns faces inside out, as in Mitsuba; where the file has normals those decide, and the order of vertices
+    is reversed to agree with them.
 
     Args:
         kind: "obj", "ply", "stl", "glb" or "gltf".
@@ -75,9 +76,20 @@ def load(
                 faces, area_vectors = faces[:, ::-1], -area_vectors
             if lacking[faces].any():
                 notes.append(f"{np.unique(faces[lacking[faces]]).size} vertices without a normal got a smooth one")
+        flat = np.zeros_like(faces, bool)  # corners that get the normal of their face, as vertices of their own
         if lacking.any():
-            given[lacking] = _smooth_normals(vertices, faces, area_vectors)[lacking]
+            smooth, cancel = _smooth_normals(vertices, faces, area_vectors)
+            given[lacking] = smooth[lacking]
+            flat = (lacking & cancel)[faces]
         normals = given / np.linalg.norm(given, axis=1, keepdims=True)
+        if flat.any():
+            at = faces[flat]
+            faces = faces.copy()
+            faces[flat] = len(vertices) + np.arange(len(at))
+            own = (area_vectors / _norm(area_vectors)).T[np.nonzero(flat)[0]]
+            vertices, normals = np.concatenate([vertices, vertices[at]]), np.concatenate([normals, own])
+            uv = None if uv is None else np.concatenate([uv, uv[at]])
+            notes.append(f"{np.unique(at).size} vertices are flat, as the normals of the faces around them cancel")
 
     if uv is not None and (kind == "obj" if flip_tex_coords is None else flip_tex_coords):
         uv = uv * [1, -1] + [0, 1]
@@ -129,19 +141,27 @@ def _area_vectors(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
         return polygons.cross(b - a, c - a)
 
 
-def _smooth_normals(vertices: np.ndarray, faces: np.ndarray, area_vectors: np.ndarray) -> np.ndarray:
-    """(V, 3) sums of unit face normals weighted by the angle at the vertex (Thuermer and Wuethrich 1998)."""
+def _smooth_normals(
+    vertices: np.ndarray, faces: np.ndarray, area_vectors: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Sums of unit face normals weighted by the angle at the vertex (Thuermer and Wuethrich 1998).
+
+    Returns:
+        (V, 3) the sums, and (V,) where they cancel, as for a sheet that has a face for each of its sides, or are empty.
+    """
     unit = area_vectors / _norm(area_vectors)
-    sums = np.zeros_like(vertices)
+    sums, angles = np.zeros_like(vertices), np.zeros(len(vertices))
     corners = [np.take(vertices.T, corner, axis=1) for corner in faces.T]
     for k in range(3):
         one, two = corners[(k + 1) % 3] - corners[k], corners[(k + 2) % 3] - corners[k]
         cosine = _dot(one, two) / (_norm(one) * _norm(two))
         angle = np.arccos(np.clip(cosine, -1, 1))
+        angles += np.bincount(faces[:, k], angle, len(vertices))
         for axis in range(3):
             sums[:, axis] += np.bincount(faces[:, k], angle * unit[axis], len(vertices))
-    sums[~sums.any(axis=1)] = [1, 0, 0]  # vertices of no face
-    return sums
+    cancel = _norm(sums.T) <= np.finfo(np.float32).eps * angles
+    sums[cancel] = [1, 0, 0]
+    return sums, cancel
 
 
 def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -159,6 +159,21 @@ def test_vertices_without_normal_get_a_smooth_one_and_a_note(write):
     assert any("without a normal" in note for note in notes)
 
 
+@pytest.mark.parametrize("back", ["f 4/4 3/3 2/2 1/1", "f 3/3 2/2 1/1 4/4"])
+def test_sheets_with_a_face_for_each_side_have_the_normals_of_their_faces(write, back):
+    """Around each corner of the square the normals cancel, or nearly so; around the tent's top they do not."""
+    text = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\nf 1/1 2/2 3/3 4/4\n" + back
+    text += "\nv 5 0 0\nv 6 0 0\nv 5 1 0\nv 5 0 1\nf 5/1 6/1 8/1\nf 7/1 5/1 8/1\nf 6/1 7/1 8/1\n"
+    mesh, notes = load(write("obj", text), "obj", IDENTITY, flip_tex_coords=False)
+    a, b, c = np.moveaxis(mesh.vertices[mesh.faces], 1, 0)
+    own = np.cross(b - a, c - a)
+    own /= np.linalg.norm(own, axis=1, keepdims=True)
+    np.testing.assert_allclose(mesh.normals[mesh.faces[:4]], np.repeat(own[:4, None], 3, axis=1), atol=1e-12)
+    np.testing.assert_array_equal(mesh.uv[mesh.faces[:4]], mesh.vertices[mesh.faces[:4]][..., :2])
+    assert len(np.unique(mesh.normals[mesh.faces[4:, 2]], axis=0)) == 1  # the top of the tent is smooth
+    assert any("4 vertices are flat" in note for note in notes)
+
+
 @pytest.mark.parametrize("size", ["1e-200", "1e200", "1e-30", "1e30"])
 def test_normals_of_any_length_are_made_unit(write, size):
     """Or are none, where the square of their length is out of range."""
