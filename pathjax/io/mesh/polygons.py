@@ -26,9 +26,9 @@ def triangles(vertices: np.ndarray, corners: np.ndarray, sizes: np.ndarray) -> t
         return corners.reshape(-1, 3), 0
     first = np.cumsum(sizes) - sizes
     owner, number = enumerated(sizes - 2)
-    one = first[owner]
-    faces = corners[np.stack([one, one + number + 1, one + number + 2], axis=1)]
+    faces = corners[first[owner, None] + np.stack([np.zeros_like(number), number + 1, number + 2], axis=1)]
 
+    # The cross products of a fan add up to Newell's normal; all of one sign, they cover the polygon once.
     large = np.flatnonzero(sizes[owner] > 3)
     fans, fan_owner = faces[large], owner[large]
     doubled = _area_vectors(vertices, fans)
