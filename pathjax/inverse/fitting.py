@@ -422,13 +422,14 @@ class _Run:
         if not any(target.step.any() for target in self.problem.targets):
             return np.zeros((self.n, self.n))
         steps, phases, noises, ratio = [], [], [], self._target_ratio(-2)
-        for (a, b), target, variance in zip(self._halves(), self.problem.targets, self.variances, strict=True):
+        for (a, b), target in zip(self._halves(), self.problem.targets, strict=True):
             step = np.where(target.step > 0, target.step, np.inf)
             # Neighbours are of nearly equal value where this matters, and their mean is less noisy.
             image = ndimage.uniform_filter((a + b) / 2 + target.image, (5, 5, 1))
             steps.append(target.step)
             phases.append((image - target.image) / step)
-            noises.append(np.sqrt(ratio * variance) / step)
+            # Of each channel by itself, without a floor: one may be rounded alike where others are noisy.
+            noises.append(np.sqrt(ratio * ndimage.uniform_filter((a - b) ** 2 / 2, (5, 5, 1))) / step)
         jacobian = self.evidence.jacobians.mean(0) * self._flat_weights()[..., None] * self.scale
         return uncertainty.rounding_covariance(
             jacobian @ solution.inverse, *(self._flat(parts) for parts in (steps, phases, noises))

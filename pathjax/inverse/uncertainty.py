@@ -16,7 +16,7 @@ MAX_RELATIVE_ERROR = 0.25
 # Shares of an undetermined direction below which a component is not named, and not given an infinite error.
 NAMED_SHARE, TOUCHED_SHARE = 0.2, 0.03
 # Residuals have structure if they agree with this significance; what is beyond so many deviations is clipped, and noise
-# is taken to be alike in windows of so many pixels. Of 900 renders and targets of the shipped scenes, each exact, as PNG
+# is taken to be alike in windows of so many pixels. Of 900 renders and targets of the shipped scenes, exact, as PNG
 # and with noise added, its standard deviation was 0.9 to 1.1 and none was beyond 4.3: false alarms are below 1e-4.
 STRUCTURE_SIGNIFICANCE, STRUCTURE_CLIP, STRUCTURE_WINDOW = 5, 5, 7
 # Neighbours are all within two pixels: a misfit is smooth, and most pairs tell most. Each pair once.
