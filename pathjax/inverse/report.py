@@ -52,7 +52,10 @@ def text(fit: Fit) -> str:
 
 
 def picture(fit: Fit, targets) -> np.ndarray:
-    """(H, W, 3) linear RGB: a row for each view, of target, fit, and residual: blue too dark, red too bright."""
+    """(H, W, 3) linear RGB: a row for each view, of target, fit, and residual: blue too dark, red too bright.
+
+    What was left out has no residual: nan, which a PNG shows black.
+    """
     rows = []
     for target, image, residual in zip(targets, fit.images, fit.residuals, strict=True):
         share = residual.mean(-1) * math.sqrt(3) / _FULL_SCALE

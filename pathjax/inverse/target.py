@@ -69,7 +69,7 @@ def read_target(path: str | Path) -> Target:
         return Target(image, np.nan_to_num(step), float(largest))
     levels, opaque = files.png_storage(path)
     code = np.rint(files.linear_to_srgb(image) * levels)
-    low, high = (files.srgb_to_linear(np.clip((code + half) / levels, 0, None)) for half in (-0.5, 0.5))
+    low, high = (files.srgb_to_linear(np.clip((code + off) / levels, 0, None)) for off in (-0.5, 0.5))
     # Of 0 too the noise is that of a whole step: all of its half lies on one side.
     step = np.where(code > 0, high - low, 2 * high)
     return Target(image, step, float(files.srgb_to_linear(1 - 0.5 / levels)), opaque[..., None])

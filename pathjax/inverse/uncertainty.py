@@ -90,7 +90,7 @@ def rounding_covariance(influence, step, phase, noise) -> np.ndarray:
 
     Pixels of nearly equal values are rounded alike, so that their errors do not average out as scatter over pixels has
     it. The error of rounding x is a series of sines in 2 pi k x / step, damped by noise. If what all pixels have in
-    common is uniform over a step, its terms are uncorrelated (Widrow and Kollar, Quantization Noise, 2008, ch. 4).
+    common is uniform over a step, its terms are uncorrelated (Widrow and Kollar, Quantization Noise, 2008).
 
     Args:
         influence: (N, 3, n) of each value of the target on the answer.
@@ -125,8 +125,7 @@ def structure(misfits: list[np.ndarray]) -> tuple[float, float]:
     for misfit in misfits:
         f = np.clip(misfit, -STRUCTURE_CLIP, STRUCTURE_CLIP)
         present = f.any(-1)
-        # (H, W, 3, 3) of the channels, which share their noise; of the pixels around, since it differs from place to
-        # place all the same.
+        # (H, W, 3, 3): channels share their noise, and its size differs from place to place all the same.
         share = ndimage.uniform_filter(present.astype(float), STRUCTURE_WINDOW, mode="constant")
         size = STRUCTURE_WINDOW, STRUCTURE_WINDOW, 1, 1
         squares = ndimage.uniform_filter(f[..., :, None] * f[..., None, :], size, mode="constant")
