@@ -12,7 +12,7 @@ import numpy as np
 from pathjax import film, replicates
 from pathjax.errors import InputError
 from pathjax.integrators import aov, path, pixel
-from pathjax.runtime import native_map
+from pathjax.runtime import native_map, usual_promotion
 from pathjax.scene import Scene
 
 NAMES = aov.FirstHit._fields
@@ -21,6 +21,7 @@ MAX_SPP = 16
 CHUNK_PIXELS = 1 << 14
 
 
+@usual_promotion
 def render_aovs(scene: Scene, names: Sequence[str], spp: int = MAX_SPP, seed: int = 0) -> dict[str, np.ndarray]:
     """Name -> (H, W, channels) float32, as Mitsuba's `aov` integrator has it; 0 where nothing is seen.
 

@@ -15,7 +15,7 @@ from pathjax.errors import InputError
 from pathjax.integrators import path, pixel, terms
 from pathjax.named import Parameter
 from pathjax.render import differentiable, differentiated
-from pathjax.runtime import native_map
+from pathjax.runtime import native_map, usual_promotion
 from pathjax.scene import Scene
 
 # Every term is three more numbers that each path of the kernel keeps.
@@ -65,6 +65,7 @@ class Bounces:
         return tail.fit(means[:, known].mean(1), error)
 
 
+@usual_promotion
 def render_bounces(
     scene: Scene, depth: int, spp=64, seed: int = 0, strategy: str = "mis", *, errors: bool = True
 ) -> Bounces:
@@ -159,6 +160,7 @@ def _term_sums(static: _Static, scene, pixels, first_sample, spp, seeds):
 
 
 @partial(_term_sums.defjvp, symbolic_zeros=True)
+@usual_promotion
 def _term_sums_jvp(static: _Static, primals, tangents):
     """Linear in the tangents, so that it also transposes."""
     scene, *work = primals

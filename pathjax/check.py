@@ -12,6 +12,7 @@ from pathjax.errors import InputError
 from pathjax.gradient import is_glass, jacobian, ratio_by
 from pathjax.named import with_parameters
 from pathjax.render import render
+from pathjax.runtime import usual_promotion
 from pathjax.scene import Scene
 
 # Chance that a right derivative is called wrong.
@@ -37,6 +38,7 @@ class GradientCheck:
         return float((self.z**2).mean())
 
 
+@usual_promotion
 def check_gradient(scene: Scene, name: str, spp: int = 64, seed: int = 0, *, seeds: int = 16, block: int = 8):
     """Compare `jacobian` with differences of `render` at other values of one parameter, with common random numbers.
 

@@ -28,7 +28,7 @@ from pathjax.errors import InputError
 from pathjax.integrators import path, pixel
 from pathjax.ior_step import dielectrics
 from pathjax.named import Parameter
-from pathjax.runtime import native_map
+from pathjax.runtime import native_map, usual_promotion
 from pathjax.scene import Scene
 
 METHODS = ("difference", "attached")
@@ -71,6 +71,7 @@ class Wanted:
     glass: tuple[int, ...]  # rows of the dielectrics that get a difference
 
 
+@usual_promotion
 def jacobian(scene: Scene, names, spp: int = 64, seed: int = 0, *, strategy="mis", method="difference", step=None):
     """Image and its derivative with respect to named parameters, from the same paths, in one kernel.
 
@@ -108,6 +109,7 @@ def jacobian(scene: Scene, names, spp: int = 64, seed: int = 0, *, strategy="mis
     return as_image(image), Jacobian(*jax.tree.map(as_image, (derivatives, bias)), used)
 
 
+@usual_promotion
 def pixel_jacobians(
     scene: Scene, wanted: dict[str, Parameter], pixels, first_sample, spp, seed, *, strategy, method, step, **how
 ):

@@ -14,6 +14,7 @@ import numpy as np
 
 from pathjax import description as desc
 from pathjax.errors import InputError
+from pathjax.runtime import usual_promotion
 from pathjax.shapes.bvh_build import Tree
 
 if TYPE_CHECKING:
@@ -48,11 +49,13 @@ class About:
         return id(self.parameters)
 
 
+@usual_promotion
 def parameters(scene: Scene) -> dict[str, jax.Array]:
     """All parameters of the scene by name, `ID.field`."""
     return {name: get(scene, p.path)[p.index] for name, p in about(scene).parameters.items()}
 
 
+@usual_promotion
 def with_parameters(scene: Scene, values: Mapping) -> Scene:
     """The scene with other values for some of its parameters; nothing is compiled again.
 

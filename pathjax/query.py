@@ -9,11 +9,12 @@ import jax.numpy as jnp
 
 from pathjax.core.math import normalize, rescale
 from pathjax.core.types import Hit, Ray
-from pathjax.runtime import native_map
+from pathjax.runtime import native_map, usual_promotion
 from pathjax.scene import Scene
 from pathjax.shapes import geometry
 
 
+@usual_promotion
 def closest_hit(scene: Scene, origins, directions) -> Hit:
     """First primitive that each ray meets.
 

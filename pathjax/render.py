@@ -13,10 +13,11 @@ from pathjax import bsdfs, emitters, film, gradient, named
 from pathjax.errors import InputError
 from pathjax.integrators import path, pixel
 from pathjax.named import Parameter
-from pathjax.runtime import native_map
+from pathjax.runtime import native_map, usual_promotion
 from pathjax.scene import Scene
 
 
+@usual_promotion
 def render(
     scene: Scene,
     spp: int = 64,
@@ -59,6 +60,7 @@ def render(
     return image.reshape(*film.image_shape(scene.film), 3)
 
 
+@usual_promotion
 def render_pixels(
     scene: Scene,
     pixels,
@@ -111,6 +113,7 @@ def _means(static: _Static, scene, control, pixels, first_sample, spp, seed):
 
 
 @partial(_means.defjvp, symbolic_zeros=True)
+@usual_promotion
 def _means_jvp(static: _Static, primals, tangents):
     """Tangent J @ d(parameters): linear, so that it also transposes."""
     if static.split_depth or static.sampler != "lattice":

@@ -25,7 +25,7 @@ import warnings
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
+from functools import partial, wraps
 from pathlib import Path
 
 import jax
@@ -157,6 +157,20 @@ def _processor() -> str:
     return f"{platform.machine()}-{hashlib.sha256(''.join(first).encode()).hexdigest()[:16]}"
 
 
+def usual_promotion(f: Callable) -> Callable:
+    """f, within which JAX promotes dtypes and ranks as by default: what the user forbids is meant for the user's code.
+
+    For what is called from outside, and for what JAX calls later, such as rules of differentiation.
+    """
+
+    @wraps(f)
+    def usual(*args, **kwargs):
+        with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
+            return f(*args, **kwargs)
+
+    return usual
+
+
 def native() -> bool:
     """Whether loops over rays become native code here: on CPUs, unless the user opted out."""
     return jax.default_backend() == "cpu" and _OPTION in os.environ.get("XLA_FLAGS", "")
@@ -183,7 +197,7 @@ def concurrently(f: Callable, items: Iterable) -> Iterator[tuple]:
     with ThreadPoolExecutor(workers) as pool:
         try:
             for item in items:
-                waiting.append((item, pool.submit(f, item)))
+                waiting.append((item, pool.submit(usual_promotion(f), item)))
                 # One that is ready for each thread, and one whose result is being used.
                 if len(waiting) > 2 * workers:
                     done, result = waiting.popleft()
@@ -196,6 +210,7 @@ def concurrently(f: Callable, items: Iterable) -> Iterator[tuple]:
                 result.cancel()
 
 
+@usual_promotion
 def native_map(f: Callable, xs, *shared, form: str | None = None, devices: int | None = None):
     """`f(x, *shared)` for every x of `xs`, on all local devices.
 
@@ -217,6 +232,7 @@ def native_map(f: Callable, xs, *shared, form: str | None = None, devices: int |
         return _map(f, xs, shared, form, devices)
 
     @run.def_vmap
+    @usual_promotion
     def run_batch(size, batched, xs, *shared):
         xs_batched, *shared_batched = batched
 

@@ -20,6 +20,7 @@ from pathjax.emitters.constant import Constant
 from pathjax.errors import InputError
 from pathjax.film import Film
 from pathjax.named import About, Parameter
+from pathjax.runtime import usual_promotion
 from pathjax.shapes import box, coincident, leaves, planar, sphere, triangle
 from pathjax.shapes.box import Boxes
 from pathjax.shapes.bvh_build import RULES
@@ -48,6 +49,7 @@ class Scene:
     about: About | None = field(metadata={"static": True})
 
 
+@usual_promotion
 def build(description: desc.Description, dtype=jnp.float32, split_rule: str = "sah") -> Scene:
     """Compile a description into tables grouped by kind.
 

@@ -18,6 +18,7 @@ from pathjax.checkpoint import Checkpoint, identity
 from pathjax.errors import InputError
 from pathjax.integrators import path
 from pathjax.interrupts import Interrupts
+from pathjax.runtime import usual_promotion
 from pathjax.scene import Scene
 
 # Samples of every pixel before their number may differ.
@@ -44,6 +45,7 @@ class RenderResult:
     reason: str  # why it ended: "target error", "time limit", "spp", "interrupted", "no estimate"
 
 
+@usual_promotion
 def render_until(
     scene: Scene,
     target_error: float | None = None,

@@ -32,6 +32,7 @@ from pathjax.inverse.problem import Problem
 from pathjax.inverse.programs import Stepper, kept
 from pathjax.inverse.uncertainty import Evidence
 from pathjax.named import with_parameters
+from pathjax.runtime import usual_promotion
 from pathjax.scene import Scene
 
 # Samples per pixel of the approach. Newton's method begins with a part of the samples that `fit` is given.
@@ -88,6 +89,7 @@ class Fit:
             return self.covariance / np.outer(sigma, sigma)
 
 
+@usual_promotion
 def fit(
     scene: Scene | Sequence[Scene],
     target,

@@ -15,7 +15,7 @@ from jax import lax
 
 from pathjax.core.math import at, dot, larger, smaller
 from pathjax.shapes.bvh import Tree
-from pathjax.shapes.leaves import rows_of
+from pathjax.shapes.leaves import numbers_of, rows_of
 
 FACES = 6
 
@@ -25,7 +25,7 @@ FACES = 6
 class Boxes:
     """The face of a box where its coordinate `axis` is -1 or 1 is its rectangle number 2 axis + 0 or 1."""
 
-    leaves: jax.Array  # (L, 13, W) of `leaf_numbers`, NaN in empty lanes; row of the first rectangle of each lane
+    leaves: jax.Array  # (L, 13, W) bits of `leaf_numbers`, NaN in empty lanes; row of the first rectangle of each lane
     tree: Tree | None  # None: every ray tests all
 
 
@@ -66,8 +66,8 @@ def intersect(table: Boxes, leaf, prepared, start):
         distances (W,), inf or NaN where missed, possibly negative where behind; rows (W,) of the faces.
     """
     o, d = prepared
-    leaf = at(table.leaves, leaf)
-    first = rows_of(leaf)
+    block = at(table.leaves, leaf)
+    leaf, first = numbers_of(block, d.dtype), rows_of(block)
     from_c = [o[axis] - leaf[axis] for axis in range(3)]
     started = start - first
     x, inverse = [], []

@@ -23,7 +23,8 @@ def pack(numbers, lo, hi, dtype, rule="sah", first=0, step=1):
         first, step: primitive i is row first + step i of its table.
     Returns:
         leaves (L, K + 1, W), tree (None for a few primitives, each a leaf of its own), built tree for reports or None.
-        The last numbers of a leaf are the bits of its rows: one block, so that a visit misses the cache once.
+        A leaf holds the bits of its numbers, as integers, then its rows: one block, so that a visit misses the cache
+        once, and no array of the scene holds the NaN of the padding, which JAX's debug_nans would find.
     """
     count = len(numbers)
     if count <= FLAT_LIMIT:
@@ -38,11 +39,16 @@ def pack(numbers, lo, hi, dtype, rule="sah", first=0, step=1):
     padded = np.concatenate([numbers, np.full((1, numbers.shape[1]), np.nan)])
     leaves = np.moveaxis(padded[rows], 1, 2).astype(dtype)  # row -1 is the padding
     rows = np.where(rows < 0, rows, first + step * rows)
-    bits = rows.astype(integer_like(leaves.dtype)).view(leaves.dtype)
-    return jnp.asarray(np.concatenate([leaves, bits[:, None]], 1)), tree, built
+    integer = integer_like(leaves.dtype)
+    blocks = np.concatenate([leaves.view(integer), rows[:, None].astype(integer)], 1)
+    return jnp.asarray(blocks), tree, built
+
+
+def numbers_of(block, dtype):
+    """The numbers whose bits are (a part of) a leaf; what stands for its rows is none."""
+    return lax.bitcast_convert_type(block, dtype)
 
 
 def rows_of(leaf):
     """Rows (..., W) of the primitives of a leaf (..., K + 1, W), ascending; -1 in empty lanes."""
-    bits = leaf[..., -1, :]
-    return lax.bitcast_convert_type(bits, integer_like(bits.dtype)).astype(jnp.int32)
+    return leaf[..., -1, :].astype(jnp.int32)

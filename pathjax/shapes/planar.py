@@ -18,13 +18,13 @@ from pathjax.core.types import Surface
 from pathjax.core.warp import square_to_disk
 from pathjax.shapes.box import Boxes
 from pathjax.shapes.bvh import Tree
-from pathjax.shapes.leaves import rows_of
+from pathjax.shapes.leaves import numbers_of, rows_of
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Planar:
-    leaves: jax.Array  # (L, 15, W) of `leaf_numbers`, NaN in empty lanes; row of each lane
+    leaves: jax.Array  # (L, 15, W) bits of `leaf_numbers`, NaN in empty lanes; row of each lane
     tree: Tree | None  # None: L = 1, every ray tests all
     frames: jax.Array  # (P, 4, 3): c, a, b, unit normal
     boxes: Boxes | None  # which find the last of the rectangles, in place of the leaves
@@ -73,7 +73,8 @@ def intersect(table: Planar, leaf, prepared, start):
     The border is inclusive by the rounding error of the coordinate, so faces that share an edge leave no gap.
     """
     o, d = prepared
-    leaf = at(table.leaves, leaf)
+    block = at(table.leaves, leaf)
+    leaf = numbers_of(block, d.dtype)
     c, n, dual_a, dual_b, error = leaf[0:3], leaf[3:6], leaf[6:9], leaf[9:12], leaf[12:14]
     to_c = [c[axis] - o[axis] for axis in range(3)]
     t = dot(n, to_c) / dot(n, d)
@@ -82,7 +83,7 @@ def intersect(table: Planar, leaf, prepared, start):
     error = error * (4 * np.finfo(leaf.dtype).eps)
     reach = (1 + error[0]) + t * error[1]
     inside = x * x + y * y <= reach * reach if table.disk else larger(jnp.abs(x), jnp.abs(y)) <= reach
-    rows = rows_of(leaf)
+    rows = rows_of(block)
     return jnp.where(inside & (rows != start), t, jnp.inf), rows
 
 

@@ -24,13 +24,13 @@ from pathjax.core.math import (
 from pathjax.core.types import Surface
 from pathjax.core.warp import SPHERE_PDF, cone_pdf, square_to_cone, square_to_sphere
 from pathjax.shapes.bvh import Tree
-from pathjax.shapes.leaves import rows_of
+from pathjax.shapes.leaves import numbers_of, rows_of
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Spheres:
-    leaves: jax.Array  # (L, 5, W) center, radius, NaN in empty lanes; row of each lane
+    leaves: jax.Array  # (L, 5, W) bits of center, radius, NaN in empty lanes; row of each lane
     tree: Tree | None  # None: L = 1, every ray tests all
     balls: jax.Array  # (P, 4) center, radius
     to_local: jax.Array  # (P, 3, 3) rotation into the frame of its uv
@@ -63,14 +63,15 @@ def intersect(table: Spheres, leaf, prepared, start):
     "Precision improvements for ray/sphere intersection").
     """
     o, d = prepared
-    leaf = at(table.leaves, leaf)
+    block = at(table.leaves, leaf)
+    leaf = numbers_of(block, d.dtype)
     radius = leaf[3]
     f = [o[axis] - leaf[axis] for axis in range(3)]
     b = -dot(f, d)
     closest = [f[axis] + b * d[axis] for axis in range(3)]
     half_chord = jnp.sqrt(radius * radius - dot(closest, closest))  # NaN: a miss, and every comparison drops it
     f_length = jnp.sqrt(dot(f, f))
-    rows = rows_of(leaf)
+    rows = rows_of(block)
     c = jnp.where(rows == start, 0, (f_length - radius) * (f_length + radius))
     q = b + jnp.copysign(half_chord, b)
     other = c / q

@@ -13,13 +13,13 @@ from pathjax.core.math import at, cross, dot, larger, normalize, rescale, safe_d
 from pathjax.core.types import Surface
 from pathjax.core.warp import square_to_triangle
 from pathjax.shapes.bvh import Tree
-from pathjax.shapes.leaves import rows_of
+from pathjax.shapes.leaves import numbers_of, rows_of
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Triangles:
-    leaves: jax.Array  # (L, 10, W) x of the three vertices, y, z, NaN in empty lanes; row of each lane
+    leaves: jax.Array  # (L, 10, W) bits of x of the three vertices, y, z, NaN in empty lanes; row of each lane
     tree: Tree | None  # None: L = 1, every ray tests all
     vertices: jax.Array  # (P, 3, 3) by row: vertex, axis
     normals: jax.Array | None  # (P, 3, 3) at the vertices; None: no triangle of the scene is smooth
@@ -69,7 +69,8 @@ def intersect(table: Triangles, leaf, prepared, start):
 
     def coordinates(axis):
         start = [jnp.asarray(i, jnp.uint32) for i in (leaf, 3 * axis, 0)]
-        return list(lax.dynamic_slice(table.leaves, start, (1, 3, width), allow_negative_indices=False)[0])
+        block = lax.dynamic_slice(table.leaves, start, (1, 3, width), allow_negative_indices=False)[0]
+        return list(numbers_of(block, ray.dtype))
 
     # Vertex by vertex: XLA does not vectorise loops over (3, W).
     z = [c - ray[2] for c in coordinates(axes[2])]

@@ -26,6 +26,7 @@ from jax import lax
 from pathjax.bsdfs import DiffuseTable
 from pathjax.core.math import safe_divide
 from pathjax.errors import InputError
+from pathjax.runtime import usual_promotion
 from pathjax.scene import Scene
 from pathjax.transport import factors as dense_factors
 from pathjax.transport import rays as ray_casting
@@ -126,6 +127,7 @@ class Operator:
     def _function(self, f):
         return lx.FunctionLinearOperator(f, jax.ShapeDtypeStruct(self.Le.shape, self.Le.dtype))
 
+    @usual_promotion
     def with_scene(self, scene: Scene) -> Operator:
         """The same form factors with the reflectances and radiances of a scene of the same shapes; may be traced."""
         return replace(self, **dict(zip(("albedo", "Le"), _albedos_and_lights(scene, self.patches), strict=True)))
@@ -134,6 +136,7 @@ class Operator:
         """Light L (U, 3) on the patches, for `transport.image` and `transport.radiance`."""
         return radiosity(self.patches, L)
 
+    @usual_promotion
     def control(self, L, effort: float = 2.0) -> Control:
         """Light L (U, 3), best the solution, as a control variate for `pathjax.render`; see `control`.
 
@@ -141,19 +144,23 @@ class Operator:
         """
         return Control(self.radiosity(self.T.mv(L)), jnp.asarray(effort, self.Le.dtype))
 
+    @usual_promotion
     def error(self, L) -> jax.Array:
         """Standard error (U, 3) that the errors of the form factors leave in T L, for light L (U, 3)."""
         return self.albedo * jnp.sqrt(self.factors.squared_errors_mv(L**2))
 
+    @usual_promotion
     def terms(self, depth: int) -> jax.Array:
         """Le, T Le, T^2 Le, ...: (depth, U, 3), the light that was reflected 0, 1, ... times. depth: at least 1."""
         _check_depth(depth)
         return lax.scan(lambda term, _: (self.T.mv(term), term), self.Le, length=depth)[1]
 
+    @usual_promotion
     def spectral_radius(self) -> jax.Array:
         """(3,) largest eigenvalue of T by channel, by the power method: below 1 if the light dies out."""
         return _spectral_radius(self)
 
+    @usual_promotion
     def solve(self, method: str = "gmres", depth: int | None = None, tolerance: float | None = None) -> Solution:
         """L = (I - T)^-1 Le.
 
@@ -202,6 +209,7 @@ class Operator:
             )
         return radius
 
+    @usual_promotion
     def residual_history(self, steps: int, method: str = "gmres") -> np.ndarray:
         """|Le + T L - L| / |Le| for the best L made of Le, T Le, ..., T^(k-1) Le, k = 0, ..., steps: (steps + 1,).
 
@@ -216,6 +224,7 @@ class Operator:
         return _krylov_residuals(self, steps)
 
 
+@usual_promotion
 def operator(
     scene: Scene,
     patches: int = 1000,

@@ -15,7 +15,7 @@ from pathjax.core.math import at, dot
 from pathjax.errors import InputError
 from pathjax.integrators.path import check_sampling
 from pathjax.integrators.pixel import camera_path
-from pathjax.runtime import native_map
+from pathjax.runtime import native_map, usual_promotion
 from pathjax.scene import Scene
 from pathjax.shapes import geometry
 from pathjax.shapes.geometry import Geometry
@@ -31,6 +31,7 @@ class Radiosity:
     L: jax.Array  # (U + 1, 3) radiance that leaves each patch; the last, black, stands for what is no patch
 
 
+@usual_promotion
 def radiosity(patches: Patches, L) -> Radiosity:
     """L: (U, 3)."""
     return Radiosity(patches, jnp.concatenate([L, jnp.zeros_like(L[:1])]))
@@ -47,6 +48,7 @@ def radiance(light: Radiosity, shapes: Geometry, primitive, p, back):
     return at(light.L, patch_at(light.patches, shapes, primitive, p, back))
 
 
+@usual_promotion
 def image(scene: Scene, light: Radiosity, spp: int = 16, seed: int = 0) -> jax.Array:
     """What the camera sees of the light on patches: (H, W, 3).
 

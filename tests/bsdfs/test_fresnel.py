@@ -256,9 +256,12 @@ def exact_conductor_slopes(cos_i, eta, k):
     cos_i, eta, k = (np.asarray(x, np.longdouble) for x in (cos_i, eta, k))
     n = eta + 1j * k
     w = np.sqrt(np.where(eta < 0.5, n * n - (1 - cos_i) * (1 + cos_i), (n - 1) * (n + 1) + cos_i**2))
-    dw = n / w
-    r_s, dr_s = (cos_i - w) / (cos_i + w), -2 * cos_i * dw / (cos_i + w) ** 2
-    r_p, dr_p = (n * n * cos_i - w) / (n * n * cos_i + w), 2 * n * cos_i * (2 * w - n * dw) / (n * n * cos_i + w) ** 2
+    dw, sin2 = n / w, (1 - cos_i) * (1 + cos_i)
+    # c - w and the like of their squares, where n is next to 1; r_p is r_s times a ratio.
+    c_w = np.where(eta < 0.5, cos_i - w, (1 - n) * (1 + n) / (cos_i + w))
+    r_s, dr_s = c_w / (cos_i + w), -2 * cos_i * dw / (cos_i + w) ** 2
+    ratio, d_ratio = (w * cos_i - sin2) / (w * cos_i + sin2), 2 * sin2 * cos_i * dw / (w * cos_i + sin2) ** 2
+    r_p, dr_p = r_s * ratio, dr_s * ratio + r_s * d_ratio
     slope = np.conj(r_s) * dr_s + np.conj(r_p) * dr_p  # |r|^2 changes by 2 Re(conj(r) dr), dn is 1 or i
     return (abs(r_s) ** 2 + abs(r_p) ** 2) / 2, slope.real, -slope.imag
 

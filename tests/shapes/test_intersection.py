@@ -12,7 +12,7 @@ from pathjax.core.types import Ray
 from pathjax.runtime import native_map
 from pathjax.scene import build
 from pathjax.shapes import geometry, triangle
-from pathjax.shapes.leaves import rows_of
+from pathjax.shapes.leaves import numbers_of, rows_of
 
 GREY = desc.Diffuse("grey", np.full(3, 0.5))
 # Rounding of a coordinate relative to the distances it was computed from; hits closer to a border may go either way.
@@ -61,7 +61,7 @@ def _occluded(shapes, rays, targets):
 
 def packed(shapes, o, d, t_max, exclude):
     """Rays, repeated up to a power of 2: tests of one scene then share a kernel, and compiling is what takes time."""
-    dtype = jnp.float32 if not shapes.tables else shapes.tables[0].leaves.dtype
+    dtype = f"f{shapes.tables[0].leaves.dtype.itemsize if shapes.tables else 4}"
     number = np.resize(np.arange(len(o)), 4096 if len(o) <= 4096 else 1 << (len(o) - 1).bit_length())
     t_max, exclude = np.broadcast_to(t_max, len(o)), np.broadcast_to(exclude, len(o))
     o, d, t_max = (jnp.asarray(np.asarray(x)[number], dtype) for x in (o, d, t_max))
@@ -480,7 +480,8 @@ def test_padded_lanes_are_never_hit():
         shapes = scene_of(*SCENES[name])
         rows = np.asarray(rows_of(shapes.tables[0].leaves))
         assert (rows < 0).any()
-        assert np.isnan(np.moveaxis(np.asarray(shapes.tables[0].leaves), 1, 2)[rows < 0]).all()
+        numbers = numbers_of(shapes.tables[0].leaves[:, :-1], np.float32)
+        assert np.isnan(np.moveaxis(np.asarray(numbers), 1, 2)[rows < 0]).all()
         # Through the origin, where zero padding would lie.
         o = unit(np.random.default_rng(1).normal(size=(2000, 3)))
         assert_same_hits(shapes, o, -o, clear=0.5)

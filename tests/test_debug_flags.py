@@ -1,0 +1,73 @@
+"""JAX's debug flags, by which users look for bugs of their own, find nothing in healthy scenes."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import pathjax as pj
+from pathjax import transport
+
+FLAGS = {
+    "debug_nans": lambda: jax.debug_nans(True),
+    "dtype_promotion": lambda: jax.numpy_dtype_promotion("strict"),
+    "rank_promotion": lambda: jax.numpy_rank_promotion("raise"),
+}
+SLOW = pytest.mark.slow
+# Boxes and rectangles; a sphere and glass; triangles in a tree, whose leaves have empty lanes; the rest.
+SCENES = ["cornell_box", "glass_ball", "mesh", *(pytest.param(n, marks=SLOW) for n in ("textures", "conductors"))]
+
+
+@pytest.fixture(params=FLAGS)
+def flag(request):
+    with FLAGS[request.param]():
+        yield request.param
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_scenes_load_and_render(flag, shipped, name):
+    scene = shipped(name, res=8)
+    scene = pj.with_parameters(scene, pj.parameters(scene))
+    assert np.isfinite(pj.render(scene, 2)).all()
+    assert np.isfinite(pj.render_aovs(scene, ["depth"])["depth"]).any()
+    assert pj.closest_hit(scene, np.zeros((1, 3)), np.ones((1, 3))).t.shape == (1,)
+
+
+def test_images_with_errors_and_terms_of_the_series(flag, shipped):
+    """A single sample a pixel, which has no standard error, is said to have nan, and no flag takes that for a fault."""
+    scene = shipped("cornell_box", res=8)
+    assert pj.render_until(scene, spp=5).reason
+    assert np.isnan(pj.render_until(scene, spp=1).standard_error).all()
+    assert np.isfinite(pj.render_bounces(scene, depth=2, spp=8).standard_error).all()
+
+
+def test_derivatives(flag, shipped):
+    scene = shipped("glass_ball", res=8)
+    names = ["pattern.color0", "glass.int_ior"]
+    values = {name: pj.parameters(scene)[name] for name in names}
+
+    def loss(values):
+        return jnp.sum(pj.render(pj.with_parameters(scene, values), 2))
+
+    gradient = jax.jit(jax.grad(loss))(values)  # in the user's jit the rule of differentiation is called later
+    _, J = pj.jacobian(scene, names, 2)
+    for name in names:
+        np.testing.assert_allclose(gradient[name], J[name].sum((0, 1, 2)), rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.slow
+def test_fits_and_checks_of_gradients(flag, shipped):
+    scene = shipped("cornell_box", res=8)
+    name = "white.reflectance"
+    target = pj.render(scene, 64, seed=5)
+    fit = pj.fit(pj.with_parameters(scene, {name: 0.5}), target, [name])
+    np.testing.assert_allclose(fit.values[name], pj.parameters(scene)[name], atol=0.1)
+    assert pj.check_gradient(scene, name, spp=8)
+
+
+def test_light_on_patches(flag, shipped):
+    scene = shipped("cornell_box", res=8)
+    op = transport.operator(scene, patches=30)
+    assert np.isfinite(op.solve().L).all() and np.isfinite(op.terms(3)).all()
+    assert 0 < op.spectral_radius() < 1
+    assert np.isfinite(transport.image(scene, op.radiosity(op.Le), 1)).all()
