@@ -67,12 +67,14 @@ def conductor(cos_i, eta, k):
     b2 = b * b
     s, p = a + cos_i, a * cos_i + sin2
     d_s, d_p = s * s + b2, p * p + b2 * cos2
-    absorbed = _ratio(4 * a * cos_i, d_s) * (1 + _ratio(a * a + b2 + sin2, d_p)) / 2
-    little = absorbed > 0.5
+    passes = 4 * a * cos_i
+    little = 2 * passes > d_s  # is reflected
     # cos - a of cos^2 - a^2, which is exact where they are nearly equal.
     s, p = (contrast + b2) / jnp.where(little, s, 1), a * cos_i - sin2
-    reflected = _ratio(s * s + b2, d_s) * (1 + _ratio(p * p + b2 * cos2, d_p)) / 2
-    return jnp.where(little, reflected, 1 - absorbed)
+    of_s = _ratio(jnp.where(little, s * s + b2, passes), d_s)
+    of_p = _ratio(jnp.where(little, p * p + b2 * cos2, a * a + b2 + sin2), d_p)
+    share = of_s * (1 + of_p) / 2
+    return jnp.where(little, share, 1 - share)
 
 
 def _complex_sqrt(x, y):
