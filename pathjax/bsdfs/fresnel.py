@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
 
 from pathjax.core.math import safe_sqrt, smaller
@@ -46,12 +47,13 @@ def _refraction(cos_i, eta):
     return contrast, refracts, safe_sqrt(cos2_t)
 
 
+@jax.custom_jvp
 def conductor(cos_i, eta, k):
     """Reflectance of a metal of complex IOR eta + i k, per channel (Born and Wolf; PBRT 4 ed., 9.3.6).
 
     With a + i b = sqrt((eta + i k)^2 - sin^2), of one polarisation 4 a cos / |a + i b + cos|^2 is not reflected, and of
-    the other (a^2 + b^2 + sin^2) / |(a + i b) cos + sin^2|^2 times that: sums of positive terms, so that neither it nor
-    its derivatives lose digits where nearly all is reflected. Where little is, squares of differences keep them.
+    the other (a^2 + b^2 + sin^2) / |(a + i b) cos + sin^2|^2 times that: sums of positive terms, so that it keeps its
+    digits where nearly all is reflected.
 
     Args:
         cos_i: () in [0, 1]; eta, k: (3,) in [0, 1e6].
@@ -61,32 +63,51 @@ def conductor(cos_i, eta, k):
     the critical angle of a medium that does not absorb.
     """
     cos2, sin2 = cos_i * cos_i, (1 - cos_i) * (1 + cos_i)
-    # Nothing cancels, be (eta + i k)^2 near 0 or near 1.
-    contrast = (eta - 1) * (eta + 1) - k * k
-    a, b = _complex_sqrt(jnp.where(eta < 0.5, (eta - k) * (eta + k) - sin2, contrast + cos2), 2 * eta * k)
+    right, y, modulus, large = _half_root(cos_i, eta, k)
+    # All are multiplied by `scale`, which leaves one division.
+    scale, a = jnp.where(right, 1, 2 * large), jnp.where(right, large, y)
+    a_cos = 2 * a * cos_i
+    d_s = scale * (modulus + cos2) + a_cos
+    d_p = scale * (modulus * cos2 + sin2 * sin2) + a_cos * sin2
+    passes, whole = a_cos * (d_p + scale * (modulus + sin2)), d_s * d_p
+    # All is reflected where the angle is so grazing that a product leaves the range of the floats.
+    usable = whole >= jnp.finfo(whole.dtype).tiny
+    return 1 - jnp.where(usable, passes / jnp.where(usable, whole, 1), 0)
+
+
+@conductor.defjvp
+def _conductor_jvp(primals, tangents):
+    # Other roundings: the square of that product, by which its derivative divides, leaves the range of float32, and
+    # where little is reflected the differences of nearly equal numbers have no digits of their derivatives.
+    return conductor(*primals), jax.jvp(_conductor_to_differentiate, primals, tangents)[1]
+
+
+def _conductor_to_differentiate(cos_i, eta, k):
+    """The same, where little is reflected by squares of differences."""
+    cos2, sin2 = cos_i * cos_i, (1 - cos_i) * (1 + cos_i)
+    right, y, _, large = _half_root(cos_i, eta, k)
+    small = _ratio(y, 2 * large)
+    a, b = jnp.where(right, large, small), jnp.where(right, small, large)
     b2 = b * b
     s, p = a + cos_i, a * cos_i + sin2
     d_s, d_p = s * s + b2, p * p + b2 * cos2
     passes = 4 * a * cos_i
-    little = 2 * passes > d_s  # is reflected
+    little = 2 * passes > d_s
     # cos - a of cos^2 - a^2, which is exact where they are nearly equal.
-    s, p = (contrast + b2) / jnp.where(little, s, 1), a * cos_i - sin2
+    s, p = ((eta - 1) * (eta + 1) - k * k + b2) / jnp.where(little, s, 1), a * cos_i - sin2
     of_s = _ratio(jnp.where(little, s * s + b2, passes), d_s)
     of_p = _ratio(jnp.where(little, p * p + b2 * cos2, a * a + b2 + sin2), d_p)
     share = of_s * (1 + of_p) / 2
     return jnp.where(little, share, 1 - share)
 
 
-def _complex_sqrt(x, y):
-    """Real and imaginary part of sqrt(x + i y), y >= 0, with derivatives 0 at 0."""
-    right = x >= 0
-    size = jnp.where(right, x, -x)
-    steep = y > size
-    low, high = jnp.where(steep, size, y), jnp.where(steep, y, size)
-    modulus = high * jnp.sqrt(1 + _ratio(low, high) ** 2)
-    large = safe_sqrt((modulus + size) / 2)
-    small = _ratio(y, 2 * large)
-    return jnp.where(right, large, small), jnp.where(right, small, large)
+def _half_root(cos_i, eta, k):
+    """Of sqrt(x + i y), which is a + i b above: whether x >= 0, y, |x + i y|, and the larger one of a, then, and b."""
+    # Nothing cancels, be (eta + i k)^2 near 0 or near 1.
+    near_0, near_1 = (eta - k) * (eta + k) - (1 - cos_i) * (1 + cos_i), (eta - 1) * (eta + 1) - k * k + cos_i * cos_i
+    x, y = jnp.where(eta < 0.5, near_0, near_1), 2 * eta * k
+    modulus = safe_sqrt(x * x + y * y)
+    return x >= 0, y, modulus, safe_sqrt((modulus + jnp.where(x >= 0, x, -x)) / 2)
 
 
 def _ratio(a, b):

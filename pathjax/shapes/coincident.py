@@ -5,9 +5,10 @@ another one lies in the same place, the origin as it was rounded may be on the f
 there, so that sheets may be as thin as elsewhere, origins are moved along the normal by a margin that covers the
 rounding of both.
 
-Some pairs have an order besides, and are parted by a gap that rounding cannot close: there is air between glass and
-what it touches, and a lamp that lies in a wall shines from it. A body shrinks by the gap; a sheet that shines comes
-forward. Meshes that are not flat stay as they are, and are not compared with each other.
+Some pairs have an order, and are parted by a gap that rounding cannot close, which costs nothing afterwards: there is
+air between a body and what it touches, and a lamp that lies in a wall shines from it. So a cube and glass shrink by the
+gap, and a sheet that shines comes forward. Meshes that are not flat stay as they are, and are not compared with each
+other.
 """
 
 from __future__ import annotations
@@ -73,20 +74,44 @@ def contacts(shapes: list[Faces], dtype) -> tuple[list[np.ndarray], list[np.ndar
     size = max((np.abs(each.corners).max() for each in shapes), default=0)
     movable = [i for i, each in enumerate(shapes) if each.normal is not None]
     fixed = [i for i, each in enumerate(shapes) if each.normal is None]
+    eps = np.finfo(dtype).eps
+    # Points are projected onto planes, which in one through the origin leaves what a rounding is of a rounding.
+    least = _MARGIN * (eps * eps) * size
     for others in (movable, fixed):
-        for i, row, j, partners, margin in _coplanar(shapes, movable, others, dtype):
-            mine, partner = shapes[i], shapes[j]
-            gap = min(_GAP * np.finfo(dtype).eps * size, mine.depth[row] / 4)
-            if mine.glass or (mine.lamp and not partner.lamp and not partner.glass):
-                comes_forward = not mine.glass and np.isinf(mine.depth[row])
-                moves[i][row] = mine.normal[row] * (gap if comes_forward else -gap)
-            elif partner.glass or partner.lamp != mine.lamp:
-                if partner.normal is None:
-                    moves[i][row] = triangle.face_normals(partner.corners[partners[:1]])[0, 0] * gap
-            else:
+        for i, row, j, partners, margin in _coplanar(shapes, movable, others, least, dtype):
+            mine, other = _face(shapes[i], row), _face(shapes[j], partners[0])
+            gap = min(_GAP * eps * size, mine.depth / 4)
+            if _yields(mine, other):
+                moves[i][row] = mine.normal * (gap if np.isinf(mine.depth) and not mine.glass else -gap)
+            elif not _yields(other, mine):
                 margins[i][row] = max(margins[i][row], margin.max())
                 margins[j][partners] = np.maximum(margins[j][partners], margin)
+            elif others is fixed:
+                moves[i][row] = other.normal * gap
     return moves, margins
+
+
+class _Face(NamedTuple):
+    normal: np.ndarray  # (3,)
+    depth: float
+    glass: bool
+    lamp: bool
+
+
+def _face(faces: Faces, row) -> _Face:
+    if faces.normal is None:
+        return _Face(triangle.face_normals(faces.corners[[row]])[0, 0], np.inf, faces.glass, faces.lamp)
+    return _Face(faces.normal[row], faces.depth[row], faces.glass, faces.lamp)
+
+
+def _yields(face: _Face, other: _Face) -> bool:
+    """Whether a face makes way for another one that lies in it."""
+    body, other_body = np.isfinite(face.depth), np.isfinite(other.depth)
+    if face.glass:
+        return True
+    if body:  # two bodies side by side, but not one in the other
+        return not other_body or face.normal @ other.normal < 0
+    return face.lamp and not (other.lamp or other.glass or other_body)
 
 
 def sphere_margins(balls, dtype) -> np.ndarray:
@@ -103,11 +128,11 @@ def _precision(dtype):
     return np.finfo(dtype).eps / 2 + 8 * np.finfo(np.float64).eps
 
 
-def _coplanar(shapes: list[Faces], movable, others, dtype):
+def _coplanar(shapes: list[Faces], movable, others, least, dtype):
     """For each movable face and each of the others that it touches: i, row, j, rows (N,), margins (N,) that clear both.
 
     Args:
-        movable, others: numbers i and j of shapes.
+        movable, others: numbers i and j of shapes; least: margin to begin with.
     """
     if not movable or not others:
         return
@@ -137,7 +162,10 @@ def _coplanar(shapes: list[Faces], movable, others, dtype):
             # The size of coordinates along the normal, to which rounding is relative.
             reach = (np.abs(mine).max(0) + np.abs(corners[near]).max(1)) @ np.abs(normal)
             within = np.abs((corners[near] - mine[0]) @ normal).max(1, initial=0) <= _precision(dtype) * reach
-            near, margin = near[within], _MARGIN * np.finfo(dtype).eps * reach[within]
+            near, margin = near[within], least + _MARGIN * np.finfo(dtype).eps * reach[within]
             for j in np.unique(owner[near]):
                 touches = owner[near] == j
-                yield i, row, j, rows[near[touches]], margin[touches]
+                partners = rows[near[touches]], margin[touches]
+                # The faces of a body differ from each other, and those of a mesh that stays in place are alike here.
+                groups = zip(*partners, strict=True) if shapes[j].normal is not None else [partners]
+                yield from ((i, row, j, *map(np.atleast_1d, group)) for group in groups)

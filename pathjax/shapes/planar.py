@@ -101,13 +101,8 @@ def surface(table: Planar, row, o, d, t) -> Surface:
     from_c = o - c
     distance = -safe_divide(dot(n, from_c), dot(n, d))
     q = from_c + distance * d
-    in_plane = q - dot(n, q) * n
-    margin = jnp.zeros_like(distance)
-    if table.margins is not None:
-        # The projection rounds relative to what it took away, which here must not show: the second takes away no more.
-        in_plane = in_plane - dot(n, in_plane) * n
-        margin = at(table.margins, row)
-    p = c + in_plane
+    p = c + (q - dot(n, q) * n)
+    margin = jnp.zeros_like(distance) if table.margins is None else at(table.margins, row)
     aa, ab, bb = dot(a, a), dot(a, b), dot(b, b)
     qa, qb = dot(q, a), dot(q, b)
     scale = 1 / (aa * bb - ab * ab)
