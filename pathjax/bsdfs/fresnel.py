@@ -106,8 +106,10 @@ def _half_root(cos_i, eta, k):
     # Nothing cancels, be (eta + i k)^2 near 0 or near 1.
     near_0, near_1 = (eta - k) * (eta + k) - (1 - cos_i) * (1 + cos_i), (eta - 1) * (eta + 1) - k * k + cos_i * cos_i
     x, y = jnp.where(eta < 0.5, near_0, near_1), 2 * eta * k
-    modulus = safe_sqrt(x * x + y * y)
-    return x >= 0, y, modulus, safe_sqrt((modulus + jnp.where(x >= 0, x, -x)) / 2)
+    size = jnp.where(x >= 0, x, -x)
+    squared = x * x + y * y
+    modulus = jnp.where(squared < jnp.finfo(squared.dtype).tiny, size, safe_sqrt(squared))
+    return x >= 0, y, modulus, safe_sqrt((modulus + size) / 2)
 
 
 def _ratio(a, b):

@@ -471,7 +471,7 @@ class _Run:
         if self.evidence is not None:
             for (a, b), target, noise in zip(self._halves(), self.problem.targets, self.noise, strict=True):
                 mean = (a + b) / 2
-                images.append(mean + target.image)
+                images.append((mean + target.image) / self.problem.exposure)
                 # Of both: the scatter of the residuals themselves says how noisy the target is.
                 relative = np.where(target.usable, mean / np.sqrt(noise), np.nan)
                 spread = np.nanstd(relative) if target.usable.any() else 1.0

@@ -38,8 +38,9 @@ def score(z, arguments, coordinates):
     def evaluate(z):
         evidence = _evidence(base + scale * z, groups, spp, seed, draw, coordinates)
         flat = jnp.concatenate([weight.reshape(-1, 3) for weight in weights])
-        g = scale * jnp.sum(evidence.scores(flat), 0)
-        matrix = projector @ (scale[:, None] * evidence.matrix(flat) * scale) @ projector
+        scaled = evidence._replace(jacobians=evidence.jacobians * scale)
+        g = jnp.sum(scaled.scores(flat), 0)
+        matrix = projector @ scaled.matrix(flat) @ projector
         # What is not determined stays where it is, by rows of the same size as the others.
         size = jnp.maximum(jnp.max(jnp.abs(matrix)), jnp.finfo(z.dtype).tiny)
         return (projector @ g / size + rest @ z, evidence), matrix / size + rest
@@ -64,7 +65,7 @@ def _evidence(v, groups, spp, seed, draw, coordinates) -> Evidence:
 
         def image_and_columns(scene, seed, views=views):
             image, J = jacobian(views.with_values(scene, values), views.names, spp, seed)
-            return image, coordinates.columns(J, image.shape)
+            return image * views.exposure, coordinates.columns(J, image.shape) * views.exposure
 
         seeds = jnp.stack([views.seeds(seed, draw, half) for half in (0, 1)])
         images, columns = jax.vmap(partial(views.map, image_and_columns))(seeds)
@@ -89,4 +90,4 @@ def misfits(candidates, arguments, coordinates):
 
 
 def _image(scene, seed, views, values, spp):
-    return render(views.with_values(scene, values), spp, seed)
+    return render(views.with_values(scene, values), spp, seed) * views.exposure

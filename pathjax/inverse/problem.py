@@ -21,7 +21,8 @@ class Views:
     """Views of one structure, stacked where they differ."""
 
     scene: Scene
-    targets: jax.Array  # (V, H, W, 3)
+    targets: jax.Array  # (V, H, W, 3), exposed
+    exposure: jax.Array  # () that renders are multiplied by
     names: tuple[str, ...] = field(metadata={"static": True})  # of the fitted parameters, those that these views hold
     axes: tuple[int | None, ...] = field(metadata={"static": True})  # of each leaf of the scene: 0 where stacked
     numbers: tuple[int, ...] = field(metadata={"static": True})  # of each view, its place in the caller's list
@@ -52,7 +53,8 @@ class Views:
 @dataclass(frozen=True)
 class Problem:
     scenes: list[Scene]
-    targets: list[Target]  # of arrays (H, W, 3) throughout; the image is 0 where it is not measured
+    targets: list[Target]  # exposed, of arrays (H, W, 3) throughout; the image is 0 where it is not measured
+    exposure: float  # a power of 2 that brings the targets to a level near 1: squares of radiances may leave float32
     groups: list[Views]
     coordinates: Coordinates
     start: np.ndarray  # (n,) values
@@ -88,7 +90,13 @@ def build(scene, target, names, start) -> Problem:
         raise InputError("every pixel of the target is clipped or left out; give one that is exposed for the scene")
     if pixels < unknowns:
         raise InputError(f"{pixels} pixels cannot tell {unknowns} numbers; give larger targets or more views")
-    return Problem(scenes, targets, _groups(scenes, targets, names), coordinates, coordinates.pack(values))
+    level = np.concatenate([target.image[target.usable] for target in targets]).mean()
+    exposure = float(np.exp2(-np.floor(np.log2(level)))) if level > 0 else 1.0
+    targets = [
+        replace(t, image=t.image * exposure, step=t.step * exposure, ceiling=t.ceiling * exposure) for t in targets
+    ]
+    groups = _groups(scenes, targets, exposure, names)
+    return Problem(scenes, targets, exposure, groups, coordinates, coordinates.pack(values))
 
 
 def _target(scene, target, number, count) -> Target:
@@ -116,7 +124,7 @@ def _target(scene, target, number, count) -> Target:
     return Target(np.where(measured, image, 0), np.where(measured, step, 0), target.ceiling, measured)
 
 
-def _groups(scenes, targets, names) -> list[Views]:
+def _groups(scenes, targets, exposure, names) -> list[Views]:
     groups: dict = {}
     for number, scene in enumerate(scenes):
         leaves, tree = jax.tree.flatten(replace(scene, about=None))
@@ -136,5 +144,5 @@ def _groups(scenes, targets, names) -> list[Views]:
         scene = jax.tree.unflatten(jax.tree.structure(first), stacked)
         dtype = first.camera.origin.dtype
         here = jnp.asarray(np.stack([targets[i].image for i in numbers]), dtype)
-        views.append(Views(scene, here, held, tuple(axes), numbers))
+        views.append(Views(scene, here, jnp.asarray(exposure, dtype), held, tuple(axes), numbers))
     return views

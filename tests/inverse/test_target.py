@@ -96,7 +96,7 @@ def lossy(path):
     [
         ("a.png", palette, "palette"),
         ("a.exr", lossy, "DWAA compression changes pixels"),
-        ("a.jpg", lambda path: Image.new("RGB", (8, 8)).save(path), "no targets"),
+        ("a.jpg", lambda path: Image.new("RGB", (8, 8)).save(path), "use OpenEXR or PNG for targets"),
         ("a.png", lambda path: None, "no such file"),
     ],
 )
