@@ -76,8 +76,6 @@ def intersect(table: Triangles, leaf, prepared, start):
     z = [c - ray[2] for c in coordinates(axes[2])]
     x = [c - ray[0] - ray[3] * z for c, z in zip(coordinates(axes[0]), z, strict=True)]
     y = [c - ray[1] - ray[4] * z for c, z in zip(coordinates(axes[1]), z, strict=True)]
-    # Several results share these; without the barrier each computes them again. (z is cheaper computed twice.)
-    x, y = lax.optimization_barrier((x, y))
     tolerance = 2 * np.finfo(ray.dtype).eps
 
     def edge(i, j):
