@@ -46,9 +46,10 @@ _WIDTH_FLAG = f"--{_WIDTH_OPTION}=512"
 _DEVICE_FLAG = "xla_force_host_platform_device_count"
 # A Python thread that starts computations on several devices faster than they end, 32 on each, holds a thread of the
 # pool for each device until one ends. XLA makes a thread for each core, and where all are held, the part of an
-# all-gather that another one waits for never begins. Of four for each device one runs kernels. (Two Python threads that
-# both run so far ahead can still stop each other: XLA lets those that wait go on in any order.)
-_POOL_VARIABLE, _POOL_OF_A_DEVICE = "PJRT_NPROC", 4
+# all-gather that another one waits for never begins. Of two for each device one runs kernels; with more of them renders
+# take longer. (Two Python threads that both run so far ahead can still stop each other, as XLA lets those that wait go
+# on in any order.)
+_POOL_VARIABLE, _POOL_OF_A_DEVICE = "PJRT_NPROC", 2
 # Of an all-gather XLA aborts where the last part comes a minute after the first: of two devices one may have the longer
 # half of an image, or a busy core. These are three years; jaxlib 0.7 does not know the flags.
 _PATIENCE_OPTION = "xla_cpu_collective_call"
