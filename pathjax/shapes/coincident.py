@@ -17,7 +17,6 @@ from functools import cache, reduce
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from pathjax.shapes import box, planar, triangle
 
@@ -116,6 +115,8 @@ def _yields(face: _Face, other: _Face) -> bool:
 
 def sphere_margins(balls, dtype) -> np.ndarray:
     """Margins (P,) of spheres (P, 4), center and radius; 0 for those that no other one coincides with."""
+    from scipy.spatial import cKDTree  # takes a sixth of a second, which `import pathjax` has not
+
     reach = np.linalg.norm(balls[:, :3], axis=1) + balls[:, 3]
     margins = np.zeros(len(balls))
     pairs = cKDTree(balls).query_pairs(_precision(dtype) * reach.max(initial=0), output_type="ndarray")
