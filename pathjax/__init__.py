@@ -11,7 +11,7 @@ from pathjax.render import render
 from pathjax.scene import Scene
 from pathjax.until import RenderResult, render_until
 
-__version__ = "0.3.1"
+__version__ = "0.4.0"
 __all__ = [
     "Bounces",
     "Fit",
