@@ -24,7 +24,7 @@ class Triangles:
     vertices: jax.Array  # (P, 3, 3) by row: vertex, axis
     normals: jax.Array | None  # (P, 3, 3) at the vertices; None: no triangle of the scene is smooth
     uv: jax.Array | None  # (P, 3, 2)
-    margins: jax.Array | None  # (P,) of `coincident`; None: no rectangle or disk lies in any of these
+    margins: jax.Array | None  # (P,) of `coincident`, beside their own; None: nothing flat lies in any of these
 
 
 def leaf_numbers(vertices):
@@ -89,7 +89,8 @@ def intersect(table: Triangles, leaf, prepared, start):
     moment = u * z[0] + v * z[1] + w * z[2]
     t = moment * ray[5] / det
     reach = larger(larger(jnp.abs(z[0]), jnp.abs(z[1])), jnp.abs(z[2]))
-    # Seen edge-on, or tiny and far from the ray, all three errors rule and every edge is inclusive.
+    # Seen edge-on, or tiny and far from the ray, all three errors rule and every edge is inclusive. And a ray that
+    # starts in the plane, or on a neighbour's edge, finds a distance that is rounding alone, below half of the errors.
     sound = (jnp.abs(det) > error) & (jnp.abs(moment) > reach * (error / 2))
     rows = rows_of(at(table.leaves, leaf))
     return jnp.where((front | back) & sound & (rows != start), t, jnp.inf), rows
@@ -141,7 +142,7 @@ def _normal(edge1, edge2):
 
 
 def _point_error(vertices):
-    """(3, 3) -> (3,), bound on the rounding error of an interpolated vertex."""
+    """(3, 3) -> (3,), bound on the rounding error of an interpolated vertex, and of those of a coplanar triangle."""
     return (3 * np.finfo(vertices.dtype).eps) * jnp.max(jnp.abs(vertices), 0)
 
 
