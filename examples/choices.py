@@ -22,9 +22,9 @@ from pathjax import transport
 from pathjax.bench import figures, plot
 from pathjax.bsdfs import FRESNEL
 from pathjax.integrators.path import SAMPLERS, STRATEGIES
-from pathjax.io import mitsuba_xml
+from pathjax.io.mitsuba import loader as mitsuba_xml
 from pathjax.scene import UNBOUNDED, Scene, build
-from pathjax.shapes.bvh_build import RULES
+from pathjax.shapes.accel.build import RULES
 
 SCENES = Path(__file__).resolve().parents[1] / "scenes"
 BATCHES = 16  # independent images that make up a reference

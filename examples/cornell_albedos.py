@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 
 import pathjax as pj
+from pathjax.images.image import write_png
 from pathjax.inverse import report
-from pathjax.io.image import write_png
 
 NAMES = ["white.reflectance", "red.reflectance", "green.reflectance"]
 

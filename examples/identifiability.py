@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 
 import pathjax as pj
+from pathjax.images.image import write_png
 from pathjax.inverse import report
-from pathjax.io.image import write_png
 
 NAMES = ["lamp.radiance", "floor.reflectance", "wall.reflectance"]
 SCENE = """<scene version="3.0.0">

@@ -17,10 +17,11 @@ from PIL import Image, ImageDraw
 
 import pathjax as pj
 from pathjax.bench.walk import walk
-from pathjax.camera import sample_ray
-from pathjax.io import mesh, mitsuba_xml
+from pathjax.io import mesh
+from pathjax.io.mitsuba import loader as mitsuba_xml
 from pathjax.scene import build
-from pathjax.shapes.bvh_build import RULES
+from pathjax.sensors.camera import sample_ray
+from pathjax.shapes.accel.build import RULES
 
 SCENES = Path(__file__).resolve().parents[1] / "scenes"
 GAMMA = 2.2

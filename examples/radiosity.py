@@ -14,9 +14,10 @@ from pathlib import Path
 import numpy as np
 
 import pathjax as pj
-from pathjax import description, picture, scene, transport
-from pathjax.io import mitsuba_xml
-from pathjax.io.image import write_png
+from pathjax import description, scene, transport
+from pathjax.images import picture
+from pathjax.images.image import write_png
+from pathjax.io.mitsuba import loader as mitsuba_xml
 
 BLOCKS = 32  # across the image: means over blocks hide the pixels' noise and the patches' edges
 

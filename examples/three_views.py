@@ -13,8 +13,8 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 import pathjax as pj
+from pathjax.images.image import linear_to_srgb
 from pathjax.inverse import report
-from pathjax.io.image import linear_to_srgb
 
 NAMES = ["glass.int_ior", "pattern.color0", "pattern.color1"]
 CAMERAS = ["0, 0, 4", "1.6, 0.4, 3.6", "-1, 1.2, 3.7"]

@@ -1,15 +1,15 @@
 """pathjax: a differentiable Monte Carlo path tracer in pure JAX."""
 
-from pathjax import runtime as _runtime  # noqa: F401  first: sets XLA up before a backend starts
-from pathjax.aovs import render_aovs
-from pathjax.bounces import Bounces, render_bounces
+from pathjax.compile import runtime as _runtime  # noqa: F401  first: sets XLA up before a backend starts
+from pathjax.derivatives.gradient import Jacobian, jacobian
 from pathjax.errors import InputError, InputWarning
-from pathjax.gradient import Jacobian, jacobian
-from pathjax.named import parameters, with_parameters
-from pathjax.query import closest_hit
-from pathjax.render import render
-from pathjax.scene import Scene
-from pathjax.until import RenderResult, render_until
+from pathjax.rendering.aovs import render_aovs
+from pathjax.rendering.bounces import Bounces, render_bounces
+from pathjax.rendering.progressive.until import RenderResult, render_until
+from pathjax.rendering.query import closest_hit
+from pathjax.rendering.render import render
+from pathjax.scene.parameters import parameters, with_parameters
+from pathjax.scene.scene import Scene
 
 __version__ = "0.4.0"
 __all__ = [
@@ -49,7 +49,7 @@ def load_scene(file, **parameters) -> Scene:
     import warnings
 
     from pathjax import emitters, scene
-    from pathjax.io import mitsuba_xml
+    from pathjax.io.mitsuba import loader as mitsuba_xml
 
     loaded = scene.build(mitsuba_xml.load(file, **parameters))
     if dark := emitters.darkness(loaded.emitters):
@@ -64,7 +64,7 @@ def __getattr__(name):
 
         return getattr(inverse, name)
     if name in ("GradientCheck", "check_gradient"):
-        from pathjax import check
+        from pathjax.rendering import check
 
         return getattr(check, name)
     raise AttributeError(f"module 'pathjax' has no attribute {name!r}")

@@ -15,12 +15,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pathjax import gradient
-from pathjax.film import image_shape, pixel_count
+from pathjax.derivatives import gradient
 from pathjax.integrators import pixel
-from pathjax.io import mitsuba_xml
-from pathjax.render import pixel_means
+from pathjax.io.mitsuba import loader as mitsuba_xml
+from pathjax.rendering.render import pixel_means
 from pathjax.scene import build
+from pathjax.sensors.film import image_shape, pixel_count
 
 os.environ["PATHJAX_CACHE"] = "0"  # tests leave the user's cache of kernels alone, and compile what they test
 

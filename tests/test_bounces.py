@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 import pathjax as pj
-from pathjax import bounces, runtime, tail
+from pathjax.compile import runtime
+from pathjax.rendering import bounces, tail
 
 RHO = np.array([0.2, 0.5, 0.8])
 DEPTH = 6

@@ -14,11 +14,14 @@ from jax import lax
 from jax.experimental import checkify
 
 import pathjax as pj
-from pathjax import emitters, film, runtime, transport
+from pathjax import emitters, transport
 from pathjax.bsdfs.diffuse import DiffuseTable
-from pathjax.bsdfs.texture import lookup
+from pathjax.compile import runtime
 from pathjax.core import math
-from pathjax.shapes import bvh, triangle
+from pathjax.sensors import film
+from pathjax.shapes import triangle
+from pathjax.shapes.accel import traverse as bvh
+from pathjax.textures.texture import lookup
 
 # Numbers of samplers from the ends of their range, the ends of steps, and between.
 ENDS = np.float32([0, 2**-24, 0.25, 0.5, 0.75, 1 - 2**-12, 1 - 2**-24])

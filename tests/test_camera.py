@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pathjax import camera
 from pathjax import description as desc
+from pathjax.sensors import camera
 
 ORIGIN, TARGET, UP = [1.0, 2.0, -4.0], [0.3, 0.2, 0.5], [0.1, 1.0, 0.2]
 

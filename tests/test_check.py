@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import pathjax as pj
-from pathjax import check
+from pathjax.rendering import check
 
 ROOM = """
 <bsdf type="diffuse" id="floor"><rgb name="reflectance" value="0.6, 0.5, 0.2"/></bsdf>

@@ -14,14 +14,15 @@ import numpy as np
 import pytest
 
 import pathjax as pj
-from pathjax import checkpoint, progressive
+from pathjax.rendering.progressive import checkpoint
+from pathjax.rendering.progressive import passes as progressive
 
 HOW = {"target_error": 0.015, "seed": 3}
 
 # Renders as HOW says; tells when it has begun to, and saves after every call of the kernel.
 CHILD = """
 import sys
-from pathjax import checkpoint
+from pathjax.rendering.progressive import checkpoint
 import pathjax as pj
 
 def save_if_due(self, state):

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 import pathjax as pj
-from pathjax import bsdfs, runtime
+from pathjax import bsdfs
+from pathjax.compile import runtime
 from pathjax.integrators import path, pixel
-from pathjax.render import pixel_means, render_pixels
+from pathjax.rendering.render import pixel_means, render_pixels
 
 INTERFACE = """
 <shape type="rectangle"><transform name="to_world"><scale value="5"/></transform>

@@ -16,10 +16,13 @@ import pytest
 import trimesh
 
 import pathjax as pj
-from pathjax import bounces, cli, inverse, until
-from pathjax.interrupts import SIGNALS
-from pathjax.io import image
-from pathjax.io.image import linear_to_srgb, read_exr, read_rgb, write_exr, write_png
+from pathjax import inverse
+from pathjax.cli import commands as cli
+from pathjax.images import image
+from pathjax.images.image import linear_to_srgb, read_exr, read_rgb, write_exr, write_png
+from pathjax.rendering import bounces
+from pathjax.rendering.progressive import until
+from pathjax.system.interrupts import SIGNALS
 
 FURNACE = "scenes/furnace.xml"
 SMALL = ("-D", "res=8")
@@ -763,7 +766,8 @@ def first_line_with(stream, text):
 # signal comes at a known time; then runs the same command line.
 TELLTALE = """
 import sys
-from pathjax import cli, progressive
+from pathjax.cli import commands as cli
+from pathjax.rendering.progressive import passes as progressive
 from pathjax.io import mesh
 
 def tell(what):
@@ -858,7 +862,7 @@ def test_interrupt_before_the_first_pass_ends_quickly_and_writes_nothing(interru
 # The same command line; then says how many programs were wanted of the cache, and how many it held.
 COUNTED = """
 import sys
-from pathjax import cli
+from pathjax.cli import commands as cli
 import jax
 
 events = []

@@ -9,8 +9,9 @@ import pytest
 from PIL import Image
 from scipy import stats
 
-from pathjax import cli, compare
-from pathjax.io.image import read_rgb, write_exr, write_png
+from pathjax.cli import commands as cli
+from pathjax.images import compare
+from pathjax.images.image import read_rgb, write_exr, write_png
 
 GREY = np.full((16, 24, 3), 0.3, np.float32)
 

@@ -12,12 +12,15 @@ import pytest
 from jax.extend import source_info_util
 
 import pathjax as pj
-from pathjax import aovs, bounces, gradient, ior_step, query, replicates, runtime
-from pathjax.film import pixel_count
+from pathjax.compile import runtime
+from pathjax.compile.lanes import lanes
+from pathjax.compile.lanes.interpreter import Lanes
+from pathjax.derivatives import gradient, ior_step
 from pathjax.integrators import pixel
-from pathjax.lanes import lanes
-from pathjax.lanes.machine import Lanes
-from pathjax.render import pixel_means
+from pathjax.rendering import aovs, bounces, query
+from pathjax.rendering.progressive import replicates
+from pathjax.rendering.render import pixel_means
+from pathjax.sensors.film import pixel_count
 from pathjax.transport import control, factors, patches, rays, view
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from pathjax import estimate, replicates
+from pathjax.rendering.progressive import estimate, replicates
 
 R = replicates.COUNT
 

@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 from pathjax import description as desc
-from pathjax import film
+from pathjax.sensors import film
 
 # Chance that a correct filter fails one test; seeds are fixed.
 FALSE_ALARM = 1e-4

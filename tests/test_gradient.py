@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 import pathjax as pj
-from pathjax import gradient, ior_step, named
-from pathjax.film import pixel_count
-from pathjax.io.image import write_exr
+from pathjax.derivatives import gradient, ior_step
+from pathjax.images.image import write_exr
+from pathjax.scene import parameters as named
+from pathjax.sensors.film import pixel_count
 
 ROOT = Path(__file__).resolve().parents[1]
 NO_LIMIT = 1 << 30

@@ -12,10 +12,10 @@ import pytest
 
 import pathjax as pj
 from pathjax import emitters
-from pathjax.camera import sample_ray
+from pathjax.compile.runtime import native_map
 from pathjax.integrators import path
-from pathjax.render import render_pixels
-from pathjax.runtime import native_map
+from pathjax.rendering.render import render_pixels
+from pathjax.sensors.camera import sample_ray
 
 ROOT = Path(__file__).resolve().parents[1]
 NAMES = sorted(path.stem for path in (*ROOT.glob("scenes/*.xml"), *ROOT.glob("tests/scenes/*.xml")))
@@ -381,7 +381,7 @@ def test_random_numbers_at_their_ends_give_finite_light(shipped, name, strategy)
 
 
 def test_film_samples_at_the_ends_of_random_numbers_are_finite(shipped):
-    from pathjax import film
+    from pathjax.sensors import film
 
     for name in ("cornell_box", "shapes_and_filters", "conductors"):  # box, tent, gaussian
         table = shipped(name, res=16).film

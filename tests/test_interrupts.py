@@ -8,7 +8,7 @@ import threading
 
 import pytest
 
-from pathjax.interrupts import SIGNALS, Interrupts
+from pathjax.system.interrupts import SIGNALS, Interrupts
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="sends signals")
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from jax import lax
 
-from pathjax.lanes import lanes, one_by_one
+from pathjax.compile.lanes import lanes, one_by_one
 
 WIDTH = 5
 TABLE = np.arange(24, dtype=np.float32).reshape(4, 2, 3) ** 1.5

@@ -10,7 +10,7 @@ import pytest
 
 from pathjax import __main__ as program
 from pathjax.errors import InputError
-from pathjax.output import Output
+from pathjax.system.output import Output
 
 
 @pytest.fixture
@@ -98,8 +98,9 @@ def test_text_is_escaped_for_a_terminal_that_lacks_letters(monkeypatch):
 # The program's start, and what commands do then: a file, a result, a message.
 SCRIPT = """
 import sys
-from pathjax import __main__ as program, cli
-from pathjax.output import Output, say
+from pathjax import __main__ as program
+from pathjax.cli import commands as cli
+from pathjax.system.output import Output, say
 
 def main():
     output = Output()

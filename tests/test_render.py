@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import pathjax as pj
-from pathjax.render import render_pixels
+from pathjax.rendering.render import render_pixels
 
 NO_LIMIT = 1 << 30
 GREY = '<bsdf type="diffuse"><rgb name="reflectance" value="0.2, 0.5, 0.8"/></bsdf>'

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 from jax import lax
 
-from pathjax import runtime
-from pathjax.runtime import native_map
+from pathjax.compile import runtime
+from pathjax.compile.runtime import native_map
 
 OPTION = "xla_cpu_small_while_loop_byte_threshold"
 
@@ -146,7 +146,7 @@ def test_parts_of_a_kernel_may_end_long_after_each_other(python):
 
 UNEVEN = """
 import jax, jax.numpy as jnp
-from pathjax.runtime import native_map
+from pathjax.compile.runtime import native_map
 
 def spin(item, times):
     def turn(state):
@@ -171,7 +171,7 @@ import os
 import jax, jax.numpy as jnp, numpy as np
 from functools import partial
 from jax.sharding import Mesh, PartitionSpec as P
-from pathjax.runtime import native_map
+from pathjax.compile.runtime import native_map
 
 @jax.jit
 @partial(jax.shard_map, mesh=Mesh(np.array(jax.devices()), "d"), in_specs=(P("d"), P()), out_specs=P("d"))

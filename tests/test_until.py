@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 
 import pathjax as pj
-from pathjax import estimate, progressive, runtime, until
-from pathjax.compare import relative_error
-from pathjax.interrupts import SIGNALS
+from pathjax.compile import runtime
+from pathjax.images.compare import relative_error
+from pathjax.rendering.progressive import estimate, until
+from pathjax.rendering.progressive import passes as progressive
+from pathjax.system.interrupts import SIGNALS
 
 
 @pytest.fixture(scope="module")
@@ -280,8 +282,8 @@ def test_float64_within_a_context(shipped, x64, cornell):
 
 
 def test_image_is_the_mean_of_the_replicates(cornell):
-    from pathjax import replicates
-    from pathjax.render import render_pixels
+    from pathjax.rendering.progressive import replicates
+    from pathjax.rendering.render import render_pixels
 
     result = pj.render_until(cornell, spp=32, seed=4)
     pixels = np.arange(24 * 24, dtype=np.int32)

@@ -61,7 +61,7 @@ def main(file: str) -> None:
     before = resident("VmRSS")
     import pathjax
     from pathjax import scene
-    from pathjax.io import mitsuba_xml
+    from pathjax.io.mitsuba import loader as mitsuba_xml
 
     if request["dtype"] == "float64":
         jax.config.update("jax_enable_x64", True)

@@ -16,9 +16,9 @@ from pathjax.bench import mitsuba_peer, plot
 from pathjax.bench.measure import Plan, measure
 from pathjax.bench.report import markdown
 from pathjax.errors import InputError
-from pathjax.interrupts import Interrupts
-from pathjax.io.files import check_writable, write_text
-from pathjax.output import Output, say
+from pathjax.system.files import check_writable, write_text
+from pathjax.system.interrupts import Interrupts
+from pathjax.system.output import Output, say
 
 
 def run(options, output: Output) -> int:

@@ -14,11 +14,11 @@ import jax
 import numpy as np
 
 import pathjax
-from pathjax import film
 from pathjax.bench import alone, figures, mitsuba_peer, rays
 from pathjax.bench.figures import Reference
 from pathjax.integrators.path import STRATEGIES
-from pathjax.scene import Scene
+from pathjax.scene.scene import Scene
+from pathjax.sensors import film
 
 # Independent images whose mean is the reference, so that their spread tells its error.
 BATCHES = 16

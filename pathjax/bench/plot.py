@@ -6,7 +6,7 @@ import math
 from pathlib import Path
 
 from pathjax.bench import figures
-from pathjax.io.files import encodable, write_whole
+from pathjax.system.files import encodable, write_whole
 
 _OURS = {"color": "black", "marker": "o", "linewidth": 2.2, "markersize": 7, "zorder": 3}
 _PEERS = {

@@ -10,9 +10,9 @@ import jax
 import numpy as np
 
 from pathjax.bench import embree_peer
-from pathjax.camera import sample_ray
 from pathjax.core.warp import square_to_sphere
-from pathjax.query import _closest_hit
+from pathjax.rendering.query import _closest_hit
+from pathjax.sensors.camera import sample_ray
 from pathjax.shapes.triangle import Triangles
 
 RAYS = 1 << 18

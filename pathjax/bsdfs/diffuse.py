@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 
-from pathjax.bsdfs.texture import Textures, lookup
 from pathjax.core.math import at
 from pathjax.core.types import BSDFSample
 from pathjax.core.warp import square_to_cosine_hemisphere, square_to_cosine_hemisphere_pdf
+from pathjax.textures.texture import Textures, lookup
 
 
 @jax.tree_util.register_dataclass

@@ -6,10 +6,10 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from pathjax import film
-from pathjax.camera import sample_ray
 from pathjax.core import sampler
 from pathjax.integrators import path
+from pathjax.sensors import film
+from pathjax.sensors.camera import sample_ray
 
 
 def numbers(pixels, first_sample, spp, seed):

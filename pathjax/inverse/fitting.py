@@ -25,15 +25,15 @@ import numpy as np
 import optimistix as optx
 from scipy import ndimage
 
+from pathjax.compile.runtime import usual_promotion
+from pathjax.derivatives.gradient import ior_at, is_glass
 from pathjax.errors import InputError
-from pathjax.gradient import ior_at, is_glass
 from pathjax.inverse import losses, problem, uncertainty
 from pathjax.inverse.problem import Problem
 from pathjax.inverse.programs import Stepper, kept
 from pathjax.inverse.uncertainty import Evidence
-from pathjax.named import with_parameters
-from pathjax.runtime import usual_promotion
-from pathjax.scene import Scene
+from pathjax.scene.parameters import with_parameters
+from pathjax.scene.scene import Scene
 
 # Samples per pixel of the approach. Newton's method begins with a part of the samples that `fit` is given.
 APPROACH_SPP, COARSE_PART = 16, 4

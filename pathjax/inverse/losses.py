@@ -7,9 +7,9 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 
-from pathjax.gradient import jacobian
+from pathjax.derivatives.gradient import jacobian
 from pathjax.inverse.uncertainty import Evidence
-from pathjax.render import render
+from pathjax.rendering.render import render
 
 
 def residuals(x, arguments, coordinates):

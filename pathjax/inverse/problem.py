@@ -8,11 +8,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pathjax import film, named
 from pathjax.errors import InputError
 from pathjax.inverse.coordinates import Coordinates
 from pathjax.inverse.target import Target
-from pathjax.scene import Scene
+from pathjax.scene import parameters as named
+from pathjax.scene.scene import Scene
+from pathjax.sensors import film
 
 
 @jax.tree_util.register_dataclass

@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
+from pathjax.images.picture import GAP, side_by_side, signed_colors
 from pathjax.inverse.fitting import Fit
-from pathjax.picture import GAP, side_by_side, signed_colors
 
 # Residuals of this many standard deviations are shown in full colour.
 _FULL_SCALE = 3

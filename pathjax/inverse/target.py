@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from pathjax.errors import InputError
-from pathjax.io import image as files
+from pathjax.images import image as files
 
 # What EXR files of these compressions hold differs from what was written, alike in neighbouring pixels.
 _LOSSY = ("B44", "B44A", "DWAA", "DWAB")

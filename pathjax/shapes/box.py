@@ -14,8 +14,8 @@ import numpy as np
 from jax import lax
 
 from pathjax.core.math import at, dot, larger, smaller
-from pathjax.shapes.bvh import Tree
-from pathjax.shapes.leaves import numbers_of, rows_of
+from pathjax.shapes.accel.leaves import numbers_of, rows_of
+from pathjax.shapes.accel.traverse import Tree
 
 FACES = 6
 

@@ -13,10 +13,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from pathjax.compile.lanes import one_by_one
 from pathjax.core.math import at, integer_like, smaller
 from pathjax.core.types import Hit, Ray, Surface
-from pathjax.lanes import one_by_one
-from pathjax.shapes import box, bvh, planar, sphere, triangle
+from pathjax.shapes import box, planar, sphere, triangle
+from pathjax.shapes.accel import traverse as bvh
 from pathjax.shapes.box import Boxes
 from pathjax.shapes.planar import Planar
 from pathjax.shapes.sphere import Spheres

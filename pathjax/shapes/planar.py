@@ -16,9 +16,9 @@ import numpy as np
 from pathjax.core.math import at, dot, larger, safe_atan2, safe_divide, safe_sqrt
 from pathjax.core.types import Surface
 from pathjax.core.warp import square_to_disk
+from pathjax.shapes.accel.leaves import numbers_of, rows_of
+from pathjax.shapes.accel.traverse import Tree
 from pathjax.shapes.box import Boxes
-from pathjax.shapes.bvh import Tree
-from pathjax.shapes.leaves import numbers_of, rows_of
 
 
 @jax.tree_util.register_dataclass

@@ -23,8 +23,8 @@ from pathjax.core.math import (
 )
 from pathjax.core.types import Surface
 from pathjax.core.warp import SPHERE_PDF, cone_pdf, square_to_cone, square_to_sphere
-from pathjax.shapes.bvh import Tree
-from pathjax.shapes.leaves import numbers_of, rows_of
+from pathjax.shapes.accel.leaves import numbers_of, rows_of
+from pathjax.shapes.accel.traverse import Tree
 
 
 @jax.tree_util.register_dataclass

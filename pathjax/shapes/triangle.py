@@ -12,8 +12,8 @@ from jax import lax
 from pathjax.core.math import at, cross, dot, larger, normalize, rescale, safe_divide
 from pathjax.core.types import Surface
 from pathjax.core.warp import square_to_triangle
-from pathjax.shapes.bvh import Tree
-from pathjax.shapes.leaves import numbers_of, rows_of
+from pathjax.shapes.accel.leaves import numbers_of, rows_of
+from pathjax.shapes.accel.traverse import Tree
 
 
 @jax.tree_util.register_dataclass

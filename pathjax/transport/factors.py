@@ -18,12 +18,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from pathjax.compile.runtime import native_map
 from pathjax.core import sampler
 from pathjax.core.math import dot, larger, safe_divide, safe_sqrt, spawn_ray
 from pathjax.core.types import Surface
 from pathjax.errors import InputError
-from pathjax.runtime import native_map
-from pathjax.scene import Scene
+from pathjax.scene.scene import Scene
 from pathjax.shapes import geometry
 from pathjax.shapes.planar import Planar
 from pathjax.shapes.sphere import Spheres

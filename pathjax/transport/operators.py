@@ -24,10 +24,10 @@ import numpy as np
 from jax import lax
 
 from pathjax.bsdfs import DiffuseTable
+from pathjax.compile.runtime import usual_promotion
 from pathjax.core.math import safe_divide
 from pathjax.errors import InputError
-from pathjax.runtime import usual_promotion
-from pathjax.scene import Scene
+from pathjax.scene.scene import Scene
 from pathjax.transport import factors as dense_factors
 from pathjax.transport import rays as ray_casting
 from pathjax.transport.control import Control

@@ -17,7 +17,7 @@ from pathjax.bsdfs import DiffuseTable
 from pathjax.core.math import at, cos_sin_turns, cross, dot, normalize, rescale, safe_atan2, safe_sqrt
 from pathjax.core.warp import square_to_triangle
 from pathjax.errors import InputError
-from pathjax.scene import Scene
+from pathjax.scene.scene import Scene
 from pathjax.shapes import geometry, planar, sphere, triangle
 from pathjax.shapes.geometry import Geometry
 from pathjax.shapes.planar import Planar

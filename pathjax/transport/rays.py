@@ -10,12 +10,12 @@ import numpy as np
 from jax import lax
 from scipy import sparse
 
+from pathjax.compile.runtime import native_map
 from pathjax.core import sampler
 from pathjax.core.math import dot, frame_from_normal, spawn_ray, to_world
 from pathjax.core.types import Surface
 from pathjax.core.warp import square_to_cosine_hemisphere
-from pathjax.runtime import native_map
-from pathjax.scene import Scene
+from pathjax.scene.scene import Scene
 from pathjax.shapes import geometry
 from pathjax.transport.patches import Patches, patch_at, point
 

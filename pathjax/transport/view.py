@@ -9,14 +9,14 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from pathjax import film
+from pathjax.compile.runtime import native_map, usual_promotion
 from pathjax.core import sampler
 from pathjax.core.math import at, dot
 from pathjax.errors import InputError
 from pathjax.integrators.path import check_sampling
 from pathjax.integrators.pixel import camera_path
-from pathjax.runtime import native_map, usual_promotion
-from pathjax.scene import Scene
+from pathjax.scene.scene import Scene
+from pathjax.sensors import film
 from pathjax.shapes import geometry
 from pathjax.shapes.geometry import Geometry
 from pathjax.transport.patches import Patches, patch_at

@@ -8,9 +8,10 @@ from scipy import stats
 
 import pathjax as pj
 from pathjax.bench.walk import distances, walk
-from pathjax.io import mitsuba_xml
+from pathjax.io.mitsuba import loader as mitsuba_xml
 from pathjax.scene import build
-from pathjax.shapes import bvh, bvh_build
+from pathjax.shapes.accel import build as bvh_build
+from pathjax.shapes.accel import traverse as bvh
 
 RULES = list(bvh_build.RULES)
 

@@ -11,11 +11,12 @@ from scipy import stats
 
 from pathjax import bsdfs
 from pathjax import description as desc
-from pathjax.bsdfs import conductor, dielectric, diffuse, texture
+from pathjax.bsdfs import conductor, dielectric, diffuse
 from pathjax.bsdfs.conductor import ConductorTable
 from pathjax.bsdfs.dielectric import DielectricTable
 from pathjax.bsdfs.diffuse import DiffuseTable
-from pathjax.scene import _build_materials, _textures
+from pathjax.bsdfs.builder import _textures, build_materials
+from pathjax.textures import texture
 
 # Chance that a correct bsdf fails one of the statistical tests here; seeds are fixed.
 FALSE_ALARM = 1e-4
@@ -358,7 +359,7 @@ def test_sides_of_a_shape_are_told_apart():
             for bsdf in (red, desc.Twosided("t", red, green), desc.Twosided("u", mirror, red), glass)
         ]
 
-    materials = _build_materials(Holder, jnp.float32, {})
+    materials = build_materials(Holder, jnp.float32, {})
     wi, u = jnp.array([0.6, 0, 0.8]), jnp.array([0.999, 0.3])
 
     @jax.jit

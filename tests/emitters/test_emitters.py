@@ -12,8 +12,8 @@ from scipy import stats
 from pathjax import description as desc
 from pathjax import emitters
 from pathjax.core.types import Ray
-from pathjax.named import with_parameters
 from pathjax.scene import build
+from pathjax.scene.parameters import with_parameters
 from pathjax.shapes import geometry
 
 # Chance that a correct light fails one statistical comparison; seeds are fixed.

@@ -9,8 +9,8 @@ import optimistix as optx
 import pytest
 
 import pathjax as pj
+from pathjax.images.image import read_rgb, write_exr, write_png
 from pathjax.inverse import fitting, report
-from pathjax.io.image import read_rgb, write_exr, write_png
 
 # A floor and a wall that light each other under a sky.
 ROOM = """

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from pathjax.errors import InputError
-from pathjax.io.files import check_writable, encodable, write_text
-from pathjax.io.image import read_exr, write_exr, write_png
+from pathjax.images.image import read_exr, write_exr, write_png
+from pathjax.system.files import check_writable, encodable, write_text
 
 PIXELS = {name: np.full((4, 4), 0.5, np.float32) for name in "RGB"}
 # A byte that no UTF-8 holds, as Python has it in names of files.

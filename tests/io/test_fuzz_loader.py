@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 
 from pathjax.description import Description, Mesh
 from pathjax.errors import InputError
+from pathjax.images.image import read_exr, read_rgb, write_exr, write_png
 from pathjax.io import mesh
-from pathjax.io.image import read_exr, read_rgb, write_exr, write_png
-from pathjax.io.mitsuba_xml import load
+from pathjax.io.mitsuba.loader import load
 
 SCENE = """<?xml version="1.0"?>
 <scene version="3.0.0">

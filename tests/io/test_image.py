@@ -11,9 +11,9 @@ import OpenImageIO
 import pytest
 from PIL import Image
 
-from pathjax.compare import compare
 from pathjax.errors import InputError
-from pathjax.io.image import (
+from pathjax.images.compare import compare
+from pathjax.images.image import (
     file_format,
     linear_to_srgb,
     read_exr,

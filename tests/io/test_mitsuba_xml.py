@@ -8,9 +8,9 @@ import pytest
 
 from pathjax import description as d
 from pathjax.errors import InputError
-from pathjax.io.image import write_exr, write_png
-from pathjax.io.mitsuba_xml import load
-from pathjax.io.spectra import IOR
+from pathjax.images.image import write_exr, write_png
+from pathjax.io.mitsuba.loader import load
+from pathjax.io.mitsuba.spectra import IOR
 
 CORNELL = Path(__file__).parents[2] / "scenes" / "cornell_box.xml"
 SENSOR = '<sensor type="perspective"/>'

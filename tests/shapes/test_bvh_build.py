@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pathjax.shapes import bvh_build
-from pathjax.shapes.bvh_build import build
+from pathjax.shapes.accel import build as bvh_build
+from pathjax.shapes.accel.build import build
 
 RULES = ["sah", "equal", "middle"]
 

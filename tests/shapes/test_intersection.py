@@ -7,12 +7,12 @@ import pytest
 import trimesh
 
 from pathjax import description as desc
+from pathjax.compile.runtime import native_map
 from pathjax.core.math import normalize, spawn_ray
 from pathjax.core.types import Ray
-from pathjax.runtime import native_map
 from pathjax.scene import build
 from pathjax.shapes import geometry, triangle
-from pathjax.shapes.leaves import numbers_of, rows_of
+from pathjax.shapes.accel.leaves import numbers_of, rows_of
 
 GREY = desc.Diffuse("grey", np.full(3, 0.5))
 # Rounding of a coordinate relative to the distances it was computed from; hits closer to a border may go either way.

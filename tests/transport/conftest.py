@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import pytest
 
 from pathjax import description as desc
-from pathjax.io import mitsuba_xml
+from pathjax.io.mitsuba import loader as mitsuba_xml
 from pathjax.scene import build
 
 

@@ -10,8 +10,8 @@ import pytest
 import pathjax as pj
 from pathjax import transport
 from pathjax.integrators import pixel
-from pathjax.render import pixel_means
-from pathjax.scene import UNBOUNDED
+from pathjax.rendering.render import pixel_means
+from pathjax.scene.scene import UNBOUNDED
 
 BALL = """<shape type="sphere"><boolean name="flip_normals" value="true"/><bsdf type="diffuse">
   <rgb name="reflectance" value="0.3, 0.6, 0.9"/></bsdf><emitter type="area"/></shape>"""

@@ -9,7 +9,8 @@ import pytest
 from scipy import stats
 
 import pathjax as pj
-from pathjax import runtime, transport
+from pathjax import transport
+from pathjax.compile import runtime
 from pathjax.transport import factors, rays, view
 
 RHO = np.array([0.2, 0.5, 0.8])

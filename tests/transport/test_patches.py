@@ -9,9 +9,9 @@ import pytest
 
 import pathjax as pj
 from pathjax import transport
+from pathjax.compile.runtime import native_map
 from pathjax.core.math import at, dot
 from pathjax.core.types import Hit, Ray
-from pathjax.runtime import native_map
 from pathjax.shapes import geometry
 from pathjax.transport import patches as patches_module
 

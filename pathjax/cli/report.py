@@ -1,0 +1,151 @@
+"""What `pathjax info` tells: what a scene holds, what is compiled for it, its parameters, its hierarchies."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pathjax import bsdfs, emitters
+from pathjax.rendering import bounces
+from pathjax.scene.parameters import parameters
+from pathjax.scene.scene import UNBOUNDED, Scene
+from pathjax.sensors import film
+from pathjax.shapes import geometry
+from pathjax.shapes.accel.leaves import rows_of
+from pathjax.shapes.box import Boxes
+from pathjax.shapes.planar import Planar
+
+_SAMPLER = "randomly shifted lattice, hashing for roulette"
+
+
+def facts(scene: Scene) -> dict:
+    """Everything as JSON-ready values."""
+    about = scene.about
+    description = about.description
+    max_depth = int(scene.max_depth)
+    parts = [part for table in scene.geometry.tables for part in geometry.searched(table)]
+    height, width = film.image_shape(scene.film)
+    dark = emitters.darkness(scene.emitters)
+    return {
+        "file": description.file,
+        "image": {"width": width, "height": height, "filter": scene.film.filter, "spp": description.spp},
+        "camera": "thinlens" if scene.camera.lens is not None else "perspective",
+        "integrator": {
+            "max_depth": None if max_depth == UNBOUNDED else max_depth,
+            "rr_depth": int(scene.rr_depth),
+            "hide_emitters": scene.hide_emitters,
+        },
+        "sampler": {"file": description.sampler, "used": _SAMPLER},
+        "shapes": len(description.shapes),
+        "primitives": {_kind(part): _primitives(part) for part in parts},
+        "compiled": {
+            "shapes": [_kind(part) + (" (tree)" if part.tree else " (flat)") for part in parts],
+            "bsdfs": [type(table).__name__.removesuffix("Table").lower() for table in scene.materials.tables],
+            "light sampling": bsdfs.any_smooth(scene.materials) and scene.emitters.area is not None,
+            "emitters": [name for name in ("area", "constant") if getattr(scene.emitters, name) is not None],
+            "dtype": str(scene.camera.origin.dtype),
+        },
+        "trees": {
+            kind: {
+                "nodes": len(tree.child),
+                "leaves": len(tree.leaf_first),
+                "depth": tree.depth,
+                "primitives per leaf": float(tree.leaf_count.mean()),
+                "sah cost": float(tree.sah_cost),
+            }
+            for kind, tree in about.trees.items()
+        },
+        "parameters": {
+            name: {"value": np.asarray(value).tolist(), "shape": list(value.shape), "bounds": _bounds(about, name)}
+            for name, value in parameters(scene).items()
+        },
+        "notes": [*description.notes, *([f"{dark}, so images are black"] if dark else [])],
+    }
+
+
+def tail_facts(scene: Scene, error: float) -> dict:
+    """What the scene's max_depth cuts off, and the one that cuts off a share `error` of light, from a quick render.
+
+    Raises:
+        InputError: error is not between 0 and 1.
+    """
+    tail, max_depth = bounces.pilot(scene), int(scene.max_depth)
+    share, uncertainty = tail.cut_off(max_depth)
+    return {
+        "error": error,
+        "terms": tail.terms.tolist(),
+        "ratio": [_finite(x) for x in tail.ratio],
+        "cut_off": share.tolist() if max_depth < UNBOUNDED else [0.0] * 3,
+        "cut_off_error": [_finite(x) for x in uncertainty] if max_depth < UNBOUNDED else [0.0] * 3,
+        "max_depth": tail.depth_for(error),
+    }
+
+
+def _finite(x) -> float | None:
+    """JSON has no inf."""
+    return float(x) if np.isfinite(x) else None
+
+
+def _tail_lines(tail: dict, max_depth) -> list[str]:
+    if tail["max_depth"] is None:
+        return [f"tail        the last of {len(tail['terms'])} terms do not decay, so no max_depth can be suggested"]
+    worst = int(np.argmax(tail["cut_off"]))
+    ratio = ", ".join(f"{x:.3g}" for x in tail["ratio"])
+    lines = [f"tail        each bounce leaves {ratio} of the light before it (red, green, blue)"]
+    if max_depth is not None:
+        share, uncertainty = tail["cut_off"][worst], tail["cut_off_error"][worst]
+        lines.append(f"            max_depth {max_depth} cuts off {share:.2g} +- {uncertainty:.1g} of all light")
+    lines.append(f"            max_depth {tail['max_depth']} would cut off no more than {tail['error']:g}")
+    return lines
+
+
+def _bounds(about, name):
+    low, high = about.parameters[name].bounds
+    return [low, None if high == np.inf else high]
+
+
+def _primitives(part) -> int:
+    return int((rows_of(part.leaves) >= 0).sum())
+
+
+def _kind(part) -> str:
+    if isinstance(part, Planar):
+        return "disks" if part.disk else "rectangles"
+    if isinstance(part, Boxes):
+        return "cubes"
+    return type(part).__name__.lower()
+
+
+def text(facts: dict) -> str:
+    """The same for people."""
+    image, integrator, compiled = facts["image"], facts["integrator"], facts["compiled"]
+    depth = "unbounded" if integrator["max_depth"] is None else integrator["max_depth"]
+    lines = [
+        facts["file"],
+        f"image       {image['width']} x {image['height']}, {image['filter']} filter, {image['spp']} spp by default",
+        f"camera      {facts['camera']}",
+        f"integrator  path, max_depth {depth}, roulette from depth {integrator['rr_depth']}"
+        + (", emitters hidden" if integrator["hide_emitters"] else ""),
+        f"sampler     {facts['sampler']['used']} (the file asks for {facts['sampler']['file']})",
+        f"shapes      {facts['shapes']}: {_listed(f'{n} {kind}' for kind, n in facts['primitives'].items())}",
+        f"compiled    {_listed([*compiled['shapes'], *compiled['bsdfs']])}; {compiled['dtype']}",
+        "lights      " + _listed(compiled["emitters"]) + ("" if compiled["light sampling"] else ", not sampled"),
+    ]
+    for kind, tree in facts["trees"].items():
+        lines.append(
+            f"tree        {kind}s: {tree['nodes']} nodes, {tree['leaves']} leaves "
+            f"of {tree['primitives per leaf']:.1f}, depth {tree['depth']}, SAH cost {tree['sah cost']:.1f}"
+        )
+    if "tail" in facts:
+        lines += _tail_lines(facts["tail"], integrator["max_depth"])
+    lines.append("parameters" if facts["parameters"] else "parameters  none")
+    for name, parameter in facts["parameters"].items():
+        low, high = parameter["bounds"]
+        value = parameter["value"]
+        shown = ", ".join(f"{x:g}" for x in value) if isinstance(value, list) else f"{value:g}"
+        lines.append(f"  {name:32} {shown:28} in [{low:g}, {'inf' if high is None else format(high, 'g')}]")
+    lines += [f"note        {note}" for note in facts["notes"]]
+    return "\n".join(lines)
+
+
+def _listed(items) -> str:
+    return ", ".join(items) or "none"

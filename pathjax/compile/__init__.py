@@ -1,0 +1,1 @@
+"""How a function of one ray becomes a native kernel over millions."""

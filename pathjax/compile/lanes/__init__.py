@@ -1,0 +1,54 @@
+"""From a function of one item to the same function of many lanes, every number of an item in a register of its own.
+
+`jax.vmap` puts an axis in front of each array: the x of two points then lie three apart, and stacking them costs
+branches, so that LLVM vectorises little. This transformation keeps the components of every small array apart, each an
+array (W,) over the lanes. Structure (stack, slice, reshape) then costs nothing, arithmetic is SIMD across the lanes,
+and what all lanes share stays shared. Branches become selections; a loop goes on until its last lane is done, but lanes
+leave the loop that an item's own work consists of one by one, each for the next item.
+
+- `one_by_one(f)` is run for one lane after another, of those that are in the branch or the loop where it stands: a
+  search whose lanes would go different ways.
+- `optimization_barrier(x)` is computed once. (XLA's own barrier is gone before fusion, which computes a value again for
+  each of its consumers.)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from pathjax.compile.lanes.dataflow import flags_of, own_loop
+from pathjax.compile.lanes.interpreter import Lanes, one_by_one
+from pathjax.compile.lanes.persistent_loop import from_queue, in_groups
+
+__all__ = ["lanes", "one_by_one"]
+
+
+def lanes(f: Callable, width: int) -> Callable:
+    """f(x, *shared) of any number of items x, `width` at a time.
+
+    Returns:
+        function of xs, a pytree of arrays (N, ...), and of what all items share, to pytrees of arrays (N, ...).
+    """
+
+    def run(xs, *shared):
+        one = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), xs)
+        program, out = jax.make_jaxpr(f, return_shape=True)(one, *shared)
+        xs, shared = jax.tree.leaves(xs), jax.tree.leaves(shared)
+        if not len(xs[0]):
+            return jax.tree.map(lambda y: jnp.zeros((0, *y.shape), y.dtype), out)
+        # False, and no pass over HLO knows it.
+        never = lax.population_count(xs[0].ravel()[0].astype(jnp.int32)) < 0
+        machine = Lanes(width, never)
+        flags = flags_of(program, [True] * len(xs) + [False] * len(shared))
+        place = own_loop(program, flags)
+        if place is None:
+            outputs = in_groups(machine, program, xs, shared)
+        else:
+            outputs = from_queue(machine, program, xs, shared, place, flags)
+        return jax.tree.unflatten(jax.tree.structure(out), outputs)
+
+    return run

@@ -1,0 +1,149 @@
+"""Structure, which costs nothing.
+
+Rules are (lanes, inputs, params, shape of the first result) -> value, or values where the primitive has several, or
+None: not by this rule.
+"""
+
+from __future__ import annotations
+
+import math
+
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from pathjax.compile.lanes.columns import components, differs, objects
+
+
+def _broadcast_in_dim(lanes, inputs, params, shape):
+    extents = [1] * len(shape)
+    for axis, place in enumerate(params["broadcast_dimensions"]):
+        extents[place] = inputs[0].shape[axis]
+    return np.broadcast_to(inputs[0].reshape(extents), shape)
+
+
+def _slice(lanes, inputs, params, shape):
+    strides = params["strides"] or [1] * len(shape)
+    limits = zip(params["start_indices"], params["limit_indices"], strides, strict=True)
+    return inputs[0][tuple(slice(*limit) for limit in limits)]
+
+
+def _unstack(lanes, inputs, params, shape):
+    axis = params["axis"]
+    return [part.reshape(shape) for part in np.split(inputs[0], inputs[0].shape[axis], axis)]
+
+
+def _reduce(op):
+    def rule(lanes, inputs, params, shape):
+        axes = params["axes"]
+        terms = np.moveaxis(inputs[0], axes, range(len(axes))).reshape(-1, math.prod(shape))
+        while len(terms) > 1:
+            half = len(terms) // 2
+            folded = lanes.each(op, [terms[:half], terms[half : 2 * half]], (half, terms.shape[1]))
+            terms = np.concatenate([folded, terms[2 * half :]])
+        return terms.reshape(shape)
+
+    return rule
+
+
+def _dot_general(lanes, inputs, params, shape):
+    (axes_a, axes_b), batch = params["dimension_numbers"]
+    if any(batch) or len(axes_a) != 1:
+        return None
+    a, b = (np.moveaxis(components(x), axes, [0]) for x, axes in zip(inputs, (axes_a, axes_b), strict=True))
+    a, b = a.reshape(len(a), -1, 1), b.reshape(len(b), 1, -1)
+    products = lanes.each(lax.mul, [a, b], (len(a), a.shape[1], b.shape[2]))
+    return _reduce(lax.add)(lanes, [products], {"axes": (0,)}, shape)
+
+
+def _dynamic_slice(lanes, inputs, params, shape):
+    """Entries that lanes pick: gathered from a table that they share, selected from components of their own."""
+    table, *starts = inputs
+    starts = [start.item() if differs(start) else start for start in starts]
+    picked = []
+    for axis, (start, size) in enumerate(zip(starts, shape, strict=True)):
+        extent = table.shape[axis]
+        if size == extent:
+            continue
+        if jnp.ndim(start) or differs(table):
+            picked.append(axis)
+            if size > 1:  # of one entry, the gather clamps the number
+                starts[axis] = jnp.clip(start, 0, extent - size)
+        else:
+            table = lax.dynamic_slice_in_dim(table, start, size, axis, allow_negative_indices=False)
+    if differs(table):
+        for axis in picked:
+            size, extent = shape[axis], table.shape[axis]
+            windows = [np.take(table, range(k, k + size), axis) for k in range(extent - size + 1)]
+            table = windows[0]
+            for k, window in enumerate(windows[1:], 1):
+                table = lanes.select(starts[axis] >= k, table, window)
+        return table
+    if not picked:
+        return table
+    extents = [table.shape[axis] for axis in picked]
+    columns = jnp.moveaxis(table, picked, range(len(picked))).reshape(math.prod(extents), -1)
+    blocks = []
+    for offsets in np.ndindex(*(shape[axis] for axis in picked)):
+        index = 0
+        for axis, extent, offset in zip(picked, extents, offsets, strict=True):
+            index = index * extent + (starts[axis].astype(jnp.int32) + offset)
+        # One column at a time: gathered from a reshaped table, every index would be divided and multiplied again.
+        blocks.append([lanes.picked(columns[:, k], index) for k in range(columns.shape[1])])
+    rest = [size for axis, size in enumerate(shape) if axis not in picked]
+    block = objects([*(shape[axis] for axis in picked), *rest], [item for items in blocks for item in items])
+    return np.moveaxis(block, range(len(picked)), picked)
+
+
+def _gather(lanes, inputs, params, shape):
+    """One block, as a slice of which some axes of length 1 may be dropped."""
+    table, starts = inputs
+    numbers = params["dimension_numbers"]
+    in_bounds = params["mode"] in (lax.GatherScatterMode.CLIP, lax.GatherScatterMode.PROMISE_IN_BOUNDS)
+    if np.ndim(starts) != 1 or not in_bounds:
+        return None
+    places = dict(zip(numbers.start_index_map, components(starts), strict=True))
+    offsets = [places.get(axis, jnp.int32(0)) for axis in range(np.ndim(table))]
+    offsets = [objects((), [x]) if jnp.ndim(x) else x for x in offsets]
+    block = _dynamic_slice(lanes, [table, *offsets], params, params["slice_sizes"])
+    return None if block is None else block.reshape(shape)
+
+
+def _dynamic_update_slice(lanes, inputs, params, shape):
+    table, update, *starts = inputs
+    if len(starts) != 1 or np.shape(update)[0] != 1:
+        return None
+    start = starts[0].item() if differs(starts[0]) else starts[0]
+    (new,) = components(update).flat
+    items = [lanes.number(lax.select_n, start == k, old, new) for k, old in enumerate(components(table))]
+    return objects(shape, items)
+
+
+RULES = {
+    "broadcast_in_dim": _broadcast_in_dim,
+    "reshape": lambda lanes, x, params, shape: x[0].reshape(shape),
+    "squeeze": lambda lanes, x, params, shape: x[0].reshape(shape),
+    "expand_dims": lambda lanes, x, params, shape: x[0].reshape(shape),
+    "transpose": lambda lanes, x, params, shape: x[0].transpose(params["permutation"]),
+    "stop_gradient": lambda lanes, x, params, shape: x[0],
+    "rev": lambda lanes, x, params, shape: np.flip(x[0], params["dimensions"]),
+    "slice": _slice,
+    "concatenate": lambda lanes, x, params, shape: np.concatenate(list(map(components, x)), params["dimension"]),
+    "stack": lambda lanes, x, params, shape: np.stack(list(map(components, x)), params["axis"]),
+    "unstack": _unstack,
+    "split": lambda lanes, x, params, shape: np.split(x[0], np.cumsum(params["sizes"])[:-1], params["axis"]),
+    "select_n": lambda lanes, x, params, shape: lanes.each(lax.select_n, x, shape),
+    "reduce_sum": _reduce(lax.add),
+    "reduce_max": _reduce(lax.max),
+    "reduce_min": _reduce(lax.min),
+    "reduce_and": _reduce(lax.bitwise_and),
+    "reduce_or": _reduce(lax.bitwise_or),
+    "dot_general": _dot_general,
+    "dynamic_slice": _dynamic_slice,
+    "gather": _gather,
+    "dynamic_update_slice": _dynamic_update_slice,
+    # Of the shape of their operands, and yet not component by component.
+    **dict.fromkeys(("cumsum", "cumprod", "cummax", "cummin", "cumlogsumexp", "sort", "scatter", "scatter-add",
+                     "scatter-mul", "scatter_add", "scatter_mul", "argmin", "argmax"),
+                    lambda lanes, x, params, shape: None),
+}

@@ -1,0 +1,1 @@
+"""Derivatives of images in what materials and lights are made of."""

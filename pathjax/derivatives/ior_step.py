@@ -1,0 +1,106 @@
+"""By how much to change an IOR for a difference: so that the image moves by a part of a pixel."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from pathjax import bsdfs
+from pathjax.bsdfs import DielectricTable
+from pathjax.compile.runtime import native_map
+from pathjax.core.math import at, dot, safe_divide, spawn_ray, to_world
+from pathjax.integrators import path
+from pathjax.scene import parameters as named
+from pathjax.scene.scene import Scene
+from pathjax.sensors import film
+from pathjax.sensors.camera import sample_ray
+from pathjax.shapes import geometry
+
+# Images move by this part of a pixel under one step, in the median: less adds noise, more adds bias.
+STEP_PIXELS = 0.35
+# Bounds of the step, relative to the IOR: float32 resolves the lower; beyond the upper a difference is no derivative.
+MIN_STEP, MAX_STEP = 2e-4, 0.03
+# Rays that are followed to see how far the image moves, and vertices of each.
+_PILOTS, _PILOT_DEPTH = 1024, 12
+
+
+def dielectrics(scene: Scene) -> tuple[int, DielectricTable]:
+    """Place of the table of dielectrics, and the table."""
+    return next((i, t) for i, t in enumerate(scene.materials.tables) if isinstance(t, DielectricTable))
+
+
+def steps(scene, rows, step):
+    """(G,) steps of the relative IOR."""
+    _, table = dielectrics(scene) if rows else (None, None)
+    dtype = scene.camera.origin.dtype
+    if not rows:
+        return jnp.zeros((0,), dtype)
+    rows = jnp.asarray(rows, jnp.int32)
+    ratio = (table.int_ior / table.ext_ior)[rows]
+    if step is not None:
+        # Twice the step must leave a positive IOR.
+        return jnp.minimum(jnp.asarray(step, dtype), 0.4 * ratio)
+    motion = motions(scene, rows)
+    wished = STEP_PIXELS / jnp.where(motion > 0, motion, 1)
+    # Glass that no pilot saw (small, or met after a diffuse bounce) gets a step in the middle of the range.
+    wished = jnp.where(motion > 0, wished, 0.1 * MAX_STEP * ratio)
+    return jnp.clip(wished, MIN_STEP * ratio, MAX_STEP * ratio)
+
+
+@jax.jit
+def motions(scene, rows):
+    """(G,) median number of pixels by which what is seen through glass moves per unit of relative IOR; 0: not seen."""
+    count = film.pixel_count(scene.film)
+    pilots = jnp.asarray(np.unique(np.linspace(0, count - 1, min(_PILOTS, count)).astype(np.int32)))
+    return jax.vmap(lambda row: _median(native_map(_motion, pilots, scene, row)))(rows)
+
+
+def _median(x):
+    seen = jnp.isfinite(x)
+    return jnp.where(jnp.any(seen), jnp.nanmedian(jnp.where(seen, x, jnp.nan)), 0)
+
+
+def _motion(pixel_number, scene, row):
+    """Pixels per unit of relative IOR of one dielectric, for the ray through the middle of a pixel; NaN: not seen."""
+    place, table = dielectrics(scene)
+    ratio = at(table.int_ior, row) / at(table.ext_ior, row)
+    half = jnp.full((2,), 0.5, ratio.dtype)
+    middle, _ = film.sample_position(scene.film, pixel_number, half)
+    size = jnp.array([scene.film.width, scene.film.height], ratio.dtype)
+
+    def seen(x):
+        """Where the ray ends that refracts wherever it can: a point, or a direction if it hits nothing."""
+        varied = replace(table, int_ior=table.int_ior.at[row].set(x[0] * at(table.ext_ior, row)))
+        materials = named.put(scene.materials, ("tables", place), varied)
+        ray = sample_ray(scene.camera, middle + x[1:] / size, half)
+
+        def extend(state):
+            ray, _, met, depth, _ = state
+            hit = geometry.closest_hit(scene.geometry, ray)
+            found = hit.primitive >= 0
+            surface = geometry.surface(scene.geometry, ray, hit)
+            frame, wi, kind, at_row = path.shading(materials, ray, hit, surface)
+            drawn = bsdfs.sample(materials, kind, at_row, surface.uv, wi, jnp.full_like(half, 1 - 2**-24))
+            d = to_world(frame, drawn.wo)
+            on = found & drawn.delta & (kind >= 0)
+            end = jnp.where(found, surface.p, ray.d)
+            met = met | (found & bsdfs.is_glass(materials, kind) & (at_row == row))
+            return spawn_ray(surface, d, hit.primitive), end, met, depth + 1, on
+
+        start = ray, ray.o, jnp.bool_(False), jnp.int32(0), jnp.bool_(True)
+        _, end, met, _, unfinished = lax.while_loop(lambda s: s[-1] & (s[-2] < _PILOT_DEPTH), extend, start)
+        return end, met & ~unfinished
+
+    start = jnp.concatenate([ratio[None], jnp.zeros((2,), ratio.dtype)])
+    basis = jnp.eye(3, dtype=ratio.dtype)
+    moved, met = jax.vmap(lambda t: jax.jvp(seen, (start,), (t,), has_aux=True)[1:], out_axes=(0, None))(basis)
+    # Least squares: which shift in the image would move the end as the IOR does.
+    by_ior, by_x, by_y = moved
+    xx, xy, yy, bx, by = dot(by_x, by_x), dot(by_x, by_y), dot(by_y, by_y), dot(by_ior, by_x), dot(by_ior, by_y)
+    determinant = xx * yy - xy * xy
+    shift = jnp.stack([safe_divide(yy * bx - xy * by, determinant), safe_divide(xx * by - xy * bx, determinant)])
+    return jnp.where(met, jnp.hypot(shift[0], shift[1]), jnp.nan)

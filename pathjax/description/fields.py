@@ -1,0 +1,301 @@
+"""Typed reading of one plugin element: each parameter is asked for once, and `finish` refuses what nobody asked for."""
+
+from __future__ import annotations
+
+import math
+import re
+
+import numpy as np
+
+from pathjax.description.elements import Document, Element, nearest, require_attributes
+from pathjax.errors import InputError
+
+VALUES = ("float", "integer", "boolean", "string", "rgb", "spectrum", "point", "vector", "transform")
+OBJECTS = ("integrator", "sensor", "sampler", "film", "rfilter", "shape", "bsdf", "texture", "emitter")
+
+# A uniform spectrum of 1 has CIE XYZ (1, 1, 1): this colour in linear sRGB. Mitsuba's RGB mode emits it for a spectrum
+# used as radiance; used as reflectance, the spectrum is lit by the white point and stays (1, 1, 1).
+UNIFORM_RADIANCE = np.array(
+    [[3.240479, -1.537150, -0.498535], [-0.969256, 1.875991, 0.041556], [0.055648, -0.204043, 1.057311]]
+).sum(axis=1)
+
+NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
+REQUIRED = object()
+
+
+class Fields:
+    """What one plugin element holds: parameters by name, and the objects nested in it or referred to."""
+
+    def __init__(self, document: Document, element: Element):
+        require_attributes(element, required=("type",), optional=("id", "name"))
+        self.document = document
+        self.element = element
+        self.type = element.attributes["type"]
+        self.known: list[str] = []
+        self._values: dict[str, Element] = {}
+        self._objects: list[Element] = []
+        self._taken: set[str] = set()
+        for child in element.children:
+            if child.tag not in (*VALUES, *OBJECTS, "ref"):
+                raise child.error(f"{child} is not supported inside {element}; use one of: {', '.join(VALUES)}, ref")
+            target = document.resolve(child)
+            if target is not child and target.tag not in OBJECTS:
+                raise child.error(f"{child} refers to {target}, which is no object")
+            if target.tag in OBJECTS and target.tag != "texture":
+                self._objects.append(child)
+                continue
+            name = child.attributes.get("name")
+            if not name:
+                raise child.error(f'{child} inside {element} lacks name="...", the parameter that it sets')
+            if name in self._values:
+                raise child.error(f'"{name}" is given twice; the first is at line {self._values[name].line}')
+            self._values[name] = child
+
+    def where(self, name: str) -> Element:
+        """The element that sets `name`; the plugin's own where the file leaves it to its default."""
+        return self._values.get(name, self.element)
+
+    def error(self, name: str, message: str) -> InputError:
+        return self.where(name).error(f'"{name}" of <{self.element.tag} type="{self.type}"> {message}')
+
+    def has(self, name: str) -> bool:
+        return name in self._values
+
+    def float(self, name: str, default=REQUIRED, *, above=-math.inf, at_least=-math.inf, below=math.inf):
+        """A finite number, above < number < below and number >= at_least; `default` if it is not given."""
+        element = self._take(name, default, ("float", "integer"))
+        if element is None:
+            return default
+        value = number(element, _value(element))
+        if not (above < value < below and value >= at_least):
+            low = f"above {above:g}" if above > -math.inf else f"at least {at_least:g}"
+            high = f" and below {below:g}" if below < math.inf else ""
+            raise self.error(name, f"must be {low}{high}, is {value:g}")
+        return value
+
+    def integer(self, name: str, default=REQUIRED, *, at_least: int, at_most: int = 2**31 - 1):
+        element = self._take(name, default, ("integer",))
+        if element is None:
+            return default
+        text = _value(element).strip()
+        if not re.fullmatch(r"[+-]?\d{1,19}", text):
+            raise element.error(f"{element}: {text[:40]!r} is not an integer")
+        if not at_least <= int(text) <= at_most:
+            span = f"{at_least}" if at_least == at_most else f"from {at_least} to {at_most}"
+            raise self.error(name, f"must be {span}, is {int(text)}")
+        return int(text)
+
+    def boolean(self, name: str, default=REQUIRED):
+        element = self._take(name, default, ("boolean",))
+        if element is None:
+            return default
+        text = _value(element).strip().lower()
+        if text not in ("true", "false"):
+            raise element.error(f'{element}: {text[:40]!r} is neither "true" nor "false"')
+        return text == "true"
+
+    def string(self, name: str, default=REQUIRED, *, choices: tuple[str, ...] = ()):
+        element = self._take(name, default, ("string",))
+        if element is None:
+            return default
+        text = _value(element)
+        if not choices:
+            return text
+        if text.lower() not in choices:
+            raise self.error(name, f'cannot be "{text[:40]}"; use {" or ".join(choices)}{nearest(text, choices)}')
+        return text.lower()
+
+    def float_or_name(self, name: str, default: str):
+        """A number, or the text of a <string>."""
+        if self.has(name) and self._values[name].tag == "string":
+            return self.string(name)
+        return self.float(name, default, above=0)
+
+    def point(self, name: str, default=REQUIRED):
+        """(3,) float64, written as x, y, z attributes or as value="x, y, z"."""
+        element = self._take(name, default, ("point", "vector"))
+        return default if element is None else triple(element, default=None, extra=("name",))
+
+    def color(self, name: str, default=REQUIRED, *, at_most: float = math.inf, radiance: bool = False):
+        """(3,) float64 linear RGB from <rgb>, a uniform <spectrum> or a <float>, each channel in [0, at_most]."""
+        element = self._take(name, default, ("rgb", "spectrum", "float"))
+        if element is None:
+            return default
+        text = _value(element)
+        if element.tag == "spectrum" and ":" in text:
+            raise element.error(f"{element}: a spectrum by wavelengths is not supported; give linear RGB as <rgb>")
+        if text.strip().startswith("#"):
+            raise element.error(f'{element}: hexadecimal colours are not supported; give linear RGB, value="r, g, b"')
+        values = np.array(numbers(element, text))
+        if len(values) != 1 and (len(values) != 3 or element.tag != "rgb"):
+            raise element.error(f"{element} has {len(values)} numbers; <rgb> takes 1 or 3, others 1")
+        if values.min() < 0 or values.max() > at_most:
+            limit = "not be negative" if at_most == math.inf else f"lie between 0 and {at_most:g}"
+            raise self.error(name, f"must {limit}, is {text.strip()[:60]}")
+        scale = UNIFORM_RADIANCE if radiance and element.tag == "spectrum" else np.ones(3)
+        return values * scale
+
+    def texture(self, name: str) -> Element | None:
+        """The <texture> that sets `name`, or None where it is something else, to be read by `color`."""
+        if not self.has(name) or self.document.resolve(self._values[name]).tag != "texture":
+            return None
+        self._take(name, None, ("texture", "ref"))
+        return self.document.resolve(self._values[name])
+
+    def transform(self, name: str) -> np.ndarray:
+        """(4, 4) float64: the element's steps in the order of the file; the identity if it is not given."""
+        element = self._take(name, None, ("transform",))
+        return np.eye(4) if element is None else transform(element)
+
+    def objects(self, tag: str, limit: int = 1) -> list[Element]:
+        """The nested or referenced objects of this kind, in the order of the file."""
+        found = [child for child in self._objects if self.document.resolve(child).tag == tag]
+        self._objects = [child for child in self._objects if child not in found]
+        if len(found) > limit:
+            raise found[limit].error(f"{self.element} takes at most {limit} <{tag}>")
+        return [self.document.resolve(child) for child in found]
+
+    def finish(self) -> None:
+        """Refuse what no call has asked for."""
+        for name, child in self._values.items():
+            if name not in self._taken:
+                known = ", ".join(self.known) or "none"
+                raise child.error(
+                    f"{child} is not a parameter of {self.element}; it has: {known}{nearest(name, self.known)}"
+                )
+        for child in self._objects:
+            raise child.error(f"{child} has no place inside {self.element}")
+
+    def _take(self, name: str, default: object, tags: tuple[str, ...]) -> Element | None:
+        self.known.append(name)
+        self._taken.add(name)
+        if name not in self._values:
+            if default is REQUIRED:
+                raise self.element.error(f'{self.element} needs <{tags[0]} name="{name}" ...>')
+            return None
+        element = self._values[name]
+        if element.tag not in tags:
+            kind = element.tag if element.tag != "ref" else "texture"
+            raise self.error(name, f"cannot be a <{kind}>; give it as {' or '.join(f'<{tag}>' for tag in tags)}")
+        if element.children and element.tag not in ("transform", "texture"):
+            raise element.children[0].error(f"{element.children[0]} has no place inside {element}")
+        return element
+
+
+def number(element: Element, text: str) -> float:
+    """One decimal number, finite in float32 too."""
+    if not NUMBER.fullmatch(text.strip()) or not abs(float(text)) < 3e38:
+        raise element.error(f"{element}: {text.strip()[:40]!r} is not a finite number")
+    return float(text)
+
+
+def numbers(element: Element, text: str) -> list[float]:
+    """Numbers between commas or blanks; at least one."""
+    return [number(element, part) for part in re.split(r"[\s,]+", text.strip().rstrip(","))]
+
+
+def triple(element: Element, default: float | None, extra: tuple[str, ...] = ()) -> np.ndarray:
+    """(3,) from x, y, z attributes or `value` (one number stands for three); `default` None: all must be there."""
+    require_attributes(element, optional=("value", "x", "y", "z", *extra))
+    attributes = element.attributes
+    if "value" in attributes:
+        if set("xyz") & set(attributes):
+            raise element.error(f"{element} mixes value with x, y, z; give one or the other")
+        values = numbers(element, attributes["value"])
+        if len(values) not in (1, 3):
+            raise element.error(f"{element} has {len(values)} numbers; it takes 1 or 3")
+        return np.broadcast_to(np.array(values), 3).copy()
+    missing = [axis for axis in "xyz" if axis not in attributes]
+    if missing and default is None:
+        raise element.error(f'{element} lacks the attribute "{missing[0]}"')
+    return np.array([number(element, attributes[axis]) if axis in attributes else default for axis in "xyz"])
+
+
+def transform(element: Element) -> np.ndarray:
+    """(4, 4) float64, affine and invertible: the steps of a <transform>, the first in the file applied first."""
+    require_attributes(element, required=("name",))
+    matrix = np.eye(4)
+    for step in element.children:
+        if step.tag not in STEPS:
+            raise step.error(f"{step} is not supported inside {element}; use one of: {', '.join(STEPS)}")
+        if step.children:
+            raise step.error(f"{step} takes nothing inside")
+        matrix = STEPS[step.tag](step) @ matrix
+        if not (np.abs(matrix) < 3e38).all():
+            raise step.error(f"{step} makes {element} overflow")
+        if np.linalg.cond(matrix[:3, :3]) > 1e12:
+            raise step.error(f"{step} makes {element} singular: it flattens space")
+    return matrix
+
+
+def _translate(step: Element) -> np.ndarray:
+    matrix = np.eye(4)
+    matrix[:3, 3] = triple(step, default=0.0)
+    return matrix
+
+
+def _scale(step: Element) -> np.ndarray:
+    return np.diag([*triple(step, default=1.0), 1.0])
+
+
+def _rotate(step: Element) -> np.ndarray:
+    axis = triple(step, default=0.0, extra=("angle",))
+    require_attributes(step, required=("angle",), optional=("value", "x", "y", "z"))
+    length = np.linalg.norm(axis)
+    if abs(length - 1) > 0.02:  # Mitsuba takes the axis as it is, and shears if it is not of unit length
+        raise step.error(f"{step}: the axis must have length 1, has {length:g}")
+    x, y, z = axis / length
+    angle = math.radians(math.fmod(number(step, step.attributes["angle"]), 360))
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    matrix = np.eye(4)
+    matrix[:3, :3] += math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross
+    return matrix
+
+
+def _lookat(step: Element) -> np.ndarray:
+    require_attributes(step, required=("origin", "target"), optional=("up",))
+    origin, target, up = (_vector(step, step.attributes.get(key, "0, 0, 0")) for key in ("origin", "target", "up"))
+    forward = _unit(step, target - origin, "origin and target coincide")
+    if not up.any():  # any will do; this is the one that Mitsuba takes
+        x, y, z = forward
+        sign = math.copysign(1, z)
+        up = np.array([1 - sign * x * x / (sign + z), -sign * x * y / (sign + z), -sign * x])
+    left = _unit(step, np.cross(up, forward), "up is parallel to the line of sight")
+    matrix = np.eye(4)
+    matrix[:3] = np.stack([left, np.cross(forward, left), forward, origin], axis=1)
+    return matrix
+
+
+def _matrix(step: Element) -> np.ndarray:
+    require_attributes(step, required=("value",))
+    values = numbers(step, step.attributes["value"])
+    if len(values) not in (9, 16):
+        raise step.error(f"{step} has {len(values)} numbers; it takes 9 or 16")
+    matrix = np.eye(4)
+    side = 3 if len(values) == 9 else 4
+    matrix[:side, :side] = np.reshape(values, (side, side))
+    if not np.array_equal(matrix[3], [0, 0, 0, 1]):
+        raise step.error(f"{step}: the last row must be 0 0 0 1, as the transform is to be affine")
+    return matrix
+
+
+def _vector(step: Element, text: str) -> np.ndarray:
+    values = numbers(step, text)
+    if len(values) != 3:
+        raise step.error(f"{step}: {text.strip()[:40]!r} must be three numbers")
+    return np.array(values)
+
+
+def _unit(step: Element, vector: np.ndarray, complaint: str) -> np.ndarray:
+    length = np.linalg.norm(vector)
+    if not 1e-12 < length < math.inf:
+        raise step.error(f"{step}: {complaint}")
+    return vector / length
+
+
+def _value(element: Element) -> str:
+    require_attributes(element, required=("name", "value"))
+    return element.attributes["value"]
+
+
+STEPS = {"translate": _translate, "rotate": _rotate, "scale": _scale, "lookat": _lookat, "matrix": _matrix}

@@ -1,0 +1,1 @@
+"""Image files, and how images compare."""

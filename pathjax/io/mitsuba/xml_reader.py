@@ -1,0 +1,181 @@
+"""Scene XML to a tree of elements that know their line: includes, `default`, `$name` and ids are settled here.
+
+What the elements mean is the business of `loader.py` and of each kind.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from xml.parsers import expat
+
+import numpy as np
+
+from pathjax.description.elements import Document, Element, find_file, nearest, require_attributes
+from pathjax.errors import InputError
+
+# Far above any real scene (meshes live in files of their own), and low enough that a hostile file fails at once.
+MAX_BYTES = 64 << 20
+MAX_DEPTH = 32
+MAX_ELEMENTS = 1_000_000
+MAX_FILES = 1_000
+MAX_VALUE = 10_000
+
+REFERENCE = re.compile(r"\$(\w+)")
+
+
+def read(path: str | Path, parameters: Mapping[str, object]) -> Document:
+    """Read a scene file and what it includes.
+
+    Args:
+        parameters: values that override the file's `default`s; each must be used by the file.
+    Raises:
+        InputError: unreadable or malformed XML, a document type, an include cycle, an unknown `$name`, a duplicate id.
+    """
+    reader = _Reader(Path(path), {name: _as_text(value) for name, value in parameters.items()})
+    root = reader.expand(_parse(Path(path), str(path)), chain=(Path(path).resolve(),))
+    reader.check_parameters(str(path))
+    ids: dict[str, Element] = {}
+    for element in _walk(root):
+        if element.tag != "ref" and element.id:
+            if element.id in ids:
+                first = ids[element.id]
+                raise element.error(f'the id "{element.id}" is taken already, at {first.file}:{first.line}')
+            ids[element.id] = element
+    return Document(root, ids, tuple(reader.folders))
+
+
+class _Reader:
+    """What includes share: the values of `$name`, the folders to search, and how much has been read."""
+
+    def __init__(self, path: Path, parameters: dict[str, str]):
+        self.given = parameters
+        self.values = dict(parameters)
+        self.used: set[str] = set()
+        self.folders = [path.parent]
+        self.elements = 0
+        self.files = 1
+
+    def expand(self, root: Element, chain: tuple[Path, ...]) -> Element:
+        if root.tag != "scene":
+            raise root.error(f'the outermost element is {root}; a scene file starts with <scene version="3.0.0">')
+        require_attributes(root, required=("version",))
+        if not re.fullmatch(r"[23]\.\d+\.\d+", root.attributes["version"]):
+            version = root.attributes["version"]
+            raise root.error(f'scene version "{version}" is not supported; use Mitsuba 3\'s format, version="3.0.0"')
+        children: list[Element] = []
+        for element in root.children:
+            self._substitute(element)
+            match element.tag:
+                case "default":
+                    require_attributes(element, required=("name", "value"))
+                    self.used.add(element.attributes["name"])
+                    self.values.setdefault(element.attributes["name"], element.attributes["value"])
+                case "path":
+                    require_attributes(element, required=("value",))
+                    self.folders.append(find_file(element.attributes["value"], self.folders, element, folder=True))
+                case "include":
+                    children += self._include(element, chain)
+                case _:
+                    children.append(element)
+        root.children = children
+        return root
+
+    def _include(self, element: Element, chain: tuple[Path, ...]) -> list[Element]:
+        require_attributes(element, required=("filename",))
+        path = find_file(element.attributes["filename"], [*self.folders, chain[-1].parent], element)
+        if path.resolve() in chain:
+            raise element.error(f'the file "{path}" includes itself')
+        self.files += 1
+        if self.files > MAX_FILES or len(chain) > MAX_DEPTH:
+            raise element.error(f"more than {MAX_FILES} included files, or {MAX_DEPTH} within one another")
+        return self.expand(_parse(path, str(path)), (*chain, path.resolve())).children
+
+    def _substitute(self, top: Element) -> None:
+        for element in _walk(top):
+            self.elements += 1
+            if self.elements > MAX_ELEMENTS:
+                raise element.error(f"the scene has more than {MAX_ELEMENTS} elements")
+            for key, text in element.attributes.items():
+                if "$" in text:
+                    element.attributes[key] = REFERENCE.sub(lambda match, at=element: self._value(match[1], at), text)
+                    if len(element.attributes[key]) > MAX_VALUE:
+                        raise element.error(f'the attribute "{key}" grows beyond {MAX_VALUE} characters')
+
+    def _value(self, name: str, element: Element) -> str:
+        self.used.add(name)
+        if name not in self.values:
+            raise element.error(
+                f'${name} is not defined; put <default name="{name}" value="..."/> before it, or pass {name}=...'
+                f"{nearest(name, self.values)}"
+            )
+        return self.values[name]
+
+    def check_parameters(self, file: str) -> None:
+        for name in self.given:
+            if name not in self.used:
+                known = ", ".join(sorted(self.used)) or "none"
+                raise InputError(
+                    f'{file}: the scene has no parameter "{name}"; it has: {known}{nearest(name, sorted(self.used))}'
+                )
+
+
+def _parse(path: Path, shown: str) -> Element:
+    data = _read_bytes(path, shown)
+    parser = expat.ParserCreate()
+    stack: list[Element] = []
+    roots: list[Element] = []
+
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        element = Element(tag, attributes, shown, parser.CurrentLineNumber)
+        if len(stack) >= MAX_DEPTH:
+            raise element.error(f"elements are nested more than {MAX_DEPTH} deep")
+        (stack[-1].children if stack else roots).append(element)
+        stack.append(element)
+
+    def text(data: str) -> None:
+        if data.strip():
+            raise InputError(f"{shown}:{parser.CurrentLineNumber}: stray text {data.strip()[:40]!r} between elements")
+
+    def doctype(*_: object) -> None:
+        raise InputError(f"{shown}:{parser.CurrentLineNumber}: a document type (<!DOCTYPE>) is not allowed; remove it")
+
+    parser.StartElementHandler = start
+    parser.EndElementHandler = lambda tag: stack.pop()
+    parser.CharacterDataHandler = text
+    parser.StartDoctypeDeclHandler = doctype
+    parser.EntityDeclHandler = doctype
+    try:
+        parser.Parse(data, True)
+    except InputError:
+        raise
+    except expat.ExpatError as error:
+        raise InputError(f"{shown}:{error.lineno}: not well-formed XML: {expat.errors.messages[error.code]}") from None
+    except (ValueError, LookupError) as error:  # an encoding that Python does not know
+        raise InputError(f"{shown}:1: cannot be decoded: {error}") from None
+    return roots[0]
+
+
+def _read_bytes(path: Path, shown: str) -> bytes:
+    try:
+        if path.is_file() and path.stat().st_size <= MAX_BYTES:
+            return path.read_bytes()
+        reason = "no such file"
+        if path.exists():
+            reason = f"larger than {MAX_BYTES >> 20} MiB, too large for a scene" if path.is_file() else "not a file"
+    except (OSError, ValueError) as error:
+        reason = f"cannot be read: {error}"
+    raise InputError(f"{shown}: {reason}")
+
+
+def _walk(element: Element) -> Iterator[Element]:
+    yield element
+    for child in element.children:
+        yield from _walk(child)
+
+
+def _as_text(value: object) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    return ", ".join(map(str, value)) if np.ndim(value) == 1 else str(value)

@@ -1,0 +1,1 @@
+"""Images and queries, from a scene."""

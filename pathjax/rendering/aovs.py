@@ -1,0 +1,67 @@
+"""Arbitrary output variables: what the camera sees first, for denoisers and for compositing."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+
+import jax
+import numpy as np
+
+from pathjax.compile.runtime import native_map, usual_promotion
+from pathjax.errors import InputError
+from pathjax.integrators import aov, path, pixel
+from pathjax.rendering.progressive import replicates
+from pathjax.scene.scene import Scene
+from pathjax.sensors import film
+
+NAMES = aov.FirstHit._fields
+MAX_SPP = 16
+# Pixels in one call of the kernel, whose memory they bound.
+CHUNK_PIXELS = 1 << 14
+
+
+@usual_promotion
+def render_aovs(scene: Scene, names: Sequence[str], spp: int = MAX_SPP, seed: int = 0) -> dict[str, np.ndarray]:
+    """Name -> (H, W, channels) float32, as Mitsuba's `aov` integrator has it; 0 where nothing is seen.
+
+    "depth" (1 channel) is the distance along the ray from the near clip plane, "normal" (3) the shading normal in world
+    space, "albedo" (3) the share of light that a reflector sends back, textures and Fresnel's terms included, and 1 for
+    glass. Means over the film positions of the first min(spp, 16) samples that `render_until` takes for this seed.
+
+    Raises:
+        InputError: unknown or repeated name, spp or seed out of range.
+    """
+    check_names(names, NAMES)
+    path.check_sampling("mis", spp, seed)
+    spp = min(spp, MAX_SPP)
+    shares = replicates.shares(np.array([spp], np.int32))
+    count, seeds = film.pixel_count(scene.film), replicates.seeds(seed)
+    chunk = min(CHUNK_PIXELS, count)
+    images = [np.empty((count, width), np.float32) for width in (1, 3, 3)]
+    for first in range(0, count, chunk):
+        # The last call repeats the last pixel up to full length.
+        pixels = np.minimum(np.arange(first, first + chunk, dtype=np.int32), count - 1)
+        tiled = np.tile(pixels, replicates.COUNT)
+        numbers = pixel.numbers(tiled, 0, *(np.repeat(x, chunk) for x in (np.maximum(shares, 1), seeds)))
+        for image, means in zip(images, _render_aovs(replace(scene, about=None), tiled, *numbers), strict=True):
+            means = np.asarray(means, np.float32).reshape(replicates.COUNT, chunk, -1)
+            mean = (means * (shares / np.float32(spp))[..., None]).sum(0, dtype=np.float32)
+            image[first : first + chunk] = mean[: count - first]
+    height, width = film.image_shape(scene.film)
+    return {name: dict(zip(NAMES, images, strict=True))[name].reshape(height, width, -1) for name in names}
+
+
+def check_names(names: Sequence[str], known: Sequence[str]) -> None:
+    """Refuse what is not known, and what is named twice."""
+    for i, name in enumerate(names):
+        if name not in known:
+            raise InputError(f"no output variable is named {name!r}; known are {', '.join(known)}")
+        if name in names[:i]:
+            raise InputError(f"output variable {name} is named twice; name it once")
+
+
+@partial(jax.jit, static_argnames=("form", "devices"))
+def _render_aovs(scene, pixels, first_sample, spp, seed, *, form=None, devices=None):
+    return native_map(aov.mean, (pixels, first_sample, spp, seed), scene, form=form, devices=devices)

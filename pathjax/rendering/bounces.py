@@ -1,0 +1,204 @@
+"""The Neumann series, term by term: L = Le + T Le + T^2 Le + ..., an image of each term from the same paths."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import partial, reduce
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from pathjax import emitters
+from pathjax.compile.runtime import native_map, usual_promotion
+from pathjax.derivatives import gradient
+from pathjax.description.parameter import Parameter
+from pathjax.errors import InputError
+from pathjax.integrators import path, pixel, terms
+from pathjax.rendering import tail
+from pathjax.rendering.progressive import estimate, replicates
+from pathjax.rendering.render import differentiable, differentiated
+from pathjax.scene import parameters as named
+from pathjax.scene.scene import Scene
+from pathjax.sensors import film
+
+# Every term is three more numbers that each path of the kernel keeps.
+MOST_TERMS = 64
+# Samples of a replicate that are summed up plainly: float32 keeps 5 digits even where all are equal.
+_PORTION = 1 << 12
+# Of `pilot`: enough that the light of a scene is spread evenly by the last terms.
+PILOT_TERMS, PILOT_PIXELS, PILOT_SPP = 12, 1 << 12, 64
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True, eq=False)
+class Bounces:
+    """Terms of the series: `terms[k]` is T^k Le, light that was reflected or refracted k times.
+
+    The number of samples stands by for the standard error.
+    """
+
+    terms: jax.Array  # (depth, H, W, 3) linear RGB
+    deviation: jax.Array  # (depth, H, W, 3) root of `variance`, whose range is that of radiance
+    samples: jax.Array  # (H, W) int32 of each pixel
+
+    @property
+    def variance(self) -> jax.Array:
+        """(depth, H, W, 3) unbiased estimate of that of `terms`, 3 degrees of freedom; nan below 2 spp."""
+        return self.deviation**2
+
+    @property
+    def standard_error(self) -> np.ndarray:
+        """(depth, H, W, 3), pooled over 3 x 3 pixels as that of `render_until`."""
+        images, variances = np.asarray(self.terms), np.asarray(self.deviation, float) ** 2
+        count = np.asarray(self.samples)
+        return np.stack([estimate.standard_error(*term, count) for term in zip(images, variances, strict=True)])
+
+    def tail(self) -> tail.Tail:
+        """How much light there is beyond these terms, in the mean over the pixels that are finite.
+
+        Raises:
+            InputError: fewer than 3 terms, or no such pixel.
+        """
+        means, deviation = (np.asarray(x, float).reshape(len(x), -1, 3) for x in (self.terms, self.deviation))
+        known = np.isfinite(means).all((0, 2))
+        if not known.any():
+            raise InputError("no pixel is finite, so nothing can be told of the light beyond these terms")
+        # Pixels are independent of each other.
+        error = np.sqrt((deviation[:, known] ** 2).sum(1)) / known.sum()
+        return tail.fit(means[:, known].mean(1), error)
+
+
+@usual_promotion
+def render_bounces(
+    scene: Scene, depth: int, spp=64, seed: int = 0, strategy: str = "mis", *, errors: bool = True
+) -> Bounces:
+    """An image of each of the first `depth` terms of L = Le + T Le + T^2 Le + ..., from the same paths.
+
+    Their sum is, to rounding, the image with max_depth = depth that `render_until(scene, spp=spp, seed=seed)` gives:
+    the mean of four replicates, whose spread tells the standard errors. With `errors=False` there is one sequence and
+    no standard error, and the sum is that of `render(scene, spp, seed)`. Either costs about as much as `render`. The
+    scene's own max_depth does not count.
+
+    Pure; may be called inside `jax.jit`, under `jax.vmap`, and `terms` be differentiated in named reflectances,
+    radiances and other colours, as `render`, forwards or backwards. `deviation` and `variance` have no derivative.
+
+    Args:
+        depth: how many terms, 1 to 64; 1 is emission alone. Static.
+        spp: samples per pixel; or (H, W) int32, `samples` of a `RenderResult`, whose image is then the sum.
+        seed, strategy: of `render`.
+        errors: estimate the variance.
+    Raises:
+        InputError: depth, spp or seed out of range, unknown strategy; differentiation in the IOR of glass or in
+            anything but named parameters.
+    """
+    _check_depth(depth)
+    path.check_sampling(strategy, spp, seed)
+    shape = film.image_shape(scene.film)
+    pixels = jnp.arange(film.pixel_count(scene.film), dtype=jnp.int32).reshape(shape)
+    return _bounces(scene, int(depth), pixels, spp, seed, strategy, errors)
+
+
+def pilot(scene: Scene, seed: int = 0) -> tail.Tail:
+    """The Tail after 12 terms, from 64 samples of at most 4096 pixels, spread evenly over the image."""
+    count = film.pixel_count(scene.film)
+    some = np.unique(np.linspace(0, count - 1, min(PILOT_PIXELS, count)).astype(np.int32))
+    return _bounces(scene, PILOT_TERMS, jnp.asarray(some)[None], PILOT_SPP, seed, "mis", True).tail()
+
+
+def _check_depth(depth) -> None:
+    if isinstance(depth, bool) or not isinstance(depth, int | np.integer) or not 1 <= depth <= MOST_TERMS:
+        raise InputError(
+            f"depth = {depth!r}; it is the number of terms Le, T Le, T^2 Le, ..., an integer in [1, {MOST_TERMS}]: "
+            "without a term there is no image, and 1 is emission alone"
+        )
+
+
+@dataclass(frozen=True)
+class _Static:
+    wanted: tuple[tuple[str, Parameter], ...]  # parameters in which a derivative may be wanted
+    depth: int
+    strategy: str
+
+
+def _bounces(scene, depth, pixels, spp, seed, strategy, errors) -> Bounces:
+    """Of pixels (H, W)."""
+    samples = jnp.broadcast_to(jnp.asarray(spp, jnp.int32), pixels.shape)
+    shares = replicates.shares(samples.ravel()) if errors else samples.reshape(1, -1)
+    seeds = replicates.seeds(seed) if errors else jnp.asarray(seed, jnp.uint32)[None]
+    most = None if isinstance(shares, jax.core.Tracer) else int(shares.max())
+    static = _Static(differentiable(scene), depth, strategy)
+    scene = replace(scene, max_depth=jnp.int32(depth), about=None)
+    if most is None or most <= _PORTION:
+        sums = _term_sums(static, scene, pixels.ravel(), 0, shares, seeds)
+    else:
+        sums = 0
+        for first in range(0, most, _PORTION):
+            portion = jnp.clip(shares - first, 0, _PORTION)
+            sums = sums + _term_sums(static, scene, pixels.ravel(), first, portion, seeds)
+    return Bounces(*_moments(sums, shares, shape=pixels.shape), samples)
+
+
+@partial(jax.jit, static_argnames="shape")
+def _moments(sums, shares, *, shape):
+    """Means and deviations (depth, H, W, 3), of sums (R, N, depth, 3) of (R, N) samples; see `replicates.moments`."""
+    sums, shares = list(sums), [x[:, None, None].astype(sums.dtype) for x in shares]  # a loop over them vectorises
+    count = jnp.maximum(sum(shares), 1)
+    mean = sum(sums) / count
+    apart = [lax.stop_gradient(x / jnp.maximum(n, 1) - mean) for x, n in zip(sums, shares, strict=True)]
+    # As in a norm: squares of radiances leave the range of float32.
+    largest = reduce(jnp.maximum, map(jnp.abs, apart))
+    scale = jnp.where(largest > 0, largest, 1)
+    spread = sum(n * (x / scale) ** 2 for x, n in zip(apart, shares, strict=True)) / count
+    freedom = sum(n > 0 for n in shares) - 1
+    deviation = jnp.where(freedom > 0, scale * jnp.sqrt(spread / jnp.maximum(freedom, 1)), jnp.nan)
+    depth = mean.shape[1]
+    return tuple(jnp.moveaxis(x, 1, 0).reshape(depth, *shape, 3) for x in (mean, deviation))
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _term_sums(static: _Static, scene, pixels, first_sample, spp, seeds):
+    """(R, N, depth, 3) sums of pixels (N,); spp: (R, N) of each replicate, whose seeds (R,) are given."""
+    sums, _ = _kernel(scene, pixels, first_sample, spp, seeds, depth=static.depth, strategy=static.strategy)
+    return sums
+
+
+@partial(_term_sums.defjvp, symbolic_zeros=True)
+@usual_promotion
+def _term_sums_jvp(static: _Static, primals, tangents):
+    """Linear in the tangents, so that it also transposes."""
+    scene, *work = primals
+    scene_tangent, *_ = tangents
+    wanted = differentiated(static.wanted, scene_tangent)
+    for name, parameter in wanted.items():
+        if gradient.is_glass(parameter):
+            raise InputError(
+                f"terms of the series are not differentiated in {name}: the IOR of glass moves paths, which takes "
+                "differences; differentiate `render` in it, or `render` of scenes that differ in max_depth"
+            )
+    colors = tuple((parameter.path, parameter.index) for parameter in wanted.values())
+    sums, by_color = _kernel(scene, *work, depth=static.depth, strategy=static.strategy, colors=colors)
+    tangent = jnp.zeros_like(sums)
+    for place, parameter in enumerate(wanted.values()):
+        # Light keeps its channel, so the derivative in a colour is diagonal.
+        tangent = tangent + by_color[:, :, place] * named.get(scene_tangent, parameter.path)[parameter.index]
+    return sums, tangent
+
+
+@partial(jax.jit, static_argnames=("depth", "strategy", "colors"))
+def _kernel(scene, pixels, first_sample, spp, seeds, *, depth, strategy, colors=()):
+    """Sums (R, N, depth, 3), and derivatives (R, N, T, depth, 3) in the entries that `colors` lists."""
+    choice = emitters.choice(scene.emitters, strategy)
+
+    def one_pixel(work, scene, choice, tangents):
+        def of(scene):
+            return terms.sums(work, scene, choice, strategy, depth, bool(colors)), ()
+
+        sums, by_color, _ = gradient.by_tangent(of, scene, colors, tangents)
+        return sums, by_color
+
+    tiled = jnp.tile(pixels, len(seeds))
+    work = tiled, *pixel.numbers(tiled, first_sample, spp.ravel(), jnp.repeat(seeds, len(pixels)))
+    results = native_map(one_pixel, work, scene, choice, gradient.unit_tangents(scene, colors))
+    return tuple(x.reshape(*spp.shape, *x.shape[1:]) for x in results)

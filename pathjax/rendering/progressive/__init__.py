@@ -1,0 +1,1 @@
+"""Renders that go on until an error is reached."""

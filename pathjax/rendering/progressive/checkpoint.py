@@ -1,0 +1,135 @@
+"""A render's state on disk: a process that was killed left the last whole one, which leads on to the same bits."""
+
+from __future__ import annotations
+
+import contextlib
+import glob
+import hashlib
+import json
+import time
+import warnings
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from pathjax.errors import InputError, InputWarning
+from pathjax.rendering.progressive.passes import State, plan
+from pathjax.rendering.progressive.replicates import one_if_equal
+from pathjax.scene.scene import Scene
+from pathjax.sensors import film
+from pathjax.system.files import write_whole
+
+# Saving costs at most one in this many seconds.
+COST = 200
+# What the first is thought to cost: it is made after a second.
+_FIRST_COST = 0.005
+# Arrays that hold one number for each pixel, or one for all.
+OF_PIXELS = ("count", "weights")
+
+
+def identity(scene: Scene, seed: int, strategy: str, adaptive: bool) -> dict[str, str | int]:
+    """What a state may be continued with, and nothing else."""
+    from pathjax import __version__
+
+    height, width = film.image_shape(scene.film)
+    return {
+        "pathjax": __version__,
+        "image size": f"{width}x{height}",
+        "scene": fingerprint(scene),
+        "strategy": strategy,
+        "seed": seed,
+        "sampling": "adaptive" if adaptive else "uniform",
+    }
+
+
+def fingerprint(scene: Scene) -> str:
+    """Hash of a scene's structure and arrays; names and files do not count."""
+    leaves, structure = jax.tree.flatten(replace(scene, about=None))
+    digest = hashlib.sha256(str(structure).encode())
+    for leaf in map(np.asarray, leaves):
+        digest.update(f"{leaf.dtype}{leaf.shape}".encode())
+        digest.update(leaf.tobytes())
+    return digest.hexdigest()[:16]
+
+
+class Checkpoint:
+    """A file that holds the last saved state of one render."""
+
+    def __init__(self, path: str | Path, identity: Mapping[str, str | int]):
+        self.path, self.identity = Path(path), dict(identity)
+        self.problem: str | None = None  # why the last state is not in the file
+        self._saved, self._cost = 0.0, _FIRST_COST
+        # What a killed process left half written.
+        for part in self.path.parent.glob(f".{glob.escape(self.path.name)}.*.part"):
+            with contextlib.suppress(OSError):
+                part.unlink()
+
+    def load(self, fresh: State) -> State:
+        """The saved state, or `fresh`, which has the same shapes, where there is no file.
+
+        Raises:
+            InputError: damaged, no checkpoint, or one of another render; the message says which.
+        """
+        if not self.path.exists():
+            return fresh
+        try:
+            with np.load(self.path, allow_pickle=False) as file:
+                facts = json.loads(str(file["facts"]))
+                identity, spp, seconds = facts["identity"], int(facts["spp"]), float(facts["seconds"])
+                arrays = {name: file[name] for name in ("means", *OF_PIXELS)} if file.files != ["facts"] else {}
+        except Exception as error:  # zipfile, zlib, NumPy and json raise what they like, as the file's bytes have it
+            raise self._refusal(f"is no checkpoint, or a damaged one ({error})") from None
+        for name, ours in self.identity.items():
+            theirs = identity.get(name)
+            if theirs != ours:
+                raise self._refusal(f"was made with {name} {theirs}, this is {name} {ours}")
+        if not arrays:
+            return fresh
+        state = replace(fresh, seconds=seconds)
+        for name, array in arrays.items():
+            wanted = getattr(fresh, name)
+            shapes = (wanted.shape, (1,)) if name in OF_PIXELS else (wanted.shape,)
+            if array.dtype != wanted.dtype or array.shape not in shapes:
+                raise self._refusal(f"is damaged: {name} is {array.dtype}{list(array.shape)}")
+            setattr(state, name, np.broadcast_to(array, wanted.shape).copy())
+        plan(state, spp)
+        return state
+
+    def save(self, state: State) -> None:
+        """Raises:
+        InputError: it cannot be written; the last one that was is intact.
+        """
+        started = time.perf_counter()
+        # Before the first sample nothing needs to be kept, only to be known to be writable.
+        arrays = {}
+        if state.count.any():
+            arrays = {"means": state.means} | {name: one_if_equal(getattr(state, name)) for name in OF_PIXELS}
+        facts = json.dumps({"identity": self.identity, "spp": state.spp, "seconds": state.seconds})
+
+        try:
+            write_whole(self.path, lambda file: np.savez(file, facts=np.array(facts), **arrays))
+        finally:
+            self._saved = time.perf_counter()
+            if arrays:
+                self._cost = self._saved - started
+
+    def keep(self, state: State) -> None:
+        """Save; where that fails warn, once for each reason, for the render is worth more than its checkpoint."""
+        earlier, self.problem = self.problem, None
+        try:
+            self.save(state)
+        except Exception as error:
+            self.problem = str(error) or type(error).__name__
+            if self.problem != earlier:
+                warnings.warn(f"{self.problem}; the render goes on without", InputWarning, stacklevel=2)
+
+    def save_if_due(self, state: State) -> None:
+        """Keep, unless the last time was so lately that it would slow the render down."""
+        if time.perf_counter() - self._saved > COST * self._cost:
+            self.keep(state)
+
+    def _refusal(self, what: str) -> InputError:
+        return InputError(f"{self.path} {what}; delete it, or name another checkpoint")

@@ -1,0 +1,246 @@
+"""Render until an error is reached, a time is over or samples are spent; nothing is lost when it is stopped."""
+
+from __future__ import annotations
+
+import math
+import operator
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from pathjax.compile.runtime import usual_promotion
+from pathjax.errors import InputError
+from pathjax.integrators import path
+from pathjax.rendering.progressive import estimate, replicates
+from pathjax.rendering.progressive import passes as progressive
+from pathjax.rendering.progressive.checkpoint import Checkpoint, identity
+from pathjax.scene.scene import Scene
+from pathjax.sensors import film
+from pathjax.system.interrupts import Interrupts
+
+# Samples of every pixel before their number may differ.
+PILOT_SPP = 16
+# A round multiplies the samples by at most MOST_GROWTH. Near the target it takes this power of what is predicted to be
+# lacking, so as not to pass it by, but never less than LEAST_GROWTH.
+MOST_GROWTH, LEAST_GROWTH, CAUTION = 2.0, 1.05, 0.75
+MAX_SPP = 2**31 - 1
+UNKNOWN = estimate.ImageError(math.nan, math.nan)
+
+
+@dataclass(frozen=True)
+class RenderResult:
+    """An image and how wrong it is."""
+
+    image: np.ndarray  # (H, W, 3) float32
+    standard_error: np.ndarray  # (H, W, 3) float32 of the image; nan where a pixel has fewer than 2 samples
+    spp: float  # mean over the pixels
+    samples: np.ndarray  # (H, W) int32 of each pixel
+    compile_seconds: float  # of this call
+    run_seconds: float  # of all calls that shared the checkpoint
+    error: float  # estimate of `compare.relative_error`, of the pixels that are finite; nan where it cannot be made
+    error_bound: float  # that the error exceeds in some 5 % of renders; what is compared with the target
+    reason: str  # why it ended: "target error", "time limit", "spp", "interrupted", "no estimate"
+
+
+@usual_promotion
+def render_until(
+    scene: Scene,
+    target_error: float | None = None,
+    time_limit: float | None = None,
+    spp: int | None = None,
+    seed: int = 0,
+    strategy: str = "mis",
+    checkpoint: str | Path | None = None,
+    progress: bool = False,
+) -> RenderResult:
+    """Render until the first of three limits is reached.
+
+    The error is sqrt(mean((I - R)^2 / (R^2 + 0.01 L^2))) of the image I against the truth R, where L is the level of R:
+    the mean of what is lit, but for its brightest quarter, such as lamps in view (`compare.level`). So 0.02 is 2 % in
+    any unit of radiance. It is estimated as long as float32 holds the radiances, some 1e-31 to 1e36. A target is never
+    claimed of an image that is black, darker than that or not finite: a render that nothing else would end then ends
+    with the reason "no estimate", after the pilot or when the finite pixels are on target.
+
+    The image is the mean of independent replicates, so not that of `render` for the same seed. With `spp` alone all
+    pixels get as many samples; else, after a pilot, noisy neighbourhoods get more (`estimate.sample_weights`). Either
+    way the image is unbiased up to the scene's max_depth. The same arguments give the same image, bit for bit, unless a
+    time limit or an interrupt ended it.
+
+    Args:
+        target_error: reached when the upper bound of the estimate is no higher.
+        time_limit: seconds of rendering; compilation, which nothing can cut short, comes on top.
+        spp: most samples per pixel, on average.
+        checkpoint: a .npz file to save the state in, at intervals, when interrupted and at the end. Where it exists
+            the render goes on from there; killed at any moment and called again, it gives the image of an undisturbed
+            run.
+        progress: show a bar on stderr.
+    Raises:
+        InputError: an argument is out of range, or nothing to stop at is given; a checkpoint of another render, a
+            damaged one, or one that cannot be written. Once rendering has begun that is an InputWarning: the image is
+            returned, and the last checkpoint that was written is intact.
+        KeyboardInterrupt: by Ctrl-C while the kernel compiles. Later, Ctrl-C, SIGTERM and SIGHUP end the render, which
+            returns what is done (in the main thread, where alone Python hears them).
+    """
+    render = Render(scene, target_error, time_limit, spp, seed, strategy, checkpoint)
+    render.compile()
+    return render.run(progress)
+
+
+class Render:
+    """What `render_until` does, in steps: check the arguments and take up the checkpoint, compile, run."""
+
+    def __init__(self, scene, target_error, time_limit, spp, seed, strategy, checkpoint):
+        _check(target_error, time_limit, spp)
+        path.check_sampling(strategy, MAX_SPP if spp is None else spp, seed)
+        self.scene, self.seed, self.strategy = scene, operator.index(seed), strategy
+        self.target_error, self.time_limit = target_error, time_limit
+        self.spp = MAX_SPP if spp is None else int(spp)
+        self.compile_seconds = 0.0
+        adaptive = target_error is not None or time_limit is not None
+        self.state, self.checkpoint = progressive.start(scene), None
+        if checkpoint is not None:
+            self.checkpoint = Checkpoint(checkpoint, identity(scene, self.seed, strategy, adaptive))
+            self.state = self.checkpoint.load(self.state)
+            self.checkpoint.save(self.state)
+        if not adaptive or self.state.spp > self.spp:
+            progressive.plan(self.state, self.spp)
+        elif not self.state.spp:
+            progressive.plan(self.state, min(PILOT_SPP, self.spp))
+
+    def compile(self) -> None:
+        started = time.perf_counter()
+        progressive.compile(self.scene, self.strategy)
+        self.compile_seconds += time.perf_counter() - started
+
+    def run(self, progress: bool = False) -> RenderResult:
+        with Interrupts() as interrupts, _bar(progress) as show:
+            reason, found = self._run(interrupts, show)
+            with ThreadPoolExecutor(1) as beside:
+                saved = beside.submit(self.checkpoint.keep, self.state) if self.checkpoint is not None else None
+                result = self._result(reason, found or self._evaluate())
+                if saved is not None:
+                    saved.result()
+        return result
+
+    def _run(self, interrupts, show) -> tuple[str, tuple | None]:
+        """Extend the state until there is a reason to stop. What it becomes depends on itself alone, not on time.
+
+        Returns:
+            the reason, and what `_evaluate` gives where it is known.
+        """
+        state, error = self.state, UNKNOWN
+        started = time.perf_counter() - state.seconds
+
+        def stopped():
+            if interrupts.heard:
+                return "interrupted"
+            # However short the time, something is rendered: it is 0 until then.
+            if self.time_limit is not None and state.seconds and time.perf_counter() - started >= self.time_limit:
+                return "time limit"
+            return None
+
+        while True:
+            for _ in progressive.extend(self.scene, state, self.seed, self.strategy, stopped):
+                state.seconds = time.perf_counter() - started
+                if self.checkpoint is not None:
+                    self.checkpoint.save_if_due(state)
+                show(self, error)
+                if reason := stopped():
+                    return reason, None
+            if state.spp >= self.spp:
+                return "spp", None
+            image, variance, error = found = self._evaluate()
+            if self._on_target(error):
+                return "target error", found
+            if math.isnan(error.bound) and self.spp == MAX_SPP and self.time_limit is None:
+                return "no estimate", found
+            if state.spp == PILOT_SPP:
+                state.weights = estimate.sample_weights(image, variance).ravel()
+            progressive.plan(state, min(_next_spp(state.spp, error, self.target_error), self.spp))
+
+    def _on_target(self, error: estimate.ImageError) -> bool:
+        return self.target_error is not None and error.bound <= self.target_error
+
+    def _evaluate(self) -> tuple[np.ndarray, np.ndarray, estimate.ImageError]:
+        """Image and its variance, (H, W, 3) each, and its error."""
+        shape = (*film.image_shape(self.scene.film), 3)
+        image, variance = (x.reshape(shape) for x in self.state.moments())
+        # While some pixels know nothing of their error, neither does the image.
+        known = self.state.count.min() >= 2
+        return image, variance, estimate.image_error(image, variance) if known else UNKNOWN
+
+    def _result(self, reason, found) -> RenderResult:
+        image, variance, error = found
+        count = self.state.count.reshape(image.shape[:2])
+        if reason != "interrupted" and self._on_target(error):
+            reason = "target error" if np.isfinite(image).all() else "no estimate"
+        standard_error = estimate.standard_error(image, variance, count)
+        seconds = self.compile_seconds, self.state.seconds
+        return RenderResult(image, standard_error, float(count.mean()), count, *seconds, *error, reason)
+
+
+def _check(target_error, time_limit, spp) -> None:
+    if target_error is None and time_limit is None and spp is None:
+        raise InputError("nothing to stop at; give target_error, time_limit or spp")
+    for name, value in (("target_error", target_error), ("time_limit", time_limit)):
+        if value is not None and not (value > 0 and math.isfinite(value)):
+            raise InputError(f"{name} = {value}; it must be positive and finite")
+    if spp is not None and not (isinstance(spp, int | np.integer) and 1 <= spp <= MAX_SPP):
+        raise InputError(f"spp = {spp}; it must be an integer in [1, 2^31)")
+
+
+def _next_spp(spp: int, error: estimate.ImageError, target: float | None) -> int:
+    if spp < PILOT_SPP:
+        return PILOT_SPP
+    growth = MOST_GROWTH
+    if target is not None and math.isfinite(error.bound):
+        lacking = (error.bound / target) ** 2
+        growth = min(max(lacking**CAUTION, LEAST_GROWTH), MOST_GROWTH)
+    return spp + math.ceil(spp * (growth - 1) / replicates.COUNT) * replicates.COUNT
+
+
+@contextmanager
+def _bar(wanted: bool) -> Iterator:
+    """A function (Render, error at the end of the last round) that shows how far it is.
+
+    Nothing that goes wrong with the display ends the render.
+    """
+    if not wanted:
+        yield lambda *_: None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = TextColumn("rendering"), BarColumn(), TextColumn("{task.fields[status]}"), TimeRemainingColumn()
+    bar = Progress(*columns, console=Console(stderr=True), transient=True)
+    task = bar.add_task("", total=1.0, status="")
+
+    def show(render: Render, error: estimate.ImageError) -> None:
+        spp = render.state.count.mean()
+        status = f"{spp:.4g} spp"
+        if math.isfinite(error.estimate):
+            status += f"  error {error.estimate:.2%}"
+        with suppress(Exception):
+            bar.update(task, completed=_share_done(render, spp, error), status=status)
+
+    with suppress(Exception):
+        bar.start()
+    try:
+        yield show
+    finally:
+        with suppress(Exception):
+            bar.stop()
+
+
+def _share_done(render: Render, spp: float, error: estimate.ImageError) -> float:
+    shares = [spp / render.spp]
+    if render.time_limit is not None:
+        shares.append(render.state.seconds / render.time_limit)
+    if render.target_error is not None and error.bound > 0:
+        shares.append(spp / max(render.state.spp * (error.bound / render.target_error) ** 2, 1))
+    return min(max(shares), 1.0)

@@ -1,0 +1,53 @@
+"""From a description to a scene: each room builds its own tables."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from pathjax import description as desc
+from pathjax.bsdfs.builder import build_materials
+from pathjax.compile.runtime import usual_promotion
+from pathjax.description.parameter import Parameter
+from pathjax.errors import InputError
+from pathjax.scene.metadata import About
+from pathjax.scene.scene import UNBOUNDED, Scene
+from pathjax.sensors import camera, film
+from pathjax.shapes.accel.build import RULES
+from pathjax.shapes.builder import build_shapes
+
+
+@usual_promotion
+def build(description: desc.Description, dtype=jnp.float32, split_rule: str = "sah") -> Scene:
+    """Compile a description into tables grouped by kind.
+
+    Args:
+        dtype: of all reals; float64 needs `jax_enable_x64`.
+        split_rule: of the hierarchies, for experiments: "sah" (least expected cost), "equal" (equal counts) or "middle"
+            (of the centroids' bounds). Hits and images are the same; only their cost differs.
+    Raises:
+        InputError: float64 without `jax_enable_x64`; an unknown split_rule.
+    """
+    if split_rule not in RULES:
+        raise InputError(f"scene.build: split_rule {split_rule!r} is unknown; use one of {', '.join(RULES)}")
+    if jax.dtypes.canonicalize_dtype(dtype) != np.dtype(dtype):
+        raise InputError('scene.build: float64 is off in JAX; call jax.config.update("jax_enable_x64", True) first')
+    parameters: dict[str, Parameter] = {}
+    materials = build_materials(description, dtype, parameters)
+    geometry, emitters, trees = build_shapes(description, dtype, parameters, split_rule)
+    integrator = description.integrator
+    max_depth = UNBOUNDED if integrator.max_depth < 0 else integrator.max_depth
+    scene = Scene(
+        camera.build(description.camera, description.film, dtype),
+        film.build(description.film, dtype),
+        geometry,
+        materials,
+        emitters,
+        np.int32(max_depth),
+        np.int32(integrator.rr_depth),
+        integrator.hide_emitters,
+        About(description, parameters, trees),
+    )
+    # NumPy up to here: `jnp.asarray` compiles a program for every shape that it meets.
+    return jax.device_put(scene)

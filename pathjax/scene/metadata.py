@@ -1,0 +1,29 @@
+"""What people ask of a scene and kernels do not."""
+
+from __future__ import annotations
+
+import weakref
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from pathjax import description as desc
+from pathjax.description.parameter import Parameter
+from pathjax.shapes.accel.build import Tree
+
+
+@dataclass(frozen=True, eq=False)
+class About:
+    """What people ask of a scene and kernels do not: names, the file, reports. Equal for scenes of one loading."""
+
+    description: desc.Description
+    parameters: Mapping[str, Parameter]
+    trees: Mapping[str, Tree]  # kind of shape -> its hierarchy, for reports
+    # Of tables that `with_parameters` made: a weak reference to the array, and which of its parameters are traced.
+    # Tables hold many parameters, and a derivative costs time for each that may be wanted.
+    traced: Mapping[tuple, tuple[weakref.ref, frozenset[str]]] = field(default_factory=dict)
+
+    def __eq__(self, other):
+        return isinstance(other, About) and self.parameters is other.parameters
+
+    def __hash__(self):
+        return id(self.parameters)

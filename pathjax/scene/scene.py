@@ -1,0 +1,33 @@
+"""The scene: a pytree whose structure says what occurs, so that only that is compiled."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import jax
+
+from pathjax.bsdfs import Materials
+from pathjax.emitters import Emitters
+from pathjax.scene.metadata import About
+from pathjax.sensors.camera import Camera
+from pathjax.sensors.film import Film
+from pathjax.shapes.geometry import Geometry
+
+# Depth that stands for "no limit": more bounces than any path survives roulette.
+UNBOUNDED = 1 << 30
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Scene:
+    """Arrays of a scene. Scenes of the same structure and array shapes share one compiled kernel."""
+
+    camera: Camera
+    film: Film
+    geometry: Geometry
+    materials: Materials
+    emitters: Emitters
+    max_depth: jax.Array  # () int32 vertices of the longest path; 1: emission only
+    rr_depth: jax.Array  # () int32 vertices before roulette begins
+    hide_emitters: bool = field(metadata={"static": True})  # from the camera
+    about: About | None = field(metadata={"static": True})

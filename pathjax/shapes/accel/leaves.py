@@ -1,0 +1,55 @@
+"""Primitives packed for intersection: blocks of numbers, a primitive in each lane, and a tree over many of them."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from pathjax.core.math import integer_like
+from pathjax.shapes.accel import build as bvh_build
+from pathjax.shapes.accel import traverse as bvh
+
+# Up to here every ray tests all primitives of a kind, one after another; above, a tree pays.
+FLAT_LIMIT = 32
+LEAF_WIDTH = 8
+
+
+def pack(numbers, lo, hi, dtype, rule="sah", first=0, step=1):
+    """Pack primitives for intersection.
+
+    Args:
+        numbers: (P, K) what the intersection wants to know of each primitive.
+        lo, hi: (P, 3) bounds.
+        first, step: primitive i is row first + step i of its table.
+    Returns:
+        leaves (L, K + 1, W), tree (None for a few primitives, each a leaf of its own), built tree for reports or None.
+        A leaf holds the bits of its numbers, as integers, then its rows: one block, so that a visit misses the cache
+        once, and no array of the scene holds the NaN of the padding, which JAX's debug_nans would find.
+    """
+    count = len(numbers)
+    if count <= FLAT_LIMIT:
+        built, tree = None, None
+        rows = np.arange(count, dtype=np.int32)[:, None]
+    else:
+        built = bvh_build.build(lo, hi, rule=rule, leaf_size=LEAF_WIDTH)
+        lane = np.arange(LEAF_WIDTH)
+        place = built.leaf_first[:, None] + lane
+        rows = np.where(lane < built.leaf_count[:, None], built.order[np.minimum(place, count - 1)], -1)
+        tree = bvh.pack(built, dtype)
+    padded = np.concatenate([numbers, np.full((1, numbers.shape[1]), np.nan)])
+    leaves = np.moveaxis(padded[rows], 1, 2).astype(dtype)  # row -1 is the padding
+    rows = np.where(rows < 0, rows, first + step * rows)
+    integer = integer_like(leaves.dtype)
+    blocks = np.concatenate([leaves.view(integer), rows[:, None].astype(integer)], 1)
+    return jnp.asarray(blocks), tree, built
+
+
+def numbers_of(block, dtype):
+    """The numbers whose bits are (a part of) a leaf; what stands for its rows is none."""
+    return lax.bitcast_convert_type(block, dtype)
+
+
+def rows_of(leaf):
+    """Rows (..., W) of the primitives of a leaf (..., K + 1, W), ascending; -1 in empty lanes."""
+    return leaf[..., -1, :].astype(jnp.int32)
