@@ -31,14 +31,9 @@ class Materials:
     sides: jax.Array  # (S, 2, 2) int32 of each shape: front and back; kind (-1: absorbs), row
 
 
-def any_smooth(materials: Materials) -> bool:
-    """Whether some kind present has a density, so that light sampling makes sense."""
-    return any(MODULES[type(table)].SMOOTH for table in materials.tables)
-
-
-def any_glass(materials: Materials) -> bool:
-    """Whether some kind present lies between two media."""
-    return any(isinstance(table, DielectricTable) for table in materials.tables)
+def occurs(materials: Materials, capability: str) -> bool:
+    """Whether some kind present is capable of it, of CAPABILITIES."""
+    return any(getattr(MODULES[type(table)], capability.upper()) for table in materials.tables)
 
 
 def with_fresnel(materials: Materials, fresnel: str) -> Materials:
@@ -53,33 +48,27 @@ def select(materials: Materials, shape, front):
     return kind, row
 
 
-def is_smooth(materials: Materials, kind):
-    """() bool: this bsdf has a density."""
-    flags = [MODULES[type(table)].SMOOTH for table in materials.tables]
+def has(materials: Materials, kind, capability: str):
+    """() bool: whether this kind of bsdf is capable of it, of CAPABILITIES; nothing is where there is no bsdf."""
+    flags = [getattr(MODULES[type(table)], capability.upper()) for table in materials.tables]
+    if not any(flags):
+        return jnp.bool_(False)
     if all(flags):
         return kind >= 0
     return at(jnp.array(flags), jnp.maximum(kind, 0)) & (kind >= 0)
 
 
-def is_glass(materials: Materials, kind):
-    """() bool: this bsdf lies between two media and tells its sides apart; the others reflect in front of them."""
-    flags = [isinstance(table, DielectricTable) for table in materials.tables]
-    if not any(flags):
-        return jnp.bool_(False)
-    return at(jnp.array(flags), jnp.maximum(kind, 0))
+def moving_bit(materials: Materials, kind, row):
+    """() int32: bit row % 31 where parameters of the bsdf move paths, else 0."""
+    return jnp.where(has(materials, kind, "moves_paths"), jnp.left_shift(jnp.int32(1), row % 31), 0)
 
 
-def glass_bit(materials: Materials, kind, row):
-    """() int32: bit row % 31 where the kind is a dielectric, else 0."""
-    return jnp.where(is_glass(materials, kind), jnp.left_shift(jnp.int32(1), row % 31), 0)
-
-
-def evaluate(materials: Materials, kind, row, uv, wi, wo):
+def evaluate(materials: Materials, kind, row, surface, wi, wo):
     """f |cos theta_o| (3,) and pdf () of a smooth bsdf; 0 for the others."""
     smooth = [(i, table) for i, table in enumerate(materials.tables) if MODULES[type(table)].SMOOTH]
 
     def of(table):
-        return lambda: MODULES[type(table)].evaluate(table, row, uv, wi, wo)
+        return lambda: MODULES[type(table)].evaluate(table, row, surface.uv, wi, wo)
 
     if len(smooth) == 1:
         return of(smooth[0][1])()
@@ -87,18 +76,18 @@ def evaluate(materials: Materials, kind, row, uv, wi, wo):
     return lax.switch(index, [of(table) for _, table in smooth])
 
 
-def sample(materials: Materials, kind, row, uv, wi, u) -> BSDFSample:
+def sample(materials: Materials, kind, row, surface, wi, u) -> BSDFSample:
     """Draw `wo` and its weight from the bsdf. u: (2,)."""
 
     def of(table):
-        return lambda: MODULES[type(table)].sample(table, row, uv, wi, u)
+        return lambda: MODULES[type(table)].sample(table, row, surface.uv, wi, u)
 
     if len(materials.tables) == 1:
         return of(materials.tables[0])()
     return lax.switch(jnp.maximum(kind, 0), [of(table) for table in materials.tables])
 
 
-def sample_other(materials: Materials, row, uv, wi, u) -> BSDFSample:
+def sample_other(materials: Materials, row, surface, wi, u) -> BSDFSample:
     """The branch of a dielectric that `sample` leaves out."""
     table = next(table for table in materials.tables if isinstance(table, DielectricTable))
-    return dielectric.sample(table, row, uv, wi, u, other=True)
+    return dielectric.sample(table, row, surface.uv, wi, u, other=True)

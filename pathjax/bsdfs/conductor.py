@@ -21,7 +21,7 @@ class ConductorTable:
     ideal: jax.Array | None  # (R,) bool, this row has no Fresnel term
 
 
-SMOOTH = False
+SMOOTH, DELTA, TRANSMISSIVE, SIDED, BRANCHES, MOVES_PATHS = False, True, False, False, False, False
 
 
 def sample(table: ConductorTable, row, uv, wi, u) -> BSDFSample:

@@ -24,7 +24,7 @@ class DielectricTable:
     fresnel: str = field(default="exact", metadata={"static": True})  # of REFLECTANCES
 
 
-SMOOTH = False
+SMOOTH, DELTA, TRANSMISSIVE, SIDED, BRANCHES, MOVES_PATHS = False, True, True, True, True, True
 REFLECTANCES = {"exact": fresnel.dielectric, "schlick": fresnel.schlick}
 # Least probability of either branch where the choice is by another IOR: with one that vanishes as Fresnel's terms do,
 # derivatives near the critical angle have infinite variance; with a constant it grows as a logarithm.

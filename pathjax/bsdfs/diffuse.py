@@ -22,7 +22,7 @@ class DiffuseTable:
     textures: Textures | None
 
 
-SMOOTH = True  # has a density that light sampling can use
+SMOOTH, DELTA, TRANSMISSIVE, SIDED, BRANCHES, MOVES_PATHS = True, False, False, False, False, False
 
 
 def reflectance(table: DiffuseTable, row, uv):

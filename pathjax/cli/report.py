@@ -40,7 +40,7 @@ def facts(scene: Scene) -> dict:
         "compiled": {
             "shapes": [_kind(part) + (" (tree)" if part.tree else " (flat)") for part in parts],
             "bsdfs": [type(table).__name__.removesuffix("Table").lower() for table in scene.materials.tables],
-            "light sampling": bsdfs.any_smooth(scene.materials) and scene.emitters.area is not None,
+            "light sampling": bsdfs.occurs(scene.materials, "smooth") and scene.emitters.area is not None,
             "emitters": [name for name in ("area", "constant") if getattr(scene.emitters, name) is not None],
             "dtype": str(scene.camera.origin.dtype),
         },

@@ -84,11 +84,11 @@ def _motion(pixel_number, scene, row):
             found = hit.primitive >= 0
             surface = geometry.surface(scene.geometry, ray, hit)
             frame, wi, kind, at_row = path.shading(materials, ray, hit, surface)
-            drawn = bsdfs.sample(materials, kind, at_row, surface.uv, wi, jnp.full_like(half, 1 - 2**-24))
+            drawn = bsdfs.sample(materials, kind, at_row, surface, wi, jnp.full_like(half, 1 - 2**-24))
             d = to_world(frame, drawn.wo)
             on = found & drawn.delta & (kind >= 0)
             end = jnp.where(found, surface.p, ray.d)
-            met = met | (found & bsdfs.is_glass(materials, kind) & (at_row == row))
+            met = met | (found & bsdfs.has(materials, kind, "moves_paths") & (at_row == row))
             return spawn_ray(surface, d, hit.primitive), end, met, depth + 1, on
 
         start = ray, ray.o, jnp.bool_(False), jnp.int32(0), jnp.bool_(True)

@@ -49,8 +49,8 @@ def sample(scene, pixel, stream, number) -> FirstHit:
         _, wi, kind, row = path.shading(scene.materials, ray, hit, surface)
         u = path.bounce_numbers(scene, stream, number, start.depth)
         # The mean weight of a bsdf sample is the albedo, exact where all directions carry the same.
-        drawn = bsdfs.sample(scene.materials, kind, row, surface.uv, wi, u.bsdf)
-        albedo = jnp.where(bsdfs.is_glass(scene.materials, kind), 1, jnp.where(kind >= 0, drawn.weight, 0))
+        drawn = bsdfs.sample(scene.materials, kind, row, surface, wi, u.bsdf)
+        albedo = jnp.where(bsdfs.has(scene.materials, kind, "transmissive"), 1, jnp.where(kind >= 0, drawn.weight, 0))
         return FirstHit((passed + hit.t)[None], surface.shading_n, albedo)
 
     found = lax.cond(hit.primitive >= 0, seen, lambda: _nothing(scene))

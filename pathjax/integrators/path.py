@@ -100,7 +100,7 @@ def start(
         controlled: `extend` is given a control.
     """
     one, zero3 = jnp.ones_like(ray.t_max), jnp.zeros_like(ray.o)
-    passive = one if bsdfs.any_glass(scene.materials) else None
+    passive = one if bsdfs.occurs(scene.materials, "transmissive") else None
     glass = jnp.int32(0) if watch_glass else None
     throughput = zero3 + (scene.max_depth > 0)
     L = Gain(zero3, zero3) if by_vertex else zero3
@@ -130,8 +130,8 @@ def extend(
     """
     shapes, materials = scene.geometry, scene.materials
     least, most = (jnp.full_like(path.ray.t_max, x) for x in (MIN_SURVIVAL, MAX_SURVIVAL))
-    has_glass = bsdfs.any_glass(materials)
-    sample_lights = strategy != "bsdf" and choice is not None and bsdfs.any_smooth(materials)
+    has_glass = bsdfs.occurs(materials, "transmissive")
+    sample_lights = strategy != "bsdf" and choice is not None and bsdfs.occurs(materials, "smooth")
 
     def end(path: Path) -> Path:
         return path._replace(alive=jnp.bool_(False))
@@ -182,13 +182,13 @@ def extend(
         L = path.L
         if sample_lights:
 
-            smooth = bsdfs.is_smooth(materials, kind)
+            smooth = bsdfs.has(materials, kind, "smooth")
 
             def direct():
                 drawn = emitters.sample(scene.emitters, shapes, choice, surface.p, u.light, u.triangle)
                 drawn = lax.optimization_barrier(drawn)
                 wo = to_local(frame, drawn.d)
-                f, pdf_bsdf = bsdfs.evaluate(materials, kind, row, surface.uv, wi, wo)
+                f, pdf_bsdf = bsdfs.evaluate(materials, kind, row, surface, wi, wo)
                 share = mis_weight(drawn.pdf, pdf_bsdf) if strategy == "mis" else 1
                 possible = (drawn.pdf > 0) & (pdf_bsdf > 0)
                 scale = lax.optimization_barrier(share / jnp.where(possible, drawn.pdf, 1))
@@ -205,11 +205,11 @@ def extend(
             L = L._replace(light=light) if isinstance(L, Gain) else L + light
 
         # ---- bsdf sample ------------------------------------------------------------------------------------------
-        drawn = bsdfs.sample(materials, kind, row, surface.uv, wi, u.bsdf)
+        drawn = bsdfs.sample(materials, kind, row, surface, wi, u.bsdf)
         d = to_world(frame, drawn.wo)
         drawn, d = lax.optimization_barrier((drawn, d))
         if path.pending is not None:
-            splits = bsdfs.is_glass(materials, kind) & (path.splits > 0)
+            splits = bsdfs.has(materials, kind, "branches") & (path.splits > 0)
             drawn = drawn._replace(weight=jnp.where(splits, drawn.pdf, 1) * drawn.weight)
         throughput = path.throughput * drawn.weight
 
@@ -227,7 +227,7 @@ def extend(
         alive = (kind >= 0) & (drawn.pdf > 0) & (derivative | (largest > 0)) & (u.roulette < survival)
         pdf = jnp.where(drawn.delta, jnp.inf, drawn.pdf)
         if path.glass is not None:
-            glass = path.glass | bsdfs.glass_bit(materials, kind, row)
+            glass = path.glass | bsdfs.moving_bit(materials, kind, row)
         ray_on = spawn_ray(surface, d, hit.primitive)
         on = Path(ray_on, L, throughput / survival, pdf, passive, path.depth, alive, glass, expected=path.expected)
         if path.pending is None:
@@ -236,7 +236,7 @@ def extend(
         return lax.cond(splits, split, lambda path, on: on, path, on)
 
     def split(path: Path, on: Path) -> Path:
-        other = bsdfs.sample_other(materials, row, surface.uv, wi, u.bsdf)
+        other = bsdfs.sample_other(materials, row, surface, wi, u.bsdf)
         branch = on._replace(
             ray=spawn_ray(surface, to_world(frame, other.wo), hit.primitive),
             throughput=path.throughput * other.weight * other.pdf,  # roulette comes at the next vertex
@@ -273,7 +273,7 @@ def shading(materials, ray: Ray, hit, surface):
     frame = frame_from_normal(surface.shading_n)
     wi = to_local(frame, -ray.d)
     kind, row = bsdfs.select(materials, hit.shape, wi[2] > 0)
-    side = jnp.where(bsdfs.is_glass(materials, kind) | (wi[2] > 0), 1, -1).astype(wi.dtype)
+    side = jnp.where(bsdfs.has(materials, kind, "sided") | (wi[2] > 0), 1, -1).astype(wi.dtype)
     return frame._replace(n=frame.n * side), jnp.stack([wi[0], wi[1], wi[2] * side]), kind, row
 
 

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import partial
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -12,10 +13,10 @@ from scipy import stats
 from pathjax import bsdfs
 from pathjax import description as desc
 from pathjax.bsdfs import conductor, dielectric, diffuse
+from pathjax.bsdfs.builder import _textures, build_materials
 from pathjax.bsdfs.conductor import ConductorTable
 from pathjax.bsdfs.dielectric import DielectricTable
 from pathjax.bsdfs.diffuse import DiffuseTable
-from pathjax.bsdfs.builder import _textures, build_materials
 from pathjax.textures import texture
 
 # Chance that a correct bsdf fails one of the statistical tests here; seeds are fixed.
@@ -23,6 +24,7 @@ FALSE_ALARM = 1e-4
 ALBEDO = np.array([[0.9, 0.5, 0.1], [1.0, 0.0, 0.3]], np.float32)
 WHITE = DiffuseTable(jnp.asarray(ALBEDO), None, None)
 UV = jnp.zeros(2)
+SURFACE = SimpleNamespace(uv=UV)
 
 
 def uniform(*shape, seed=1):
@@ -365,8 +367,8 @@ def test_sides_of_a_shape_are_told_apart():
     @jax.jit
     def draw_side(shape, front):
         kind, row = bsdfs.select(materials, shape, front)
-        drawn = bsdfs.sample(materials, kind, row, UV, wi, u)
-        return kind, drawn, bsdfs.is_smooth(materials, kind), bsdfs.is_glass(materials, kind)
+        drawn = bsdfs.sample(materials, kind, row, SURFACE, wi, u)
+        return kind, drawn, bsdfs.has(materials, kind, "smooth"), bsdfs.has(materials, kind, "sided")
 
     def weight(shape, front):
         kind, drawn, smooth, _ = draw_side(shape, front)
