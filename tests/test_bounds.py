@@ -5,6 +5,7 @@ is made item by item, with real branches, and JAX's `checkify` looks at every in
 """
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -15,13 +16,11 @@ from jax.experimental import checkify
 
 import pathjax as pj
 from pathjax import emitters, transport
-from pathjax.bsdfs.diffuse import DiffuseTable
 from pathjax.compile import runtime
 from pathjax.core import math
 from pathjax.sensors import film
 from pathjax.shapes import triangle
 from pathjax.shapes.accel import traverse as bvh
-from pathjax.textures.texture import lookup
 
 # Numbers of samplers from the ends of their range, the ends of steps, and between.
 ENDS = np.float32([0, 2**-24, 0.25, 0.5, 0.75, 1 - 2**-12, 1 - 2**-24])
@@ -191,11 +190,16 @@ def test_lights_are_chosen_inside_of_arrays(outside_of, make_scene):
 
 
 def test_textures_are_read_inside_of_arrays_wherever_uv_lies(outside_of, shipped):
-    (table,) = (t.textures for t in shipped("textures", res=4).materials.tables if isinstance(t, DiffuseTable))
+    textures = shipped("textures", res=4).materials.textures
     numbers = np.float32([0, 2**-24, 0.5, 1 - 2**-24, 1, -(2**-24), -1, 1e9, 1e38, np.inf, -np.inf, np.nan])
-    rows, u, v = (x.ravel() for x in np.meshgrid(np.arange(len(table.to_uv)), numbers, numbers))
-    items = jnp.asarray(rows, jnp.int32), jnp.stack([u, v], -1)
-    assert not outside_of(lambda: runtime.native_map(lambda item, table: lookup(table, *item), items, table))
+    rows = [(kind, row) for kind, t in enumerate(textures.tables) for row in range(len(t.column("to_uv").values))]
+    number, u, v = (x.ravel() for x in np.meshgrid(np.arange(len(rows)), numbers, numbers))
+    items = jnp.asarray(np.array(rows)[number], jnp.int32), jnp.stack([u, v], -1)
+
+    def look_up(item, textures):
+        return textures.look_up(item[0], SimpleNamespace(uv=item[1]))
+
+    assert not outside_of(lambda: runtime.native_map(look_up, items, textures))
 
 
 @pytest.mark.parametrize("filter", ["box", "tent", "gaussian"])

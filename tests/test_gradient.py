@@ -318,11 +318,17 @@ def stage(make_scene, tmp_path_factory):
             + sky(),
             **camera,
         )
-        place = "materials", "tables", 0, "textures", "bitmaps"
-        scene = named.put(scene, (*place, "texels"), jnp.asarray(PICTURES[picture].reshape(-1, 3), jnp.float32))
-        return named.put(scene, (*place, "nearest"), jnp.asarray([picture != "ramp"]))
+        return with_picture(scene, picture)
 
     return make
+
+
+def with_picture(scene, picture):
+    """The scene whose only texture shows one of PICTURES."""
+    (table,) = scene.materials.textures.tables
+    table = table.with_column("texels", jnp.asarray(PICTURES[picture].reshape(-1, 3), jnp.float32))
+    table = table.with_column("nearest", jnp.asarray([picture != "ramp"]))
+    return named.put(scene, ("materials", "textures", "tables", 0), table)
 
 
 GLASS = "glass.int_ior"
@@ -454,10 +460,7 @@ def test_attached_derivatives_know_no_edges(edge_seen_through_a_slab, derivative
     fresnel_alone = difference(lambda eta: through_slab(eta, 0.45), 1e-6)
     agree(image, edge_image(IOR, width), rounding=3e-4, pixelwise=False)
     agree(slopes[GLASS], fresnel_alone, rounding=1e-3, pixelwise=False)
-    ramp = named.put(scene, ("materials", "tables", 0, "textures", "bitmaps", "nearest"), jnp.asarray([False]))
-    texels = jnp.asarray(PICTURES["ramp"].reshape(-1, 3), jnp.float32)
-    ramp = named.put(ramp, ("materials", "tables", 0, "textures", "bitmaps", "texels"), texels)
-    _, slopes = derivatives(ramp, [GLASS], 32, method="attached")
+    _, slopes = derivatives(with_picture(scene, "ramp"), [GLASS], 32, method="attached")
     # The screen is moved here so that the image's middle sees the ramp's.
     exact = difference(lambda eta: through_slab(eta, 0.5 - RAMP * (shift(eta)[0] - shift(IOR)[0])), 1e-6)
     agree(slopes[GLASS], exact, rounding=1e-3, pixelwise=False)

@@ -15,6 +15,7 @@ ROOMS = (
     "core",
     "compile",
     "images",
+    "kinds",
     "description",
     "textures",
     "shapes",
@@ -28,6 +29,7 @@ ROOMS = (
     "rendering",
     "inverse",
     "io",
+    "testing",
     "cli",
     "bench",
 )

@@ -1,8 +1,7 @@
-"""How surfaces scatter: a file a kind, and the dispatch over the kinds that a scene holds.
+"""How surfaces scatter: a file a kind, the table of kinds, and the dispatch over those that a scene holds.
 
-A material has a front and a back, each a bsdf or nothing (which absorbs). A bsdf is a kind and a row in the table of
-that kind. Reflectors see `wi` in a frame turned towards it; a dielectric keeps the frame, whose normal tells inside
-from outside.
+A bsdf is a subclass of `BSDF`, which says what it must offer and what it may be capable of. A material has a front and
+a back, each a bsdf or nothing, which absorbs: a kind, which is the place of a table, and a row in that table.
 """
 
 from __future__ import annotations
@@ -11,34 +10,103 @@ from dataclasses import dataclass, replace
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 
-from pathjax.bsdfs import conductor, dielectric, diffuse
-from pathjax.bsdfs.conductor import ConductorTable
-from pathjax.bsdfs.dielectric import DielectricTable
-from pathjax.bsdfs.diffuse import DiffuseTable
+from pathjax import textures
+from pathjax.bsdfs.bsdf import BSDF
+from pathjax.bsdfs.conductor import Conductor
+from pathjax.bsdfs.dielectric import Dielectric
+from pathjax.bsdfs.diffuse import Diffuse
+from pathjax.bsdfs.twosided import TwoSided
 from pathjax.core.math import at
 from pathjax.core.types import BSDFSample
+from pathjax.kinds import Column, Instance, Parameters, Row, Table, ordered
+from pathjax.kinds import register as register_kind
+from pathjax.textures import Textures
 
-FRESNEL = tuple(dielectric.REFLECTANCES)
-MODULES = {DiffuseTable: diffuse, DielectricTable: dielectric, ConductorTable: conductor}
+__all__ = ["KINDS", "BSDF", "Conductor", "Dielectric", "Diffuse", "Materials", "TwoSided", "register"]
+
+# By the name that scene files give them.
+KINDS: dict[str, type[BSDF]] = {
+    "diffuse": Diffuse,
+    "conductor": Conductor,
+    "dielectric": Dielectric,
+    "twosided": TwoSided,
+}
+FRESNEL = Dielectric.fresnel.options
+
+
+def register(name: str):
+    """A decorator that makes a subclass of `BSDF` a kind, which scene files name by `name`."""
+    return register_kind(KINDS, BSDF, name, "bsdfs")
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Materials:
-    tables: tuple  # one entry per kind of bsdf present
+    tables: tuple[Table, ...]  # one for each kind of bsdf present
     sides: jax.Array  # (S, 2, 2) int32 of each shape: front and back; kind (-1: absorbs), row
+    textures: Textures | None  # in the place of parameters; None: there are none
+
+
+def build(bsdfs: list[Instance], dtype, path: tuple, parameters: Parameters) -> Materials:
+    """Materials of the shapes whose bsdfs are given.
+
+    path: where the materials will be in the scene; parameters: to enter those of bsdfs and textures.
+    """
+    sides = [bsdf.kind.sides(bsdf) for bsdf in bsdfs]
+    present = list(dict.fromkeys(side for pair in sides for side in pair if side is not None))
+    used = dict.fromkeys(v for side in present for v in side.values.values() if isinstance(v, Instance))
+    made, codes = textures.build(list(used), dtype, (*path, "textures"), parameters)
+    tables, places = [], {None: (-1, 0)}
+    for kind, rows in ordered(present, KINDS).items():
+        places |= {side: (len(tables), row) for row, side in enumerate(rows)}
+        tables.append(kind.build(rows, dtype, (*path, "tables", len(tables)), parameters, codes.get))
+    numbers = [[places[side] for side in pair] for pair in sides]
+    return Materials(tuple(tables), np.asarray(np.reshape(numbers, (-1, 2, 2)), np.int32), made)
 
 
 def occurs(materials: Materials, capability: str) -> bool:
-    """Whether some kind present is capable of it, of CAPABILITIES."""
-    return any(getattr(MODULES[type(table)], capability.upper()) for table in materials.tables)
+    """Whether some kind present is capable of it: "smooth", "delta", ... of `BSDF`, or "moves_paths"."""
+    return any(_is(table.kind, capability) for table in materials.tables)
+
+
+def has(materials: Materials, kind, capability: str):
+    """() bool: whether this kind is capable of it, as in `occurs`; where there is no bsdf nothing is."""
+    flags = [_is(table.kind, capability) for table in materials.tables]
+    if not any(flags):
+        return jnp.bool_(False)
+    if all(flags):
+        return kind >= 0
+    return at(jnp.array(flags), jnp.maximum(kind, 0)) & (kind >= 0)
+
+
+def _is(kind: type[BSDF], capability: str) -> bool:
+    if capability == "moves_paths":
+        return any(declared.moves_paths for declared in kind.declared.values())
+    return getattr(kind, capability)
+
+
+def moving_bit(materials: Materials, kind, row):
+    """() int32: bit row % 31 where parameters of the bsdf move paths, else 0."""
+    return jnp.where(has(materials, kind, "moves_paths"), jnp.left_shift(jnp.int32(1), row % 31), 0)
+
+
+def name(materials: Materials, kind: int) -> str:
+    """What scene files call a kind that is present."""
+    return next(name for name, each in KINDS.items() if each is materials.tables[kind].kind)
+
+
+def reflectances(materials: Materials) -> tuple[int, Column] | None:
+    """Kind and reflectances (R, 3) of what sends the same radiance in all directions; None where nothing does."""
+    found = [(i, t.column("reflectance")) for i, t in enumerate(materials.tables) if t.kind is Diffuse]
+    return found[0] if found else None
 
 
 def with_fresnel(materials: Materials, fresnel: str) -> Materials:
-    """The same, whose dielectrics reflect by one of `dielectric.REFLECTANCES`."""
-    tables = (replace(t, fresnel=fresnel) if isinstance(t, DielectricTable) else t for t in materials.tables)
+    """The same, whose kinds that have a choice of `fresnel` reflect by that of FRESNEL."""
+    tables = (t.with_choice("fresnel", fresnel) if "fresnel" in dict(t.choices) else t for t in materials.tables)
     return replace(materials, tables=tuple(tables))
 
 
@@ -48,28 +116,15 @@ def select(materials: Materials, shape, front):
     return kind, row
 
 
-def has(materials: Materials, kind, capability: str):
-    """() bool: whether this kind of bsdf is capable of it, of CAPABILITIES; nothing is where there is no bsdf."""
-    flags = [getattr(MODULES[type(table)], capability.upper()) for table in materials.tables]
-    if not any(flags):
-        return jnp.bool_(False)
-    if all(flags):
-        return kind >= 0
-    return at(jnp.array(flags), jnp.maximum(kind, 0)) & (kind >= 0)
-
-
-def moving_bit(materials: Materials, kind, row):
-    """() int32: bit row % 31 where parameters of the bsdf move paths, else 0."""
-    return jnp.where(has(materials, kind, "moves_paths"), jnp.left_shift(jnp.int32(1), row % 31), 0)
-
-
 def evaluate(materials: Materials, kind, row, surface, wi, wo):
     """f |cos theta_o| (3,) and pdf () of a smooth bsdf; 0 for the others."""
-    smooth = [(i, table) for i, table in enumerate(materials.tables) if MODULES[type(table)].SMOOTH]
+    smooth = [(i, table) for i, table in enumerate(materials.tables) if table.kind.smooth]
 
     def of(table):
-        return lambda: MODULES[type(table)].evaluate(table, row, surface.uv, wi, wo)
+        return lambda: table.kind.evaluate(Row(table, row, surface, materials.textures), wi, wo)
 
+    if not smooth:
+        return jnp.zeros_like(wi), jnp.zeros_like(wi[2])
     if len(smooth) == 1:
         return of(smooth[0][1])()
     index = sum((kind >= i).astype(jnp.int32) for i, _ in smooth[1:])
@@ -77,10 +132,10 @@ def evaluate(materials: Materials, kind, row, surface, wi, wo):
 
 
 def sample(materials: Materials, kind, row, surface, wi, u) -> BSDFSample:
-    """Draw `wo` and its weight from the bsdf. u: (2,)."""
+    """Draw `wo` and its weight from the bsdf. u: (2,), or (3,) where a kind with `lobes` is present."""
 
     def of(table):
-        return lambda: MODULES[type(table)].sample(table, row, surface.uv, wi, u)
+        return lambda: table.kind.sample(Row(table, row, surface, materials.textures), wi, u)
 
     if len(materials.tables) == 1:
         return of(materials.tables[0])()
@@ -88,6 +143,6 @@ def sample(materials: Materials, kind, row, surface, wi, u) -> BSDFSample:
 
 
 def sample_other(materials: Materials, row, surface, wi, u) -> BSDFSample:
-    """The branch of a dielectric that `sample` leaves out."""
-    table = next(table for table in materials.tables if isinstance(table, DielectricTable))
-    return dielectric.sample(table, row, surface.uv, wi, u, other=True)
+    """The branch that `sample` leaves out, of a kind that `branches`."""
+    table = next(table for table in materials.tables if table.kind.branches)
+    return table.kind.sample(Row(table, row, surface, materials.textures), wi, u, other=True)

@@ -2,33 +2,50 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
 
-import jax
 import jax.numpy as jnp
+import numpy as np
 
 from pathjax.bsdfs import fresnel
-from pathjax.core.math import at
+from pathjax.bsdfs.bsdf import BSDF
 from pathjax.core.types import BSDFSample
+from pathjax.kinds import Color
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class ConductorTable:
-    specular_reflectance: jax.Array  # (R, 3)
-    eta: jax.Array | None  # (R, 3); None: no row is a metal, all reflect ideally
-    k: jax.Array | None  # (R, 3)
-    ideal: jax.Array | None  # (R,) bool, this row has no Fresnel term
+class Conductor(BSDF):
+    """Smooth one-sided metal. Without eta and k it is Mitsuba's material "none", an ideal mirror."""
 
+    specular_reflectance = Color(1.0, textured=False)
+    eta = Color(None, bounds=(0, math.inf), textured=False)
+    k = Color(None, bounds=(0, math.inf), textured=False)
+    delta = True
 
-SMOOTH, DELTA, TRANSMISSIVE, SIDED, BRANCHES, MOVES_PATHS = False, True, False, False, False, False
+    @classmethod
+    def read(cls, loader, fields, name):
+        material = fields.string("material", "none")
+        if material != "none":
+            raise fields.error("material", f'cannot be "{material[:40]}"; give eta and k as <rgb>')
+        made = super().read(loader, fields, name)
+        given = [made.values[key] is not None for key in ("eta", "k")]
+        # Of "none" eta is 0 and k is 1: all is reflected.
+        defaults = {"eta": np.zeros(3), "k": np.ones(3)} if any(given) else {}
+        return cls.instance(name, **{key: defaults.get(key) if v is None else v for key, v in made.values.items()})
 
+    @classmethod
+    def build(cls, instances, dtype, path, parameters, code):
+        table = super().build(instances, dtype, path, parameters, code)
+        if (k := table.column("k")) is None:
+            return table
+        # Ideal mirrors among metals: with eta = 0 any k > 0 reflects all.
+        ideal = np.array([instance.values["k"] is None for instance in instances])[:, None]
+        return table.with_column("k", np.where(ideal, np.ones(1, k.values.dtype), k.values))
 
-def sample(table: ConductorTable, row, uv, wi, u) -> BSDFSample:
-    """Mirror direction; the weight is the Fresnel reflectance times `specular_reflectance`."""
-    weight = at(table.specular_reflectance, row)
-    if table.eta is not None:
-        f = fresnel.conductor(wi[2], at(table.eta, row), at(table.k, row))
-        weight = weight * jnp.where(at(table.ideal, row), 1, f)
-    one = jnp.ones_like(wi[2])
-    return BSDFSample(jnp.stack([-wi[0], -wi[1], wi[2]]), weight, one, jnp.bool_(True), one)
+    @staticmethod
+    def sample(p, wi, u) -> BSDFSample:
+        """Mirror direction; the weight is the Fresnel reflectance times `specular_reflectance`."""
+        weight = p.specular_reflectance
+        if (eta := p.eta) is not None:
+            weight = weight * fresnel.conductor(wi[2], eta, p.k)
+        one = jnp.ones_like(wi[2])
+        return BSDFSample(jnp.stack([-wi[0], -wi[1], wi[2]]), weight, one, jnp.bool_(True), one)

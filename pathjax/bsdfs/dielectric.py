@@ -2,67 +2,135 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
-import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 
 from pathjax.bsdfs import fresnel
-from pathjax.core.math import at, larger, smaller
+from pathjax.bsdfs.bsdf import BSDF
+from pathjax.bsdfs.ior import IOR
+from pathjax.core.math import larger, smaller
 from pathjax.core.types import BSDFSample
+from pathjax.description.elements import nearest
+from pathjax.kinds import Choice, Internal, Number, Table
 
-
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class DielectricTable:
-    int_ior: jax.Array  # (R,) on the side that the normal points away from
-    ext_ior: jax.Array  # (R,)
-    # (R,) int_ior / ext_ior by which rows choose between reflection and refraction while their own IOR varies, for
-    # derivatives; 0: this row chooses by its own. None, outside derivatives: all do.
-    choose_by: jax.Array | None = None
-    fresnel: str = field(default="exact", metadata={"static": True})  # of REFLECTANCES
-
-
-SMOOTH, DELTA, TRANSMISSIVE, SIDED, BRANCHES, MOVES_PATHS = False, True, True, True, True, True
 REFLECTANCES = {"exact": fresnel.dielectric, "schlick": fresnel.schlick}
 # Least probability of either branch where the choice is by another IOR: with one that vanishes as Fresnel's terms do,
 # derivatives near the critical angle have infinite variance; with a constant it grows as a logarithm.
 MIN_BRANCH = 0.1
 
 
-def sample(table: DielectricTable, row, uv, wi, u, other: bool = False) -> BSDFSample:
-    """Reflect with probability R, else refract; by the probabilities of `choose_by` where a row has it.
+@dataclass(frozen=True)
+class IndexOfRefraction(Number):
+    """A positive number, or in files the name of a material."""
 
-    other: what would not have been drawn, of pdf 0 where it cannot be. For both, pdf * weight is the share of light.
+    bounds: tuple[float, float] = (float(np.finfo(np.float32).tiny), np.inf)
 
-    wi may lie on either side: wi.z < 0 comes from inside. Radiance is scaled by 1/eta^2 on refraction, eta being the
-    IOR of the far side over that of the near side (PBRT 4 ed., 9.5.2).
-    """
-    ratio = at(table.int_ior, row) / at(table.ext_ior, row)
-    outside = wi[2] > 0
-    eta = jnp.where(outside, ratio, 1 / ratio)
-    cos_i = smaller(jnp.abs(wi[2]), jnp.ones_like(eta))
-    reflectance = REFLECTANCES[table.fresnel]
-    r, cos_t = reflectance(cos_i, eta)
-    p, choose_by = r, None
-    if table.choose_by is not None:
-        choose_by = at(table.choose_by, row)
-        p = jnp.where(choose_by > 0, _frozen_choice(reflectance, cos_i, choose_by, outside, r), r)
-    p = lax.stop_gradient(p)
-    reflect = u[0] >= p if other else u[0] < p
-    inv = 1 / eta
-    refracted = jnp.stack([-wi[0] * inv, -wi[1] * inv, jnp.where(outside, -cos_t, cos_t)])
-    wo = jnp.where(reflect, jnp.stack([-wi[0], -wi[1], wi[2]]), refracted)
-    weight = jnp.where(reflect, 1, inv * inv)
-    pdf = larger(jnp.where(reflect, p, 1 - p), jnp.zeros_like(p))
-    if choose_by is not None:
-        share = jnp.where(reflect, r, 1 - r) / jnp.where(pdf > 0, pdf, 1)
-        weight = weight * jnp.where(choose_by > 0, share, 1)
-    return BSDFSample(wo, jnp.broadcast_to(weight, (3,)), pdf, jnp.bool_(True), weight)
+    def read(self, loader, fields, name, owner):
+        value = fields.float_or_name(name, self.default)
+        if isinstance(value, str):
+            if value.lower() not in IOR:
+                use = f"use a number or one of {', '.join(IOR)}{nearest(value, IOR)}"
+                raise fields.error(name, f'cannot be "{value[:40]}"; {use}')
+            value = IOR[value.lower()]
+        return value
+
+
+class Dielectric(BSDF):
+    """Smooth interface; `int_ior` lies on the side that the normal points away from."""
+
+    int_ior = IndexOfRefraction(IOR["bk7"], moves_paths=True)
+    ext_ior = IndexOfRefraction(IOR["air"], moves_paths=True)
+    # int_ior / ext_ior by which rows choose between reflection and refraction while their own IOR varies, for
+    # derivatives; 0: this row chooses by its own. None, outside derivatives: all do.
+    choose_by = Internal()
+    fresnel = Choice("exact", options=tuple(REFLECTANCES))
+    delta = transmissive = sided = branches = True
+
+    @classmethod
+    def read(cls, loader, fields, name):
+        for lobe in ("specular_reflectance", "specular_transmittance"):
+            if (fields.color(lobe, np.ones(3)) != 1).any():
+                raise fields.error(lobe, "must be 1")
+        return super().read(loader, fields, name)
+
+    @staticmethod
+    def sample(p, wi, u, other: bool = False) -> BSDFSample:
+        """Reflect with probability R, else refract; by the probabilities of `choose_by` where a row has it.
+
+        other: what would not have been drawn, of pdf 0 where it cannot be. For both, pdf * weight is the share of
+            light.
+
+        wi may lie on either side: wi.z < 0 comes from inside. Radiance is scaled by 1/eta^2 on refraction, eta being
+        the IOR of the far side over that of the near side (PBRT 4 ed., 9.5.2).
+        """
+        ratio = p.int_ior / p.ext_ior
+        outside = wi[2] > 0
+        eta = jnp.where(outside, ratio, 1 / ratio)
+        cos_i = smaller(jnp.abs(wi[2]), jnp.ones_like(eta))
+        reflectance = REFLECTANCES[p.fresnel]
+        r, cos_t = reflectance(cos_i, eta)
+        chance, choose_by = r, p.choose_by
+        if choose_by is not None:
+            chance = jnp.where(choose_by > 0, _frozen_choice(reflectance, cos_i, choose_by, outside, r), r)
+        chance = lax.stop_gradient(chance)
+        reflect = u[0] >= chance if other else u[0] < chance
+        inv = 1 / eta
+        refracted = jnp.stack([-wi[0] * inv, -wi[1] * inv, jnp.where(outside, -cos_t, cos_t)])
+        wo = jnp.where(reflect, jnp.stack([-wi[0], -wi[1], wi[2]]), refracted)
+        weight = jnp.where(reflect, 1, inv * inv)
+        pdf = larger(jnp.where(reflect, chance, 1 - chance), jnp.zeros_like(chance))
+        if choose_by is not None:
+            share = jnp.where(reflect, r, 1 - r) / jnp.where(pdf > 0, pdf, 1)
+            weight = weight * jnp.where(choose_by > 0, share, 1)
+        return BSDFSample(wo, jnp.broadcast_to(weight, (3,)), pdf, jnp.bool_(True), weight)
 
 
 def _frozen_choice(reflectance, cos_i, ratio, outside, r):
     """Probability of reflection by another IOR `ratio`, for a path whose own reflectance is r: 1 where that is."""
     p, _ = reflectance(cos_i, jnp.where(outside, ratio, 1 / ratio))
     return jnp.where(r < 1, jnp.clip(p, MIN_BRANCH, 1 - MIN_BRANCH), 1)
+
+
+# ---- for derivatives: what moves paths is the relative IOR, int_ior / ext_ior --------------------------------------
+
+
+def place(materials) -> int:
+    """Which of the tables is that of the dielectrics."""
+    return next(i for i, table in enumerate(materials.tables) if table.kind is Dielectric)
+
+
+def iors(table: Table):
+    """(R,) int_ior, (R,) ext_ior."""
+    return table.column("int_ior").values, table.column("ext_ior").values
+
+
+def relative_ior(table: Table):
+    """(R,) int_ior / ext_ior."""
+    inside, outside = iors(table)
+    return inside / outside
+
+
+def with_relative_ior(table: Table, ratio, rows):
+    """The table with `ratio`, (R,) or (), in some rows, (R,) bool."""
+    inside, outside = iors(table)
+    return table.with_column("int_ior", jnp.where(rows, ratio * outside, inside))
+
+
+def choosing_by(table: Table, ratio, rows):
+    """The table of which some rows, (R,) bool, choose their branches as if their relative IOR were `ratio` (R,)."""
+    return table.with_column("choose_by", jnp.where(rows, ratio, 0))
+
+
+def relative_ior_by(table: Table, row, field: str):
+    """Derivative () of the relative IOR of a row in one of its parameters."""
+    inside, outside = (values[row] for values in iors(table))
+    return 1 / outside if field == "int_ior" else -inside / (outside * outside)
+
+
+def ior_at(table: Table, row, field: str, ratio):
+    """Value () of one of the parameters of a row at which its relative IOR is `ratio`."""
+    inside, outside = (values[row] for values in iors(table))
+    return ratio * outside if field == "int_ior" else inside / ratio

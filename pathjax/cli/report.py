@@ -39,7 +39,7 @@ def facts(scene: Scene) -> dict:
         "primitives": {_kind(part): _primitives(part) for part in parts},
         "compiled": {
             "shapes": [_kind(part) + (" (tree)" if part.tree else " (flat)") for part in parts],
-            "bsdfs": [type(table).__name__.removesuffix("Table").lower() for table in scene.materials.tables],
+            "bsdfs": [bsdfs.name(scene.materials, kind) for kind in range(len(scene.materials.tables))],
             "light sampling": bsdfs.occurs(scene.materials, "smooth") and scene.emitters.area is not None,
             "emitters": [name for name in ("area", "constant") if getattr(scene.emitters, name) is not None],
             "dtype": str(scene.camera.origin.dtype),

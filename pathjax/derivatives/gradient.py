@@ -21,21 +21,21 @@ import jax.numpy as jnp
 from jax import lax
 
 from pathjax import emitters
-from pathjax.bsdfs import DielectricTable
+from pathjax.bsdfs import dielectric
 from pathjax.compile.runtime import native_map, usual_promotion
 from pathjax.core import sampler
 from pathjax.core.math import at
 from pathjax.derivatives import ior_step
 from pathjax.derivatives.ior_step import dielectrics
-from pathjax.description.parameter import Parameter
 from pathjax.errors import InputError
 from pathjax.integrators import path, pixel
+from pathjax.kinds import Table
+from pathjax.kinds.parameter import Parameter
 from pathjax.scene import parameters as named
 from pathjax.scene.scene import Scene
 from pathjax.sensors import film
 
 METHODS = ("difference", "attached")
-IOR_FIELDS = ("int_ior", "ext_ior")
 # One path in so many is also traced at twice the step, to estimate the bias.
 RICHARDSON_EVERY = 16
 # Dielectrics of one kernel: the four shifts of each are bits of an int32.
@@ -168,7 +168,7 @@ def _refuse(primals, tangents):
 
 
 def is_glass(parameter: Parameter) -> bool:
-    return parameter.path[-1] in IOR_FIELDS
+    return parameter.moves_paths
 
 
 def ior_at(scene: Scene, name: str, ratio):
@@ -176,10 +176,10 @@ def ior_at(scene: Scene, name: str, ratio):
     parameter = named.find(scene, name)
     _, table = dielectrics(scene)
     row = parameter.index[0]
-    return ratio * table.ext_ior[row] if parameter.path[-1] == "int_ior" else table.int_ior[row] / ratio
+    return dielectric.ior_at(table, row, parameter.field, ratio)
 
 
-def _with_dielectrics(scene: Scene, table: DielectricTable) -> Scene:
+def _with_dielectrics(scene: Scene, table: Table) -> Scene:
     return named.put(scene, ("materials", "tables", dielectrics(scene)[0]), table)
 
 
@@ -187,16 +187,15 @@ def _choosing_by(scene: Scene, rows) -> Scene:
     """The scene whose dielectrics of some rows choose their branches by the IOR that they have now."""
     _, table = dielectrics(scene)
     rows = jnp.asarray(rows, jnp.int32)
-    ratio = lax.stop_gradient(table.int_ior / table.ext_ior)
-    return _with_dielectrics(scene, replace(table, choose_by=jnp.zeros_like(ratio).at[rows].set(ratio[rows])))
+    ratio = lax.stop_gradient(dielectric.relative_ior(table))
+    return _with_dielectrics(scene, table.with_column("choose_by", jnp.zeros_like(ratio).at[rows].set(ratio[rows])))
 
 
 def ratio_by(scene: Scene, parameter: Parameter):
     """Derivative of the relative IOR int_ior / ext_ior in one of the two."""
     _, table = dielectrics(scene)
     row = parameter.index[0]
-    inside, outside = table.int_ior[row], table.ext_ior[row]
-    return 1 / outside if parameter.path[-1] == "int_ior" else -inside / (outside * outside)
+    return dielectric.relative_ior_by(table, row, parameter.field)
 
 
 @partial(jax.jit, static_argnames=("wanted", "strategy", "form", "devices"))
@@ -275,7 +274,7 @@ def _mean_and_differences(work, scene, choice, steps, rows, strategy, derivative
     pixel_number, first_sample, spp, seed = work
     stream = sampler.pixel_stream(seed, pixel_number)
     _, table = dielectrics(scene)
-    ratios = table.int_ior / table.ext_ior
+    ratios = dielectric.relative_ior(table)
     rows = jnp.asarray(rows, jnp.int32)
     shifts = jnp.arange(4 * len(rows), dtype=jnp.int32)  # dielectric 4 k, 4 k + 1, ...
 
@@ -287,8 +286,8 @@ def _mean_and_differences(work, scene, choice, steps, rows, strategy, derivative
         row, h = at(rows, place), at(steps, place)
         moves = (jnp.arange(len(ratios)) == row) & (shift >= 0)
         change = jnp.where(k % 2 == 0, h, -h) * (1 + k // 2).astype(h.dtype)
-        int_ior = jnp.where(moves, (ratios + change) * table.ext_ior, table.int_ior)
-        return _with_dielectrics(scene, replace(table, int_ior=int_ior, choose_by=jnp.where(moves, ratios, 0)))
+        moved = dielectric.with_relative_ior(table, ratios + change, moves)
+        return _with_dielectrics(scene, dielectric.choosing_by(moved, ratios, moves))
 
     def twice(number):
         return sampler.combine(stream, number) % RICHARDSON_EVERY == 0

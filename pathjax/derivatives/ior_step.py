@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
 from pathjax import bsdfs
-from pathjax.bsdfs import DielectricTable
+from pathjax.bsdfs import dielectric
 from pathjax.compile.runtime import native_map
 from pathjax.core.math import at, dot, safe_divide, spawn_ray, to_world
 from pathjax.integrators import path
+from pathjax.kinds import Table
 from pathjax.scene import parameters as named
 from pathjax.scene.scene import Scene
 from pathjax.sensors import film
@@ -28,9 +27,9 @@ MIN_STEP, MAX_STEP = 2e-4, 0.03
 _PILOTS, _PILOT_DEPTH = 1024, 12
 
 
-def dielectrics(scene: Scene) -> tuple[int, DielectricTable]:
+def dielectrics(scene: Scene) -> tuple[int, Table]:
     """Place of the table of dielectrics, and the table."""
-    return next((i, t) for i, t in enumerate(scene.materials.tables) if isinstance(t, DielectricTable))
+    return next((i, t) for i, t in enumerate(scene.materials.tables) if t.kind.branches)
 
 
 def steps(scene, rows, step):
@@ -40,7 +39,7 @@ def steps(scene, rows, step):
     if not rows:
         return jnp.zeros((0,), dtype)
     rows = jnp.asarray(rows, jnp.int32)
-    ratio = (table.int_ior / table.ext_ior)[rows]
+    ratio = dielectric.relative_ior(table)[rows]
     if step is not None:
         # Twice the step must leave a positive IOR.
         return jnp.minimum(jnp.asarray(step, dtype), 0.4 * ratio)
@@ -67,14 +66,14 @@ def _median(x):
 def _motion(pixel_number, scene, row):
     """Pixels per unit of relative IOR of one dielectric, for the ray through the middle of a pixel; NaN: not seen."""
     place, table = dielectrics(scene)
-    ratio = at(table.int_ior, row) / at(table.ext_ior, row)
+    ratio = at(dielectric.relative_ior(table), row)
     half = jnp.full((2,), 0.5, ratio.dtype)
     middle, _ = film.sample_position(scene.film, pixel_number, half)
     size = jnp.array([scene.film.width, scene.film.height], ratio.dtype)
 
     def seen(x):
         """Where the ray ends that refracts wherever it can: a point, or a direction if it hits nothing."""
-        varied = replace(table, int_ior=table.int_ior.at[row].set(x[0] * at(table.ext_ior, row)))
+        varied = dielectric.with_relative_ior(table, x[0], jnp.arange(len(dielectric.relative_ior(table))) == row)
         materials = named.put(scene.materials, ("tables", place), varied)
         ray = sample_ray(scene.camera, middle + x[1:] / size, half)
 

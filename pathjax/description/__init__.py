@@ -10,63 +10,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-
-@dataclass(frozen=True)
-class Bitmap:
-    """An image over uv in [0, 1)^2; v points downwards, as Mitsuba's loader has it."""
-
-    name: str
-    texels: np.ndarray  # (H, W, 3) float32, linear
-    to_uv: np.ndarray  # (3, 3) float64, applied to (u, v, 1) before the look-up
-    interpolation: str = "bilinear"  # or "nearest"
-    wrap: str = "repeat"  # or "mirror", "clamp"
-
-
-@dataclass(frozen=True)
-class Checkerboard:
-    name: str
-    color0: np.ndarray  # (3,)
-    color1: np.ndarray  # (3,)
-    to_uv: np.ndarray  # (3, 3) float64
-
-
-@dataclass(frozen=True)
-class Diffuse:
-    """One-sided Lambertian reflector."""
-
-    name: str
-    reflectance: np.ndarray | Bitmap | Checkerboard  # (3,) where it is no texture
-
-
-@dataclass(frozen=True)
-class Dielectric:
-    """Smooth interface; `int_ior` lies on the side that the normal points away from."""
-
-    name: str
-    int_ior: float
-    ext_ior: float
-
-
-@dataclass(frozen=True)
-class Conductor:
-    """Smooth one-sided mirror. `eta` and `k` None: an ideal mirror (Mitsuba's material "none")."""
-
-    name: str
-    eta: np.ndarray | None  # (3,)
-    k: np.ndarray | None  # (3,)
-    specular_reflectance: np.ndarray  # (3,)
-
-
-@dataclass(frozen=True)
-class Twosided:
-    """A reflector for each side; the same object twice where the file names one."""
-
-    name: str
-    front: Diffuse | Conductor
-    back: Diffuse | Conductor
-
-
-BSDF = Diffuse | Dielectric | Conductor | Twosided
+from pathjax.kinds import Instance
 
 
 @dataclass(frozen=True)
@@ -112,7 +56,7 @@ class Mesh:
 class Shape:
     name: str
     geometry: Sphere | Rectangle | Disk | Cube | Mesh
-    bsdf: BSDF
+    bsdf: Instance
     radiance: np.ndarray | None  # (3,) of its area emitter; None: it has none
     emitter_name: str  # "" where it has no emitter
     flip_normals: bool

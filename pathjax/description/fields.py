@@ -61,15 +61,18 @@ class Fields:
     def has(self, name: str) -> bool:
         return name in self._values
 
-    def float(self, name: str, default=REQUIRED, *, above=-math.inf, at_least=-math.inf, below=math.inf):
-        """A finite number, above < number < below and number >= at_least; `default` if it is not given."""
+    def float(
+        self, name: str, default=REQUIRED, *, above=-math.inf, at_least=-math.inf, below=math.inf, at_most=math.inf
+    ):
+        """A finite number, above < number < below and at_least <= number <= at_most; `default` if it is not given."""
         element = self._take(name, default, ("float", "integer"))
         if element is None:
             return default
         value = number(element, _value(element))
-        if not (above < value < below and value >= at_least):
+        if not (above < value < below and at_least <= value <= at_most):
             low = f"above {above:g}" if above > -math.inf else f"at least {at_least:g}"
             high = f" and below {below:g}" if below < math.inf else ""
+            high = f" and at most {at_most:g}" if at_most < math.inf else high
             raise self.error(name, f"must be {low}{high}, is {value:g}")
         return value
 

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pathjax.description.parameter import Parameter
+from pathjax.kinds.parameter import Parameter
 
 # Starts this close to a bound, relative to the range, are moved inwards: beyond, unbounded coordinates hardly move.
 _EDGE = 1e-3

@@ -13,9 +13,9 @@ from jax import lax
 from pathjax import emitters
 from pathjax.compile.runtime import native_map, usual_promotion
 from pathjax.derivatives import gradient
-from pathjax.description.parameter import Parameter
 from pathjax.errors import InputError
 from pathjax.integrators import path, pixel, terms
+from pathjax.kinds.parameter import Parameter
 from pathjax.rendering import tail
 from pathjax.rendering.progressive import estimate, replicates
 from pathjax.rendering.render import differentiable, differentiated

@@ -12,9 +12,9 @@ from jax.custom_derivatives import SymbolicZero
 from pathjax import bsdfs, emitters
 from pathjax.compile.runtime import native_map, usual_promotion
 from pathjax.derivatives import gradient
-from pathjax.description.parameter import Parameter
 from pathjax.errors import InputError
 from pathjax.integrators import path, pixel
+from pathjax.kinds.parameter import Parameter
 from pathjax.scene import parameters as named
 from pathjax.scene.scene import Scene
 from pathjax.sensors import film

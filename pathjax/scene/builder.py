@@ -6,11 +6,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from pathjax import bsdfs
 from pathjax import description as desc
-from pathjax.bsdfs.builder import build_materials
 from pathjax.compile.runtime import usual_promotion
-from pathjax.description.parameter import Parameter
 from pathjax.errors import InputError
+from pathjax.kinds import Parameters
 from pathjax.scene.metadata import About
 from pathjax.scene.scene import UNBOUNDED, Scene
 from pathjax.sensors import camera, film
@@ -33,9 +33,9 @@ def build(description: desc.Description, dtype=jnp.float32, split_rule: str = "s
         raise InputError(f"scene.build: split_rule {split_rule!r} is unknown; use one of {', '.join(RULES)}")
     if jax.dtypes.canonicalize_dtype(dtype) != np.dtype(dtype):
         raise InputError('scene.build: float64 is off in JAX; call jax.config.update("jax_enable_x64", True) first')
-    parameters: dict[str, Parameter] = {}
-    materials = build_materials(description, dtype, parameters)
-    geometry, emitters, trees = build_shapes(description, dtype, parameters, split_rule)
+    parameters = Parameters()
+    materials = bsdfs.build([shape.bsdf for shape in description.shapes], dtype, ("materials",), parameters)
+    geometry, emitters, trees = build_shapes(description, dtype, parameters.known, split_rule)
     integrator = description.integrator
     max_depth = UNBOUNDED if integrator.max_depth < 0 else integrator.max_depth
     scene = Scene(
@@ -47,7 +47,7 @@ def build(description: desc.Description, dtype=jnp.float32, split_rule: str = "s
         np.int32(max_depth),
         np.int32(integrator.rr_depth),
         integrator.hide_emitters,
-        About(description, parameters, trees),
+        About(description, parameters.known, parameters.refused, trees),
     )
     # NumPy up to here: `jnp.asarray` compiles a program for every shape that it meets.
     return jax.device_put(scene)

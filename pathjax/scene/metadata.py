@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from pathjax import description as desc
-from pathjax.description.parameter import Parameter
+from pathjax.kinds.parameter import Parameter
 from pathjax.shapes.accel.build import Tree
 
 
@@ -17,6 +17,7 @@ class About:
 
     description: desc.Description
     parameters: Mapping[str, Parameter]
+    refused: Mapping[str, str]  # what is none, though it looks like one, and why
     trees: Mapping[str, Tree]  # kind of shape -> its hierarchy, for reports
     # Of tables that `with_parameters` made: a weak reference to the array, and which of its parameters are traced.
     # Tables hold many parameters, and a derivative costs time for each that may be wanted.

@@ -11,10 +11,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pathjax import description as desc
 from pathjax.compile.runtime import usual_promotion
-from pathjax.description.parameter import Parameter
 from pathjax.errors import InputError
+from pathjax.kinds.parameter import Parameter
 from pathjax.scene.metadata import About
 from pathjax.scene.scene import Scene
 
@@ -68,26 +67,10 @@ def find(scene: Scene, name: str) -> Parameter:
     known = about(scene)
     if name in known.parameters:
         return known.parameters[name]
-    if name in _textured(known.description):
-        raise InputError(
-            f"{name} is a bitmap, whose texels are too many for one derivative each; name a constant reflectance or "
-            "the colours of a checkerboard"
-        )
+    if name in known.refused:
+        raise InputError(known.refused[name])
     near = difflib.get_close_matches(name, known.parameters, n=3, cutoff=0.3)
     raise InputError(f"no parameter is named {name!r}; " + _offer(near, known.parameters))
-
-
-def _textured(description: desc.Description) -> set[str]:
-    """Names that parameters would have but for a bitmap in their place."""
-    sides = []
-    for shape in description.shapes:
-        bsdf = shape.bsdf
-        sides += [bsdf.front, bsdf.back] if isinstance(bsdf, desc.Twosided) else [bsdf]
-    return {
-        f"{bsdf.name}.reflectance"
-        for bsdf in sides
-        if isinstance(bsdf, desc.Diffuse) and isinstance(bsdf.reflectance, desc.Bitmap)
-    }
 
 
 def _offer(near, parameters):

@@ -7,10 +7,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from pathjax import description as desc
-from pathjax.description.parameter import Parameter
 from pathjax.emitters import Emitters
 from pathjax.emitters.area import AreaLights
 from pathjax.emitters.constant import Constant
+from pathjax.kinds.parameter import Parameter
 from pathjax.shapes import box, coincident, planar, sphere, triangle
 from pathjax.shapes.accel import leaves
 from pathjax.shapes.box import Boxes
@@ -151,7 +151,7 @@ def _part_coincident(kinds, shapes, dtype):
     names, points, faces = [], [], []
     for name in ("rectangle", "disk", "triangle"):
         for part, number in zip(kinds[name].parts, kinds[name].numbers, strict=True):
-            glass, lamp = isinstance(shapes[number].bsdf, desc.Dielectric), shapes[number].radiance is not None
+            glass, lamp = shapes[number].bsdf.kind.sided, shapes[number].radiance is not None
             if name == "triangle":
                 faces.append(coincident.faces_of_mesh(part[0], glass, lamp, dtype))
             else:

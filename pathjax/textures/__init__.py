@@ -1,1 +1,63 @@
-"""What varies over a surface."""
+"""What varies over a surface: a file a kind, the table of kinds, and the look-up among those that a scene holds.
+
+A texture is a subclass of `Texture`, which says what it must offer. Where a bsdf declares a `Color` or a `Number`, a
+scene file may put a texture; of kinds that the scene does not hold nothing is compiled.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import jax
+from jax import lax
+
+from pathjax.kinds import Instance, Parameters, Row, Table, ordered
+from pathjax.kinds import register as register_kind
+from pathjax.textures.bitmap import Bitmap
+from pathjax.textures.checkerboard import Checkerboard
+from pathjax.textures.texture import Texture
+
+__all__ = ["KINDS", "Bitmap", "Checkerboard", "Texture", "Textures", "build", "register"]
+
+# By the name that scene files give them.
+KINDS: dict[str, type[Texture]] = {
+    "bitmap": Bitmap,
+    "checkerboard": Checkerboard,
+}
+
+
+def register(name: str):
+    """A decorator that makes a subclass of `Texture` a kind, which scene files name by `name`."""
+    return register_kind(KINDS, Texture, name, "textures")
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Textures:
+    tables: tuple[Table, ...]  # one for each kind present
+
+    def look_up(self, code, surface):
+        """Colour (3,) of a texture at a point of a surface. code: (2,) int32 kind and row, or below 0: any."""
+
+        def of(table):
+            def look_up():
+                p = Row(table, lax.max(code[1], 0))
+                m, uv = p.to_uv, surface.uv
+                if m is not None:
+                    uv = m[:, 0] * uv[0] + m[:, 1] * uv[1] + m[:, 2]
+                return table.kind.look_up(p, uv, surface)
+
+            return look_up
+
+        if len(self.tables) == 1:
+            return of(self.tables[0])()
+        return lax.switch(lax.max(code[0], 0), [of(table) for table in self.tables])
+
+
+def build(instances: list[Instance], dtype, path: tuple, parameters: Parameters):
+    """Textures, or None where there are none, and the code (kind, row) of each instance."""
+    tables, codes = [], {}
+    for kind, rows in ordered(instances, KINDS).items():
+        codes |= {each: (len(tables), row) for row, each in enumerate(rows)}
+        tables.append(kind.build(rows, dtype, (*path, "tables", len(tables)), parameters, None))
+    return (Textures(tuple(tables)) if tables else None), codes

@@ -1,77 +1,41 @@
-"""Colours over uv: bitmaps and checkerboards."""
+"""What a texture is."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from abc import abstractmethod
 
-import jax
-import jax.numpy as jnp
-from jax import lax
+import numpy as np
 
-from pathjax.core.math import at
-
-WRAPS = ("repeat", "mirror", "clamp")
+from pathjax.kinds import Color, Instance, Kind, Row, Transform2
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class Bitmaps:
-    texels: jax.Array  # (N, 3), all images one after another, rows from the top
-    first: jax.Array  # (T,) int32 first texel
-    size: jax.Array  # (T, 2) int32 height, width; 0: this row is no bitmap
-    nearest: jax.Array  # (T,) bool, no interpolation
-    wrap: jax.Array  # (T,) int32 into WRAPS
+class Texture(Kind):
+    """A kind of texture: colours over a surface.
 
+    A class declares its parameters, and says in `look_up` what colour a point has. It may be differentiated in its
+    parameters and in uv.
+    """
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class Textures:
-    to_uv: jax.Array  # (T, 2, 3) applied to (u, v, 1)
-    colors: jax.Array | None  # (T, 2, 3) color0, color1; None: no checkerboard in the scene
-    bitmaps: Bitmaps | None  # None: no bitmap in the scene
+    to_uv = Transform2()
 
+    @staticmethod
+    @abstractmethod
+    def look_up(p: Row, uv, surface):
+        """Colour (3,) at a point.
 
-def lookup(table: Textures, row, uv):
-    """(3,) colour of texture `row` at uv (2,)."""
-    m = at(table.to_uv, row)
-    uv = m[:, 0] * uv[0] + m[:, 1] * uv[1] + m[:, 2]
+        Args:
+            p: the parameters of one texture.
+            uv: (2,) of the surface, with `to_uv` applied.
+            surface: `core.types.Surface`.
+        """
 
-    def checkerboard():
-        odd = uv - jnp.floor(uv) > 0.5
-        colors = at(table.colors, row)
-        return jnp.where(odd[0] == odd[1], colors[0], colors[1])
+    @classmethod
+    def span(cls, texture: Instance) -> tuple[float, float]:
+        """Least and largest value that the texture has; NaN where it holds one."""
+        colors = [texture.values[key] for key, declared in cls.declared.items() if isinstance(declared, Color)]
+        return float(np.min(colors)), float(np.max(colors))
 
-    if table.bitmaps is None:
-        return checkerboard()
-    if table.colors is None:
-        return _bitmap(table.bitmaps, row, uv)
-    is_bitmap = at(table.bitmaps.size, row, 0) > 0
-    return lax.cond(is_bitmap, lambda: _bitmap(table.bitmaps, row, uv), checkerboard)
-
-
-def _bitmap(table: Bitmaps, row, uv):
-    size = at(table.size, row)
-    vu = jnp.stack([uv[1], uv[0]])
-    nearest = at(table.nearest, row)
-    # Texel centres lie at (i + 1/2) / size.
-    place = vu * size - jnp.where(nearest, 0, jnp.asarray(0.5, uv.dtype))
-    low = jnp.floor(place)
-    fraction = jnp.where(nearest, 0, place - low)
-    low = low.astype(jnp.int32)
-
-    def texel(i, j):
-        y, x = _wrapped(low + jnp.array([i, j], jnp.int32), size, at(table.wrap, row))
-        return at(table.texels, at(table.first, row) + y * size[1] + x)
-
-    top = texel(0, 0) * (1 - fraction[1]) + texel(0, 1) * fraction[1]
-    bottom = texel(1, 0) * (1 - fraction[1]) + texel(1, 1) * fraction[1]
-    return top * (1 - fraction[0]) + bottom * fraction[0]
-
-
-def _wrapped(index, size, wrap):
-    size = jnp.maximum(size, 1)
-    repeat = jnp.mod(index, size)
-    twice = jnp.mod(index, 2 * size)
-    mirror = jnp.where(twice < size, twice, 2 * size - 1 - twice)
-    clamp = jnp.clip(index, 0, size - 1)
-    return jnp.where(wrap == 0, repeat, jnp.where(wrap == 1, mirror, clamp))
+    @classmethod
+    def refused(cls, name: str) -> dict[str, str]:
+        """What is no parameter because this texture stands in its place, and why."""
+        return {name: f"{name} is a texture; its parameters have names of their own (`pathjax info` lists them)"}

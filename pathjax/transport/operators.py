@@ -23,7 +23,7 @@ import lineax as lx
 import numpy as np
 from jax import lax
 
-from pathjax.bsdfs import DiffuseTable
+from pathjax import bsdfs
 from pathjax.compile.runtime import usual_promotion
 from pathjax.core.math import safe_divide
 from pathjax.errors import InputError
@@ -299,10 +299,10 @@ def _albedos_and_lights(scene: Scene, patches: Patches):
         # A row of black at the end stands for none.
         return jnp.concatenate([table, jnp.zeros_like(table[:1])])[rows]
 
-    reflectance = next((t.reflectance for t in scene.materials.tables if isinstance(t, DiffuseTable)), None)
+    _, column = bsdfs.reflectances(scene.materials) or (None, None)
     lights = scene.emitters.area
     black = jnp.zeros((patches.count, 3), patches.area.dtype)
-    albedo = black if reflectance is None else of(reflectance, patches.row)
+    albedo = black if column is None else of(column.values, patches.row)
     return albedo, black if lights is None else of(lights.radiance, patches.emitter)
 
 

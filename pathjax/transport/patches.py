@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pathjax.bsdfs import DiffuseTable
+from pathjax import bsdfs
 from pathjax.core.math import at, cos_sin_turns, cross, dot, normalize, rescale, safe_atan2, safe_sqrt
 from pathjax.core.warp import square_to_triangle
 from pathjax.errors import InputError
@@ -101,20 +101,19 @@ def _name(scene, shape) -> str:
 def _diffuse_rows(scene: Scene, faceted) -> np.ndarray:
     """(S, 2) row of the reflectance of the front and the back of each shape; -1: reflects nothing."""
     materials = scene.materials
+    diffuse, column = bsdfs.reflectances(materials) or (None, None)
     sides = np.asarray(materials.sides)
     rows = np.full(sides.shape[:2], -1)
     for shape, side in np.ndindex(rows.shape):
         kind, row = sides[shape, side]
         if kind < 0:
             continue
-        table = materials.tables[kind]
-        if not isinstance(table, DiffuseTable):
-            kind = type(table).__name__.removesuffix("Table").lower()
+        if kind != diffuse:
             raise InputError(
-                f"{_name(scene, shape)} is a {kind}; patches send the same radiance in all directions, so all must be "
-                "diffuse. Use pathjax.render"
+                f"{_name(scene, shape)} is a {bsdfs.name(materials, kind)}; patches send the same radiance in all "
+                "directions, so all must be diffuse. Use pathjax.render"
             )
-        if table.texture is not None and table.texture[row] >= 0:
+        if column.texture is not None and column.texture[row, 0] >= 0:
             raise InputError(
                 f"{_name(scene, shape)} has a texture; a patch has one reflectance. Give it a constant one"
             )

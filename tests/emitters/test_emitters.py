@@ -11,6 +11,7 @@ from scipy import stats
 
 from pathjax import description as desc
 from pathjax import emitters
+from pathjax.bsdfs import Diffuse
 from pathjax.core.types import Ray
 from pathjax.scene import build
 from pathjax.scene.parameters import with_parameters
@@ -22,7 +23,7 @@ N = 60_000
 # Relative error that float32 leaves in a density seen at an angle.
 ROUNDING = 2e-5
 RADIANCE = np.array([3.0, 2.0, 1.0])
-GREY = desc.Diffuse("grey", np.full(3, 0.5))
+GREY = Diffuse.instance("grey")
 
 
 def affine(linear, translation):

@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pathjax.description.parameter import Parameter
 from pathjax.inverse.coordinates import Coordinates
+from pathjax.kinds.parameter import Parameter
 
 COLOR = Parameter(("a",), (0,), (3,), (0, 1))
 IOR = Parameter(("b",), (0,), (), (1e-38, np.inf))

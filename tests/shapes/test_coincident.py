@@ -8,6 +8,7 @@ import pytest
 
 import pathjax as pj
 from pathjax import description as desc
+from pathjax.bsdfs import Diffuse
 from pathjax.scene import build
 
 SKY = '<emitter type="constant"><rgb name="radiance" value="1"/></emitter>'
@@ -183,7 +184,7 @@ def test_a_slab_that_is_a_mesh_has_both_its_faces_at_a_millionth_of_its_size(mak
 
 
 def tables_of(*geometries, dtype=np.float32):
-    grey = desc.Diffuse("grey", np.full(3, 0.5))
+    grey = Diffuse.instance("grey")
     shapes = tuple(desc.Shape(f"s{i}", g, grey, None, "", False) for i, g in enumerate(geometries))
     camera, film = desc.Camera(np.eye(4), 45.0), desc.Film(2, 2, (0, 0, 2, 2))
     description = desc.Description("test", camera, film, desc.Integrator(), 1, "independent", shapes, None)

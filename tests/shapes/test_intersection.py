@@ -7,6 +7,7 @@ import pytest
 import trimesh
 
 from pathjax import description as desc
+from pathjax.bsdfs import Diffuse
 from pathjax.compile.runtime import native_map
 from pathjax.core.math import normalize, spawn_ray
 from pathjax.core.types import Ray
@@ -14,7 +15,7 @@ from pathjax.scene import build
 from pathjax.shapes import geometry, triangle
 from pathjax.shapes.accel.leaves import numbers_of, rows_of
 
-GREY = desc.Diffuse("grey", np.full(3, 0.5))
+GREY = Diffuse.instance("grey")
 # Rounding of a coordinate relative to the distances it was computed from; hits closer to a border may go either way.
 ROUNDING = 2e-6
 

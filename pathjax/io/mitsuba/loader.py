@@ -10,18 +10,19 @@ import math
 import re
 from collections import defaultdict
 from collections.abc import Iterator
+from functools import partial
 from itertools import count
 from pathlib import Path
 
 import numpy as np
 
+from pathjax import bsdfs, textures
 from pathjax import description as d
 from pathjax.description.elements import Document, Element, nearest
 from pathjax.description.fields import Fields
-from pathjax.images import image
 from pathjax.io import mesh
-from pathjax.io.mitsuba.spectra import IOR
 from pathjax.io.mitsuba.xml_reader import read
+from pathjax.kinds import Instance
 
 MAX_PIXELS = 10**9
 
@@ -45,6 +46,7 @@ class _Loader:
         self.notes: list[str] = []
         self.names = set(document.ids)
         self.counts: defaultdict[str, Iterator[int]] = defaultdict(count)
+        self.making: set[Element] = set()
         self.made: dict[Element, object] = {}  # an element that is referenced twice is one object
 
     def description(self, file: str) -> d.Description:
@@ -78,7 +80,7 @@ class _Loader:
         for element in scene["bsdf"] + scene["texture"]:
             if element not in self.made:
                 self.notes.append(f"{element.file}:{element.line}: {element} is used by nothing")
-                self.shared(element, BSDFS if element.tag == "bsdf" else TEXTURES, element.id or element.tag)
+                self.shared(element, element.id or element.tag)
         return d.Description(
             file, camera, film, integrator, spp, sampler, shapes, background, background_name, tuple(self.notes)
         )
@@ -94,11 +96,28 @@ class _Loader:
         fields.finish()
         return made
 
-    def shared(self, element: Element, table: dict, name: str):
+    def shared(self, element: Element, name: str) -> Instance:
         """A bsdf or texture; the same object each time. `name` is for one without an id."""
+        if element in self.making:
+            raise element.error(f"{element} cannot stand inside itself")
         if element not in self.made:
-            self.made[element] = self.make(element, table, element.id or name)
+            self.making.add(element)
+            kinds = bsdfs.KINDS if element.tag == "bsdf" else textures.KINDS
+            handlers = {type_name: partial(_instance, kind) for type_name, kind in kinds.items()}
+            self.made[element] = self.make(element, handlers, element.id or name)
+            self.making.remove(element)
         return self.made[element]
+
+    bsdf = shared
+
+    def texture(self, fields: Fields, parameter: str, owner: str) -> Instance | None:
+        """The texture that sets a parameter; None where it is something else. `owner` names one without an id."""
+        element = fields.texture(parameter)
+        return None if element is None else self.shared(element, owner)
+
+    def find(self, fields: Fields, parameter: str) -> Path:
+        """The file that a parameter names."""
+        return self.document.find(fields.string(parameter), fields.where(parameter))
 
     def numbered(self, name: str) -> str:
         """`name0`, `name1`, ...; the next that is free."""
@@ -110,6 +129,10 @@ class _Loader:
             return self.numbered(name)
         self.names.add(name)
         return name
+
+
+def _instance(kind: type, loader: _Loader, fields: Fields, name: str) -> Instance:
+    return kind.read(loader, fields, name)
 
 
 def _shape(loader: _Loader, fields: Fields, name: str) -> d.Shape | None:
@@ -126,10 +149,11 @@ def _shape(loader: _Loader, fields: Fields, name: str) -> d.Shape | None:
     inherited = fields.element.id or None
     nested = fields.objects("bsdf")
     if nested:
-        bsdf = loader.shared(nested[0], BSDFS, nested[0].id or inherited or loader.numbered("bsdf"))
+        bsdf = loader.bsdf(nested[0], nested[0].id or inherited or loader.numbered("bsdf"))
     else:
         # Mitsuba: a light that is given no bsdf reflects nothing
-        bsdf = d.Diffuse(inherited or loader.numbered("bsdf"), np.full(3, 0.5 if radiance is None else 0.0))
+        grey = 0.5 if radiance is None else 0.0
+        bsdf = bsdfs.Diffuse.instance(inherited or loader.numbered("bsdf"), reflectance=grey)
     if isinstance(geometry, d.Mesh) and not len(geometry.faces):
         place, light = f"{fields.element.file}:{fields.element.line}", "" if radiance is None else ", and its light too"
         loader.notes.append(f"{place}: {fields.element} is left out, as no triangle has an area{light}")
@@ -168,7 +192,7 @@ def _cube(loader: _Loader, fields: Fields) -> d.Cube:
 
 def _mesh(loader: _Loader, fields: Fields) -> d.Mesh:
     made, notes = mesh.load(
-        loader.document.find(fields.string("filename"), fields.where("filename")),
+        loader.find(fields, "filename"),
         fields.type,
         fields.transform("to_world"),
         face_normals=fields.boolean("face_normals", False),
@@ -176,86 +200,6 @@ def _mesh(loader: _Loader, fields: Fields) -> d.Mesh:
     )
     loader.notes += notes
     return made
-
-
-# Bsdfs: (loader, fields, name) -> bsdf.
-
-
-def _diffuse(loader: _Loader, fields: Fields, name: str) -> d.Diffuse:
-    texture = fields.texture("reflectance")
-    if texture is None:
-        return d.Diffuse(name, fields.color("reflectance", np.full(3, 0.5), at_most=1))
-    reflectance = loader.shared(texture, TEXTURES, name)
-    if isinstance(reflectance, d.Bitmap) and not (0 <= reflectance.texels.min() <= reflectance.texels.max() <= 1):
-        raise fields.error("reflectance", "is an image with values below 0, above 1 or NaN")
-    return d.Diffuse(name, reflectance)
-
-
-def _dielectric(loader: _Loader, fields: Fields, name: str) -> d.Dielectric:
-    for lobe in ("specular_reflectance", "specular_transmittance"):
-        if (fields.color(lobe, np.ones(3)) != 1).any():
-            raise fields.error(lobe, "must be 1")
-    return d.Dielectric(name, _ior(fields, "int_ior", "bk7"), _ior(fields, "ext_ior", "air"))
-
-
-def _ior(fields: Fields, parameter: str, default: str) -> float:
-    value = fields.float_or_name(parameter, default)
-    if isinstance(value, str):
-        if value.lower() not in IOR:
-            use = f"use a number or one of {', '.join(IOR)}{nearest(value, IOR)}"
-            raise fields.error(parameter, f'cannot be "{value[:40]}"; {use}')
-        value = IOR[value.lower()]
-    return value
-
-
-def _conductor(loader: _Loader, fields: Fields, name: str) -> d.Conductor:
-    material = fields.string("material", "none")
-    if material != "none":
-        raise fields.error("material", f'cannot be "{material[:40]}"; give eta and k as <rgb>')
-    eta, k = fields.color("eta", None), fields.color("k", None)
-    if eta is not None or k is not None:  # Mitsuba's "none" is eta 0, k 1: a perfect mirror
-        eta, k = np.zeros(3) if eta is None else eta, np.ones(3) if k is None else k
-    return d.Conductor(name, eta, k, fields.color("specular_reflectance", np.ones(3), at_most=1))
-
-
-def _twosided(loader: _Loader, fields: Fields, name: str) -> d.Twosided:
-    nested = fields.objects("bsdf", limit=2)
-    if not nested:
-        raise fields.element.error(f"{fields.element} needs a <bsdf> inside")
-    names = [name] if len(nested) == 1 else [loader.unique(f"{name}_{side}") for side in ("front", "back")]
-    sides = []
-    for element, side_name in zip(nested, names, strict=True):
-        if element.attributes.get("type") not in ("diffuse", "conductor"):
-            raise element.error(f"{element} cannot stand inside {fields.element}; use diffuse or conductor")
-        sides.append(loader.shared(element, BSDFS, side_name))
-    return d.Twosided(name, sides[0], sides[-1])
-
-
-# Textures: (loader, fields, name) -> texture.
-
-
-def _bitmap(loader: _Loader, fields: Fields, name: str) -> d.Bitmap:
-    path = loader.document.find(fields.string("filename"), fields.where("filename"))
-    return d.Bitmap(
-        name,
-        image.read_rgb(path, raw=fields.boolean("raw", False)),
-        _to_uv(fields),
-        fields.string("filter_type", "bilinear", choices=("bilinear", "nearest")),
-        fields.string("wrap_mode", "repeat", choices=("repeat", "mirror", "clamp")),
-    )
-
-
-def _checkerboard(loader: _Loader, fields: Fields, name: str) -> d.Checkerboard:
-    color0 = fields.color("color0", np.full(3, 0.4), at_most=1)
-    return d.Checkerboard(name, color0, fields.color("color1", np.full(3, 0.2), at_most=1), _to_uv(fields))
-
-
-def _to_uv(fields: Fields) -> np.ndarray:
-    """(3, 3): x and y of the transform."""
-    matrix = fields.transform("to_uv")
-    if not np.allclose([matrix[:2, 2], matrix[2, :2]], 0, atol=1e-9):
-        raise fields.error("to_uv", "mixes z with u and v; shifts are <translate>, or the last column of 16 numbers")
-    return matrix[np.ix_([0, 1, 3], [0, 1, 3])]
 
 
 # Emitters: (loader, fields) -> (3,) radiance.
@@ -365,8 +309,6 @@ def _sampler(loader: _Loader, fields: Fields) -> int:
 
 TOP_LEVEL = ("integrator", "sensor", "emitter", "bsdf", "texture", "shape")
 SHAPES = {"sphere": _sphere, "rectangle": _rectangle, "disk": _disk, "cube": _cube} | dict.fromkeys(mesh.READERS, _mesh)
-BSDFS = {"diffuse": _diffuse, "dielectric": _dielectric, "conductor": _conductor, "twosided": _twosided}
-TEXTURES = {"bitmap": _bitmap, "checkerboard": _checkerboard}
 AREA_LIGHTS = {"area": _emitter}
 BACKGROUNDS = {"constant": _emitter}
 INTEGRATORS = {"path": _path, "direct": _direct}

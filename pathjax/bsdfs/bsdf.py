@@ -1,0 +1,56 @@
+"""What a bsdf is."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from typing import ClassVar
+
+import jax.numpy as jnp
+
+from pathjax.core.types import BSDFSample
+from pathjax.kinds import Instance, Kind, Row
+
+
+class BSDF(Kind):
+    """A kind of bsdf: how one side of a surface, or an interface between two media, scatters light.
+
+    A class declares its parameters and what it is capable of, samples directions, and, where it is smooth, evaluates
+    them. Directions are unit and local: z is the shading normal, `wi` points to the previous vertex. Reflectors see
+    `wi.z > 0`, whatever side they are on; what is `sided` keeps the frame, whose normal tells inside from outside.
+    """
+
+    # What is compiled, for whom, depends on these.
+    smooth: ClassVar[bool] = False  # has a density, so that light sampling makes sense: `evaluate` is its own
+    delta: ClassVar[bool] = False  # may draw from a Dirac lobe
+    transmissive: ClassVar[bool] = False  # light may pass, and its radiance scale with the IOR
+    sided: ClassVar[bool] = False  # lies between two media: one bsdf for both sides of a shape
+    branches: ClassVar[bool] = False  # has just two lobes, of which `sample(..., other=True)` gives what is not drawn
+    lobes: ClassVar[bool] = False  # takes a third random number, to choose its lobe
+
+    @staticmethod
+    @abstractmethod
+    def sample(p: Row, wi, u) -> BSDFSample:
+        """Draw `wo`, in proportion to f |cos theta_o| as well as may be.
+
+        Args:
+            p: the parameters of one bsdf at the point.
+            wi: (3,).
+            u: (2,) uniform in [0, 1); (3,) where the kind has `lobes`.
+        Returns:
+            The sample; `weight` is f |cos theta_o| / pdf per channel. Where nothing can be drawn pdf and weight are 0,
+            never NaN.
+        Gradient: `wo` and `pdf` are detached by the caller; the weight carries the derivative in the parameters.
+        """
+
+    @staticmethod
+    def evaluate(p: Row, wi, wo):
+        """f |cos theta_o| (3,) and the density () [1/sr] with which `sample` draws `wo`, without Dirac lobes.
+
+        Both are 0 where `sample` never goes. wi.z > 0 is the caller's to see to, unless the kind is `sided`.
+        """
+        return jnp.zeros_like(wi), jnp.zeros_like(wi[2])
+
+    @classmethod
+    def sides(cls, instance: Instance) -> tuple[Instance | None, Instance | None]:
+        """What the front and the back of a surface of this bsdf are; None absorbs."""
+        return instance, instance if cls.sided else None

@@ -1,0 +1,37 @@
+"""What bsdfs and textures have in common: a kind is a class that declares its parameters, and a table holds their rows.
+
+    class Phong(BSDF):
+        reflectance = Color(0.5)
+        exponent = Number(30.0, bounds=(0, math.inf))
+
+        @staticmethod
+        def evaluate(p, wi, wo): ...  # p.reflectance (3,), p.exponent (): of this row, at this point of the surface
+
+From the declaration follow what a scene file may say and what it leaves to defaults, the table of all rows, textures in
+the place of constants, and the parameters by name that can be set, differentiated and fitted.
+"""
+
+from pathjax.kinds.declared import Choice, Color, Declared, Internal, Number, PerRow, Shared, Transform2
+from pathjax.kinds.kind import Instance, Kind, ordered, register
+from pathjax.kinds.parameter import Parameter, Parameters
+from pathjax.kinds.table import Column, Row, Table
+
+__all__ = [
+    "Choice",
+    "Color",
+    "Column",
+    "Declared",
+    "Instance",
+    "Internal",
+    "Kind",
+    "Number",
+    "Parameter",
+    "Parameters",
+    "PerRow",
+    "Row",
+    "Shared",
+    "Table",
+    "Transform2",
+    "ordered",
+    "register",
+]

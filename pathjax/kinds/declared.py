@@ -1,0 +1,106 @@
+"""What a kind may declare as a class attribute: the types of its parameters."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Declared:
+    """A column of a kind's table. In a scene file it is named like the attribute."""
+
+    default: object = None  # None: rows may lack it, and the attribute of a `Row` is None where all do
+    bounds: tuple[float, float] = (-math.inf, math.inf)
+    textured: bool = False  # a texture may stand in its place
+    moves_paths: bool = False
+    shape = ()  # of a row's value
+    dtype = None  # of the scene's reals, unless it is given
+    listed = False  # is a parameter of the scene, to be set, differentiated and fitted
+    shared = False  # one array for all rows
+
+    def read(self, loader, fields, name: str, owner: str):
+        """The value that a file gives it, or the default. Raises InputError where it is out of range."""
+        return self.default
+
+    def standing_in(self):
+        """The value of rows that lack it, which nothing reads, or which means the same."""
+        return np.zeros(self.shape)
+
+
+@dataclass(frozen=True)
+class Number(Declared):
+    """A number, whose texture is the luminance of its colours."""
+
+    listed = True
+
+    def read(self, loader, fields, name, owner):
+        if self.textured and (made := loader.texture(fields, name, owner)) is not None:
+            return _in_range(fields, name, made, self.bounds)
+        low, high = self.bounds
+        return fields.float(name, self.default, at_least=low, at_most=high)
+
+
+@dataclass(frozen=True)
+class Color(Declared):
+    """Linear RGB; a default of one number stands for three."""
+
+    bounds: tuple[float, float] = (0, 1)
+    textured: bool = True
+    radiance: bool = False  # of a light: uniform spectra have another colour, see `Fields.color`
+    shape = (3,)
+    listed = True
+
+    def read(self, loader, fields, name, owner):
+        if self.textured and (made := loader.texture(fields, name, owner)) is not None:
+            return _in_range(fields, name, made, self.bounds)
+        default = None if self.default is None else np.broadcast_to(np.asarray(self.default, float), 3)
+        return fields.color(name, default, at_most=self.bounds[1], radiance=self.radiance)
+
+
+@dataclass(frozen=True)
+class Transform2(Declared):
+    """(2, 3) applied to (u, v, 1); in files a transform of x and y."""
+
+    shape = (2, 3)
+
+    def read(self, loader, fields, name, owner):
+        matrix = fields.transform(name)
+        if not np.allclose([matrix[:2, 2], matrix[2, :2]], 0, atol=1e-9):
+            raise fields.error(name, "mixes z with u and v; shifts are <translate>, or the last column of 16 numbers")
+        return matrix[np.ix_([0, 1], [0, 1, 3])]
+
+    def standing_in(self):
+        return np.eye(2, 3)
+
+
+@dataclass(frozen=True)
+class Choice(Declared):
+    """One of some words, the same for all rows: part of the program, not of its data."""
+
+    options: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Internal(Declared):
+    """A number that no file gives: the package sets it, for derivatives."""
+
+
+class PerRow(Declared):
+    """What a kind's own builder fills for each row: `shape` and `dtype` are its own."""
+
+
+class Shared(Declared):
+    """An array that belongs to all rows together, filled by the kind's own builder."""
+
+    shared = True
+
+
+def _in_range(fields, name, texture, bounds):
+    low, high = texture.kind.span(texture)
+    if not bounds[0] <= low <= high <= bounds[1]:  # also where one is NaN
+        above = f", above {bounds[1]:g}" if bounds[1] < math.inf else ""
+        raise fields.error(name, f"is an image with values below {bounds[0]:g}{above} or NaN")
+    return texture

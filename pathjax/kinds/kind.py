@@ -1,0 +1,122 @@
+"""A kind, and one object of it as a file describes it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from pathjax.errors import InputError
+from pathjax.kinds.declared import Choice, Declared
+from pathjax.kinds.parameter import Parameter, Parameters
+from pathjax.kinds.table import Column, Table
+
+
+@dataclass(frozen=True, eq=False)
+class Instance:
+    """One object of a kind: what a file says of it. Compared by identity: objects that are shared are one row."""
+
+    kind: type[Kind]
+    name: str  # id that its parameters are looked up by
+    values: Mapping[str, object]  # of declared parameters: numbers, arrays, instances of textures, None
+
+
+class Kind:
+    """A class whose attributes of type `Declared` are the parameters of a kind."""
+
+    declared: ClassVar[Mapping[str, Declared]] = {}
+
+    def __init_subclass__(cls):
+        own = {name: value for name, value in vars(cls).items() if isinstance(value, Declared)}
+        cls.declared = {**cls.declared, **own}
+        cls._places = {name: place for place, name in enumerate(cls.declared)}
+
+    @classmethod
+    def place(cls, name: str) -> int:
+        """Of a declared parameter among the columns of the table."""
+        return cls._places[name]
+
+    @classmethod
+    def read(cls, loader, fields, name: str) -> Instance:
+        """What a scene file says of one object of this kind.
+
+        Args:
+            loader: of scene files: `loader.texture(fields, parameter, owner)`, `loader.notes`, ...
+            fields: `description.fields.Fields`, which refuses what nobody asks for.
+            name: by which its parameters are known.
+        """
+        return Instance(cls, name, {key: d.read(loader, fields, key, name) for key, d in cls.declared.items()})
+
+    @classmethod
+    def instance(cls, name: str = "", **values) -> Instance:
+        """An object of this kind without a file; what is not given has its default."""
+        unknown = sorted(values.keys() - cls.declared.keys())
+        if unknown:
+            raise InputError(f"{cls.__name__} has no parameter {unknown[0]!r}; it has {', '.join(cls.declared)}")
+        return Instance(cls, name, {key: values.get(key, d.default) for key, d in cls.declared.items()})
+
+    @classmethod
+    def build(cls, instances: list[Instance], dtype, path: tuple, parameters: Parameters, code: Callable) -> Table:
+        """The table of all rows.
+
+        Args:
+            path: where the table will be in the scene; parameters: to enter those of the rows.
+            code: instance of a texture -> its kind and row among the textures.
+        """
+        columns = []
+        for key, declared in cls.declared.items():
+            values = [instance.values[key] for instance in instances]
+            textured = [isinstance(value, Instance) for value in values]
+            if all(value is None for value in values) or isinstance(declared, Choice):
+                columns.append(None)
+                continue
+            for row, value in enumerate(values):
+                name = f"{instances[row].name}.{key}"
+                if textured[row]:
+                    parameters.refused.update(value.kind.refused(name))
+                elif value is not None and declared.listed:
+                    place = (*path, "columns", len(columns), "values")
+                    parameters.known[name] = Parameter(
+                        place, (row,), declared.shape, declared.bounds, key, declared.moves_paths
+                    )
+            constants = [
+                np.broadcast_to(declared.standing_in() if missing or value is None else value, declared.shape)
+                for value, missing in zip(values, textured, strict=True)
+            ]
+            codes = None
+            if any(textured):
+                codes = np.array([code(v) if t else (-1, 0) for v, t in zip(values, textured, strict=True)], np.int32)
+            columns.append(Column(np.asarray(np.stack(constants), declared.dtype or dtype), codes))
+        choices = tuple((key, d.default) for key, d in cls.declared.items() if isinstance(d, Choice))
+        return Table(tuple(columns), cls, choices)
+
+
+def ordered(instances, kinds: Mapping[str, type]) -> dict[type, list[Instance]]:
+    """Instances by kind. Scenes of the same kinds share a structure, whatever the order of the file."""
+    known = list(kinds.values())
+    by_kind: dict[type, list[Instance]] = {}
+    for each in sorted(instances, key=lambda each: known.index(each.kind) if each.kind in known else len(known)):
+        by_kind.setdefault(each.kind, []).append(each)
+    return by_kind
+
+
+def register(kinds: dict[str, type], base: type, name: str, room: str):
+    """A decorator that enters a class among the kinds of a room, for scene files to name it.
+
+    Raises:
+        InputError: the name is taken by another class, or the class is not of the room's kind.
+    """
+
+    def enter(cls):
+        if not (isinstance(cls, type) and issubclass(cls, base)):
+            raise InputError(f"{room}.register({name!r}): {cls!r} must be a class derived from {room}.{base.__name__}")
+        known = kinds.get(name)
+        # A cell of a notebook that runs again defines its class again.
+        if known and (known.__module__, known.__qualname__) != (cls.__module__, cls.__qualname__):
+            raise InputError(f"{room}.register({name!r}): the name is taken by {known.__qualname__}; use another one")
+        kinds[name] = cls
+        return cls
+
+    return enter

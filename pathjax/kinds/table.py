@@ -1,0 +1,68 @@
+"""Tables of the rows of a kind, and one row as the physics sees it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import jax
+from jax import lax
+
+from pathjax.core.math import at, luminance
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Column:
+    values: jax.Array  # (R, *shape); of a row with a texture: not read
+    texture: jax.Array | None = None  # (R, 2) int32 kind, -1 for none, and row of the texture; None: no row has one
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Table:
+    """All rows of one kind."""
+
+    columns: tuple[Column | None, ...]  # one for each declared parameter; None: no row has it
+    kind: type = field(metadata={"static": True})
+    choices: tuple[tuple[str, str], ...] = field(default=(), metadata={"static": True})
+
+    def column(self, name: str) -> Column | None:
+        return self.columns[self.kind.place(name)]
+
+    def with_column(self, name: str, values) -> Table:
+        """The table with other values (R, *shape) of a parameter, or None."""
+        columns = list(self.columns)
+        old = columns[self.kind.place(name)]
+        texture = None if old is None else old.texture
+        columns[self.kind.place(name)] = None if values is None else Column(values, texture)
+        return Table(tuple(columns), self.kind, self.choices)
+
+    def with_choice(self, name: str, value: str) -> Table:
+        return Table(self.columns, self.kind, tuple((dict(self.choices) | {name: value}).items()))
+
+
+class Row:
+    """Parameters of one row as attributes, looked up as they are asked for: at a point of the surface if textured."""
+
+    def __init__(self, table: Table, row, surface=None, textures=None):
+        """row: () int32. surface, textures: what `look_up` of a texture takes; not used where no row has one."""
+        self._table, self._row, self._surface, self._textures = table, row, surface, textures
+
+    def __getattr__(self, name: str):
+        kind = self._table.kind
+        if name not in kind.declared:
+            raise AttributeError(f"{kind.__name__} declares no {name}; it has {', '.join(kind.declared)}")
+        if name in dict(self._table.choices):
+            return dict(self._table.choices)[name]
+        column = self._table.column(name)
+        if column is None or kind.declared[name].shared:
+            return column and column.values
+        constant = at(column.values, self._row)
+        if column.texture is None:
+            return constant
+
+        def look_up():
+            color = self._textures.look_up(at(column.texture, self._row), self._surface)
+            return color if constant.shape else luminance(color)
+
+        return lax.cond(at(column.texture, self._row, 0) >= 0, look_up, lambda: constant)

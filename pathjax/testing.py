@@ -1,0 +1,255 @@
+"""Checks that every kind must pass: the package's own in its tests, and those that users register, in theirs.
+
+    from pathjax import testing
+    testing.check_bsdf(OrenNayar, sigma=0.3)
+
+A check that fails raises AssertionError, which says what was found and what should have been. Those that are
+statistical fail for a right bsdf with the probability `false_alarm` each; seeds are fixed.
+"""
+
+from __future__ import annotations
+
+import math
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from pathjax import bsdfs
+from pathjax.bsdfs import BSDF, Materials
+from pathjax.kinds import Parameters
+
+# Directions that see grazing and steep light, and an azimuth that no symmetry favours.
+COSINES = (1.0, 0.7, 0.2)
+# Cells of the sphere, in the cosine and in the azimuth, and points of the midpoint rule in each of either.
+CELLS, POINTS = (20, 24), 12
+# Cells in which fewer samples are expected are put together: the chi-square distribution is an approximation.
+LEAST_EXPECTED = 10
+# Of differences: float32 keeps five digits of them, and what they err by is of second order.
+STEP = 0.01
+
+
+def check_bsdf(kind: type[BSDF], samples: int = 200_000, false_alarm: float = 1e-4, reciprocal: bool = True, **values):
+    """All checks that apply to a kind of bsdf, of constant parameters.
+
+    Args:
+        samples: of each statistical check.
+        reciprocal: whether its values should be the same both ways.
+        values: of its parameters, the others have their defaults.
+    Raises:
+        AssertionError: a check failed.
+    """
+    materials = material(kind, **values)
+    for wi in directions(kind):
+        check_range(materials, wi)
+        check_weights(materials, wi)
+        check_furnace(materials, wi, samples, false_alarm)
+        check_detached(materials, wi)
+        if kind.smooth:
+            check_chi_square(materials, wi, samples, false_alarm)
+        if kind.smooth and not kind.delta:
+            check_derivatives(materials, wi, samples, false_alarm)
+    if kind.smooth and reciprocal:
+        check_reciprocity(materials)
+
+
+def material(kind: type[BSDF], **values) -> Materials:
+    """Materials of one shape, both sides of which have a bsdf of this kind; parameters that are not given default."""
+    return jax.device_put(bsdfs.build([kind.instance("it", **values)], np.float32, (), Parameters()))
+
+
+def directions(kind: type[BSDF]) -> list[np.ndarray]:
+    """Unit wi (3,), from both sides where the kind tells them apart."""
+    cosines = [*COSINES, *(-z for z in COSINES)] if kind.sided else COSINES
+    return [np.array([math.sqrt(1 - z * z) * 0.6, math.sqrt(1 - z * z) * 0.8, z], np.float32) for z in cosines]
+
+
+@jax.jit
+def sample(materials: Materials, wi, u):
+    """Samples of the first bsdf for each of u (N, 2 or 3)."""
+    return jax.vmap(lambda u: bsdfs.sample(materials, jnp.int32(0), jnp.int32(0), _SURFACE, wi, u))(u)
+
+
+@jax.jit
+def evaluate(materials: Materials, wi, wo):
+    """Values (N, 3) and densities (N,) of the first bsdf for each of wo (N, 3)."""
+    return jax.vmap(lambda wo: bsdfs.evaluate(materials, jnp.int32(0), jnp.int32(0), _SURFACE, wi, wo))(wo)
+
+
+@jax.jit
+def sample_tangent(materials: Materials, tangent: Materials, wi, u):
+    """How the samples change with the materials."""
+    return jax.jvp(lambda m: sample(m, wi, u), (materials,), (tangent,))[1]
+
+
+_SURFACE = SimpleNamespace(uv=jnp.full(2, 0.5, jnp.float32))
+
+
+def random_numbers(materials: Materials, count: int, seed: int):
+    """(count, 2), or (count, 3) where the bsdf asks for them, in [0, 1)."""
+    width = 3 if bsdfs.occurs(materials, "lobes") else 2
+    return jnp.asarray(np.random.default_rng(seed).integers(0, 1 << 24, (count, width)) * 2.0**-24, jnp.float32)
+
+
+def check_range(materials: Materials, wi):
+    """Values, densities, weights and their derivatives are finite and not negative, at the ends of all ranges too."""
+    ends = np.array([0, 2**-24, 0.5, 1 - 2**-24], np.float32)
+    width = random_numbers(materials, 1, 0).shape[1]
+    u = jnp.asarray(np.stack(np.meshgrid(*[ends] * width), -1).reshape(-1, width))
+    grazing = [np.array([math.sqrt(1 - z * z), 0, z], np.float32) for z in (1e-4, 1e-7, 0.0)]
+    for each in [wi, *grazing]:
+        drawn = sample(materials, each, u)
+        f, pdf = evaluate(materials, each, drawn.wo)
+        for what, x in {"weight": drawn.weight, "pdf": drawn.pdf, "value": f, "density": pdf}.items():
+            assert np.isfinite(x).all() and (np.asarray(x) >= 0).all(), f"a {what} of wi = {each} is {np.min(x)}"
+        assert np.isfinite(drawn.wo).all(), f"a direction of wi = {each} is not finite"
+        for name, tangent in _tangents(materials).items():
+            moved = sample_tangent(materials, tangent, each, u).weight
+            assert np.isfinite(moved).all(), f"the derivative of a weight in {name} is not finite at wi = {each}"
+
+
+def check_weights(materials: Materials, wi):
+    """Sampled directions are unit, and weight times density is the value that `evaluate` has there."""
+    drawn = sample(materials, wi, random_numbers(materials, 2000, 1))
+    length = np.linalg.norm(drawn.wo, axis=1)
+    assert np.allclose(length, 1, atol=1e-5), f"a direction has length {length[np.argmax(abs(length - 1))]}"
+    kept = ~np.asarray(drawn.delta) & (np.asarray(drawn.pdf) > 0)
+    f, pdf = evaluate(materials, wi, drawn.wo)
+    # Rounding of a cosine near 0 is all that the two may differ by.
+    for what, ours, theirs in (("pdf", drawn.pdf, pdf), ("weight * pdf", drawn.weight * drawn.pdf[:, None], f)):
+        ours, theirs = np.asarray(ours)[kept], np.asarray(theirs)[kept]
+        wrong = ~np.isclose(ours, theirs, rtol=1e-3, atol=1e-5)
+        assert not wrong.any(), f"{what} is {ours[wrong][0]} of a sample, {theirs[wrong][0]} of evaluate, at wi = {wi}"
+
+
+def check_chi_square(materials: Materials, wi, samples: int, false_alarm: float, seed: int = 2):
+    """Directions are drawn with the density that `evaluate` states (chi-square over cells of the sphere)."""
+    from scipy import stats
+
+    drawn = sample(materials, wi, random_numbers(materials, samples, seed))
+    kept = ~np.asarray(drawn.delta) & (np.asarray(drawn.pdf) > 0)
+    wo = np.asarray(drawn.wo, np.float64)[kept]
+    azimuth = np.arctan2(wo[:, 1], wo[:, 0]) / (2 * np.pi) % 1
+    seen = np.histogram2d(wo[:, 2], azimuth, CELLS, [[-1, 1], [0, 1]])[0].ravel()
+    _, pdf = _on_sphere(materials, wi)
+    expected = samples * pdf.reshape(CELLS[0], POINTS, CELLS[1], POINTS).sum((1, 3)).ravel()
+    # What is not drawn from the density (Dirac lobes, no sample) is a cell of its own.
+    seen, expected = np.append(seen, samples - seen.sum()), np.append(expected, samples - expected.sum())
+    few = expected < LEAST_EXPECTED
+    seen = np.append(seen[~few], seen[few].sum())
+    expected = np.append(expected[~few], max(expected[few].sum(), 0))
+    used = expected > LEAST_EXPECTED
+    statistic = ((seen - expected)[used] ** 2 / expected[used]).sum()
+    chance = stats.chi2.sf(statistic, used.sum() - 1)
+    assert chance > false_alarm, f"samples do not follow the stated density at wi = {wi}: p = {chance:.2g}"
+    assert seen[~used].sum() <= 5 * LEAST_EXPECTED, f"{seen[~used].sum():.0f} samples lie where the density is 0"
+
+
+def check_furnace(materials: Materials, wi, samples: int, false_alarm: float, seed: int = 3):
+    """No more light leaves than arrives, and as much as `evaluate` says where it has all of it."""
+    kind = materials.tables[0].kind
+    drawn = sample(materials, wi, random_numbers(materials, samples, seed))
+    # What crosses an interface is measured in power, which does not know the IOR.
+    share = np.asarray(drawn.weight, np.float64) / np.asarray(drawn.passive, np.float64)[:, None]
+    mean, error = share.mean(0), share.std(0) / math.sqrt(samples)
+    limit = _sigmas(false_alarm) * error + 1e-5  # rounding of weights of 1
+    assert (mean <= 1 + limit).all(), f"{mean.max():.5f} of the light is scattered at wi = {wi}"
+    if kind.smooth and not kind.delta:
+        f, _ = _on_sphere(materials, wi)
+        quadrature = 1e-3 * f.sum(0)  # of the midpoint rule
+        assert (abs(mean - f.sum(0)) <= limit + quadrature).all(), (
+            f"samples scatter {mean} of the light, evaluate {f.sum(0)}, at wi = {wi}"
+        )
+
+
+def check_reciprocity(materials: Materials, seed: int = 4):
+    """f(wi, wo) = f(wo, wi)."""
+    rng = np.random.default_rng(seed)
+    pairs = rng.normal(size=(2, 500, 3))
+    pairs[..., 2] = abs(pairs[..., 2]) + 0.05
+    a, b = jnp.asarray(pairs / np.linalg.norm(pairs, axis=-1, keepdims=True), jnp.float32)
+
+    def f(wi, wo):
+        return bsdfs.evaluate(materials, jnp.int32(0), jnp.int32(0), _SURFACE, wi, wo)[0] / wo[2]
+
+    there, back = (np.asarray(jax.jit(jax.vmap(f))(*pair)) for pair in ((a, b), (b, a)))
+    wrong = ~np.isclose(there, back, rtol=1e-3, atol=1e-6)
+    assert not wrong.any(), f"f is {there[wrong][0]} one way and {back[wrong][0]} the other"
+
+
+def check_detached(materials: Materials, wi):
+    """Directions and densities carry no derivative in parameters: the weights do, for samples drawn at their values."""
+    u = random_numbers(materials, 64, 5)
+    for name, tangent in _tangents(materials, but_moving=True).items():
+        drawn = sample_tangent(materials, tangent, wi, u)
+        for what in ("wo", "pdf"):
+            assert not np.asarray(getattr(drawn, what)).any(), (
+                f"`{what}` has a derivative in {name}; put lax.stop_gradient around what it is made of"
+            )
+
+
+def check_derivatives(materials: Materials, wi, samples: int, false_alarm: float, seed: int = 6):
+    """The mean derivative of the weights is that of the scattered light, by differences of `evaluate`."""
+    u = random_numbers(materials, samples, seed)
+    for name, tangent in _tangents(materials, but_moving=True).items():
+        moved = sample_tangent(materials, tangent, wi, u).weight
+        moved = np.asarray(moved, np.float64)
+
+        def at(change, tangent=tangent):
+            return _on_sphere(jax.tree.map(lambda x, t: _plus(x, change, t), materials, tangent), wi)[0].sum(0)
+
+        ahead, behind = at(STEP), at(-STEP)
+        expected = (ahead - behind) / (2 * STEP)
+        limit = _sigmas(false_alarm) * moved.std(0) / math.sqrt(samples)
+        curvature = abs(at(2 * STEP) - at(-2 * STEP) - 2 * (ahead - behind)) / (4 * STEP) + 2e-3 * abs(expected) + 1e-3
+        assert (abs(moved.mean(0) - expected) <= limit + curvature).all(), (
+            f"the derivative in {name} is {moved.mean(0)} by samples and {expected} by evaluate, at wi = {wi}"
+        )
+
+
+def _on_sphere(materials, wi):
+    """Values (N, 3) and densities (N,) times solid angle, at the midpoints of the cells' parts."""
+    rows, columns = (cells * POINTS for cells in CELLS)
+    z, phi = -1 + (np.arange(rows) + 0.5) * 2 / rows, (np.arange(columns) + 0.5) * 2 * np.pi / columns
+    z, phi = (x.ravel() for x in np.meshgrid(z, phi, indexing="ij"))
+    r = np.sqrt(1 - z * z)
+    wo = jnp.asarray(np.stack([r * np.cos(phi), r * np.sin(phi), z], -1), jnp.float32)
+    f, pdf = evaluate(materials, wi, wo)
+    return np.asarray(f, np.float64) * (4 * np.pi / z.size), np.asarray(pdf, np.float64) * (4 * np.pi / z.size)
+
+
+def _tangents(materials, but_moving=False) -> dict:
+    """By name, a unit change of each parameter: a pytree like the materials."""
+    zero = jax.tree.map(_zero, materials)
+    table = materials.tables[0]
+    found = {}
+    for place, (name, declared) in enumerate(table.kind.declared.items()):
+        column = table.columns[place]
+        if column is None or not declared.listed or (but_moving and declared.moves_paths):
+            continue
+        columns = list(zero.tables[0].columns)
+        columns[place] = type(column)(jnp.ones_like(column.values), _zero_or_none(column.texture))
+        table_tangent = type(table)(tuple(columns), table.kind, table.choices)
+        found[name] = Materials((table_tangent, *zero.tables[1:]), zero.sides, zero.textures)
+    return found
+
+
+def _zero(x):
+    real = jnp.issubdtype(x.dtype, jnp.floating)
+    return jnp.zeros_like(x) if real else np.zeros(x.shape, jax.dtypes.float0)
+
+
+def _zero_or_none(x):
+    return None if x is None else _zero(x)
+
+
+def _plus(x, share, tangent):
+    return x if tangent.dtype == jax.dtypes.float0 else x + share * tangent
+
+
+def _sigmas(false_alarm: float) -> float:
+    """Standard deviations that a normal number exceeds, to either side, with this probability."""
+    from scipy import special
+
+    return float(special.ndtri(1 - false_alarm / 2))

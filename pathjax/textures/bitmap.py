@@ -1,0 +1,85 @@
+"""Images over uv in [0, 1)^2; v points downwards, as Mitsuba's loader has it."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+
+from pathjax.core.math import at
+from pathjax.images.image import read_rgb
+from pathjax.kinds import Column, Instance, PerRow, Shared, Table
+from pathjax.textures.texture import Texture
+
+WRAPS = ("repeat", "mirror", "clamp")
+FILTERS = ("bilinear", "nearest")
+
+
+class Bitmap(Texture):
+    """An image. An `Instance` holds `texels` (H, W, 3), linear, `to_uv`, `interpolation` and `wrap`."""
+
+    texels = Shared()  # (N, 3), all images one after another, rows from the top
+    first = PerRow()  # () int32 first texel
+    size = PerRow()  # (2,) int32 height, width
+    nearest = PerRow()  # () bool, no interpolation
+    wrap = PerRow()  # () int32 into WRAPS
+
+    @classmethod
+    def read(cls, loader, fields, name):
+        texels = read_rgb(loader.find(fields, "filename"), raw=fields.boolean("raw", False))
+        interpolation = fields.string("filter_type", "bilinear", choices=FILTERS)
+        wrap = fields.string("wrap_mode", "repeat", choices=WRAPS)
+        to_uv = cls.to_uv.read(loader, fields, "to_uv", name)
+        return cls.instance(name, texels=texels, to_uv=to_uv, nearest=interpolation == "nearest", wrap=wrap)
+
+    @classmethod
+    def build(cls, instances, dtype, path, parameters, code):
+        def all_of(key):
+            return [instance.values[key] for instance in instances]
+
+        images = all_of("texels")
+        counts = [image.shape[0] * image.shape[1] for image in images]
+        columns = {
+            "to_uv": np.asarray([np.eye(2, 3) if m is None else m for m in all_of("to_uv")], dtype),
+            "texels": np.asarray(np.concatenate([image.reshape(-1, 3) for image in images]), dtype),
+            "first": np.asarray(np.cumsum([0, *counts[:-1]]), np.int32),
+            "size": np.asarray([image.shape[:2] for image in images], np.int32),
+            "nearest": np.asarray([bool(nearest) for nearest in all_of("nearest")]),
+            "wrap": np.asarray([WRAPS.index(wrap or "repeat") for wrap in all_of("wrap")], np.int32),
+        }
+        return Table(tuple(Column(columns[key]) for key in cls.declared), cls)
+
+    @staticmethod
+    def look_up(p, uv, surface):
+        size = p.size
+        vu = jnp.stack([uv[1], uv[0]])
+        # Texel centres lie at (i + 1/2) / size.
+        place = vu * size - jnp.where(p.nearest, 0, jnp.asarray(0.5, uv.dtype))
+        low = jnp.floor(place)
+        fraction = jnp.where(p.nearest, 0, place - low)
+        low = low.astype(jnp.int32)
+
+        def texel(i, j):
+            y, x = _wrapped(low + jnp.array([i, j], jnp.int32), size, p.wrap)
+            return at(p.texels, p.first + y * size[1] + x)
+
+        top = texel(0, 0) * (1 - fraction[1]) + texel(0, 1) * fraction[1]
+        bottom = texel(1, 0) * (1 - fraction[1]) + texel(1, 1) * fraction[1]
+        return top * (1 - fraction[0]) + bottom * fraction[0]
+
+    @classmethod
+    def span(cls, texture: Instance) -> tuple[float, float]:
+        return float(texture.values["texels"].min()), float(texture.values["texels"].max())
+
+    @classmethod
+    def refused(cls, name):
+        why = "whose texels are too many for one derivative each; name a constant or the colours of a checkerboard"
+        return {name: f"{name} is a bitmap, {why}"}
+
+
+def _wrapped(index, size, wrap):
+    size = jnp.maximum(size, 1)
+    repeat = jnp.mod(index, size)
+    twice = jnp.mod(index, 2 * size)
+    mirror = jnp.where(twice < size, twice, 2 * size - 1 - twice)
+    clamp = jnp.clip(index, 0, size - 1)
+    return jnp.where(wrap == 0, repeat, jnp.where(wrap == 1, mirror, clamp))
