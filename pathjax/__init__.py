@@ -10,8 +10,8 @@ from pathjax.rendering.query import closest_hit
 from pathjax.rendering.render import render
 from pathjax.scene.parameters import parameters, with_parameters
 from pathjax.scene.scene import Scene
+from pathjax.version import __version__
 
-__version__ = "0.4.0"
 __all__ = [
     "Bounces",
     "Fit",

@@ -15,6 +15,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
+from pathjax import version
 from pathjax.errors import InputError, InputWarning
 from pathjax.rendering.progressive.passes import State, plan
 from pathjax.rendering.progressive.replicates import one_if_equal
@@ -32,11 +33,9 @@ OF_PIXELS = ("count", "weights")
 
 def identity(scene: Scene, seed: int, strategy: str, adaptive: bool) -> dict[str, str | int]:
     """What a state may be continued with, and nothing else."""
-    from pathjax import __version__
-
     height, width = film.image_shape(scene.film)
     return {
-        "pathjax": __version__,
+        "pathjax": version.__version__,
         "image size": f"{width}x{height}",
         "scene": fingerprint(scene),
         "strategy": strategy,

@@ -179,7 +179,7 @@ def test_checkpoints_of_other_renders(cornell, shipped, made, monkeypatch):
         with pytest.raises(pj.InputError, match=f"run.npz .*{says}"):
             pj.render_until(scene, **({"spp": 4, "seed": 3, "checkpoint": made} | how))
     other = f"pathjax {re.escape(pj.__version__)}, this is pathjax 9.9.9"
-    monkeypatch.setattr(pj, "__version__", "9.9.9")
+    monkeypatch.setattr(checkpoint.version, "__version__", "9.9.9")
     with pytest.raises(pj.InputError, match=other):
         pj.render_until(cornell, spp=4, seed=3, checkpoint=made)
     assert made.read_bytes() == before
