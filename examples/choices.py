@@ -22,7 +22,6 @@ from pathjax import transport
 from pathjax.bench import figures, plot
 from pathjax.bsdfs import FRESNEL
 from pathjax.integrators.path import SAMPLERS, STRATEGIES
-from pathjax.io.mitsuba import loader as mitsuba_xml
 from pathjax.scene import UNBOUNDED, Scene, build
 from pathjax.shapes.accel.build import RULES
 
@@ -43,60 +42,61 @@ class Choice(NamedTuple):
     truth: int = 0  # the choice, by its place, whose converged image is the reference
 
 
-def description(name, res, **parameters):
-    return mitsuba_xml.load(SCENES / f"{name}.xml", res=res, **parameters)
+def load(name, res, **more):
+    return pj.load_scene(SCENES / f"{name}.xml", res=res, **more)
 
 
 def with_tent(scene):
-    return replace(scene, film=replace(scene.film, filter="tent", filter_radius=1.0))
+    description = scene.about.description
+    film = replace(description.film, filter="tent", filter_radius=1.0)
+    return build(replace(description, film=film))
 
 
 def strategy(res):
     """Sample lights, bsdfs, or both (Cornell box)?"""
-    scene = build(description("cornell_box", res))
+    scene = load("cornell_box", res)
     return [Choice(name, scene, {"strategy": name}) for name in STRATEGIES]
 
 
 def roulette(res):
     """From which depth should roulette end paths (Cornell box, max_depth 32)?"""
-    scene = build(description("cornell_box", res, max_depth=32))
+    scene = load("cornell_box", res, max_depth=32)
     depths = {"none": UNBOUNDED, "from depth 2": 2, "from depth 5": 5, "from depth 10": 10}
     return [Choice(label, replace(scene, rr_depth=np.int32(depth))) for label, depth in depths.items()]
 
 
 def fresnel(res):
     """What does Schlick's approximation cost in accuracy (glass ball)?"""
-    scene = build(description("glass_ball", res))
+    scene = load("glass_ball", res)
     return [Choice(name, scene, {"fresnel": name}) for name in FRESNEL]
 
 
 def splitting(res):
     """Does following both branches of the first dielectrics pay (glass and mirror)?"""
-    scene = build(description("glass_and_mirror", res))
+    scene = load("glass_and_mirror", res)
     return [Choice(f"split_depth {depth}", scene, {"split_depth": depth}) for depth in range(4)]
 
 
 def sampler(res):
     """A lattice, independent numbers, or 2 x 2 strata of the pixel (Cornell box, tent filter)?"""
-    scene = build(with_tent(description("cornell_box", res)))
+    scene = with_tent(load("cornell_box", res))
     return [Choice(name, scene, {"sampler": name}) for name in SAMPLERS]
 
 
 def split_rule(res):
     """How should the hierarchy be split (knot of 20,800 triangles)?"""
-    scene = description("mesh", res)
-    return [Choice(rule, build(scene, split_rule=rule)) for rule in RULES]
+    return [Choice(rule, load("mesh", res, split_rule=rule)) for rule in RULES]
 
 
 def reconstruction(res):
     """A box or a tent filter, each against its own truth (Cornell box)?"""
-    scene = description("cornell_box", res)
-    return [Choice("box", build(scene)), Choice("tent", build(with_tent(scene)), truth=1)]
+    scene = load("cornell_box", res)
+    return [Choice("box", scene), Choice("tent", with_tent(scene), truth=1)]
 
 
 def control(res):
     """Does it pay to end paths in a coarse solution, whose own time comes on top (Cornell box, max_depth 32)?"""
-    scene = build(description("cornell_box", res, max_depth=32))
+    scene = load("cornell_box", res, max_depth=32)
     transport.operator(scene, PATCHES).solve()  # compiles
     started = time.perf_counter()
     op = transport.operator(scene, PATCHES)

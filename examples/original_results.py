@@ -18,8 +18,6 @@ from PIL import Image, ImageDraw
 import pathjax as pj
 from pathjax.bench.walk import walk
 from pathjax.io import mesh
-from pathjax.io.mitsuba import loader as mitsuba_xml
-from pathjax.scene import build
 from pathjax.sensors.camera import sample_ray
 from pathjax.shapes.accel.build import RULES
 
@@ -51,7 +49,7 @@ SCENE = """<scene version="3.0.0">
 
 
 def describe(file, output, res):
-    """The scene of a mesh file, written beside the output."""
+    """The scene file of a mesh file, written beside the output, and its parameters."""
     kind = file.suffix.lower().lstrip(".")
     vertices = mesh.load(file, kind, np.eye(4))[0].vertices
     low, high = vertices.min(0), vertices.max(0)
@@ -59,7 +57,7 @@ def describe(file, output, res):
     scene = output.with_suffix(".xml")
     scene.write_text(SCENE)
     numbers = {"shift": ", ".join(map(str, shift)), "scale": 2 / np.linalg.norm(high - low)}
-    return mitsuba_xml.load(scene, mesh=file.resolve(), kind=kind, res=res, **numbers)
+    return scene, {"mesh": file.resolve(), "kind": kind, "res": res, **numbers}
 
 
 def camera_rays(scene, res):
@@ -129,8 +127,8 @@ def main():
     options = parser.parse_args()
 
     box = encode(pj.render(pj.load_scene(SCENES / "triangle_box.xml", res=options.res), options.spp))
-    description = describe(options.mesh, options.output, options.res)
-    scenes = {rule: build(description, split_rule=rule) for rule in RULES}
+    file, parameters = describe(options.mesh, options.output, options.res)
+    scenes = {rule: pj.load_scene(file, parameters=parameters, split_rule=rule) for rule in RULES}
     scene = scenes["sah"]
     if "triangle" not in scene.about.trees:
         parser.error(f"{options.mesh} has too few triangles for a hierarchy; give a mesh of 33 or more")

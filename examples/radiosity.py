@@ -17,13 +17,13 @@ import pathjax as pj
 from pathjax import description, scene, transport
 from pathjax.images import picture
 from pathjax.images.image import write_png
-from pathjax.io.mitsuba import loader as mitsuba_xml
 
 BLOCKS = 32  # across the image: means over blocks hide the pixels' noise and the patches' edges
 
 
 def empty_box(res):
-    full = mitsuba_xml.load(Path(__file__).parents[1] / "scenes" / "cornell_box.xml", res=res, max_depth=-1)
+    box = pj.load_scene(Path(__file__).parents[1] / "scenes" / "cornell_box.xml", res=res, max_depth=-1)
+    full = box.about.description
     walls = tuple(shape for shape in full.shapes if not isinstance(shape.geometry, description.Cube))
     return scene.build(replace(full, shapes=walls))
 

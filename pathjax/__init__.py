@@ -3,6 +3,7 @@
 from pathjax.compile import runtime as _runtime  # noqa: F401  first: sets XLA up before a backend starts
 from pathjax.derivatives.gradient import Jacobian, jacobian
 from pathjax.errors import InputError, InputWarning
+from pathjax.io.load import load_scene
 from pathjax.rendering.aovs import render_aovs
 from pathjax.rendering.bounces import Bounces, render_bounces
 from pathjax.rendering.progressive.until import RenderResult, render_until
@@ -36,25 +37,6 @@ __all__ = [
     "render_until",
     "with_parameters",
 ]
-
-
-def load_scene(file, **parameters) -> Scene:
-    """Load a Mitsuba 3 XML scene; keywords replace the file's `$parameters`.
-
-    Raises:
-        InputError: names the file, the line, what is wrong and what to do.
-    Warns:
-        InputWarning: nothing in the file emits light.
-    """
-    import warnings
-
-    from pathjax import emitters, scene
-    from pathjax.io.mitsuba import loader as mitsuba_xml
-
-    loaded = scene.build(mitsuba_xml.load(file, **parameters))
-    if dark := emitters.darkness(loaded.emitters):
-        warnings.warn(f"{file}: {dark}, so images of it are black", InputWarning, stacklevel=2)
-    return loaded
 
 
 def __getattr__(name):

@@ -60,17 +60,15 @@ def main(file: str) -> None:
 
     before = resident("VmRSS")
     import pathjax
-    from pathjax import scene
-    from pathjax.io.mitsuba import loader as mitsuba_xml
 
     if request["dtype"] == "float64":
         jax.config.update("jax_enable_x64", True)
-    built = scene.build(mitsuba_xml.load(request["scene"], **request["parameters"]), np.dtype(request["dtype"]))
-    jax.block_until_ready(pathjax.render(built, spp=1))
+    scene = pathjax.load_scene(request["scene"], parameters=request["parameters"], dtype=request["dtype"])
+    jax.block_until_ready(pathjax.render(scene, spp=1))
     images, seconds = [], []
     for seed in request["seeds"]:
         started = time.perf_counter()
-        images.append(np.asarray(pathjax.render(built, spp=request["spp"], seed=seed)))
+        images.append(np.asarray(pathjax.render(scene, spp=request["spp"], seed=seed)))
         seconds.append(time.perf_counter() - started)
     peak = resident("VmHWM")
     np.savez(request["output"], images=np.stack(images))

@@ -30,7 +30,7 @@ def run(options, output: Output) -> int:
         raise InputError(f"{folder}: is a file; name a folder")
     defines = dict(options.defines)
     for file in options.scenes:
-        pathjax.load_scene(file, **defines)  # a wrong one is refused before an hour of work on the others
+        pathjax.load_scene(file, parameters=defines)  # a wrong one is refused before an hour of work on the others
     if options.against == "mitsuba":
         _find_mitsuba(options.scenes[0], defines)
     plan = Plan(sorted(set(options.spp)), options.repeat, options.reference_spp, options.against, options.quick, say)

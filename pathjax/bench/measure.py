@@ -53,7 +53,7 @@ class Subject(NamedTuple):
 def measure(file: str, defines: dict[str, str], plan: Plan) -> dict:
     """Everything about one scene, as JSON-ready values."""
     say = plan.say
-    scene = pathjax.load_scene(file, **defines)
+    scene = pathjax.load_scene(file, parameters=defines)
     height, width = film.image_shape(scene.film)
     say(f"{file}: compiling")
     compile_seconds = _compile(scene)

@@ -1,1 +1,1 @@
-"""Files in and out: Mitsuba scene files, meshes, images. Plain NumPy; nothing here knows JAX."""
+"""Scene files and meshes: `load.load_scene` makes a scene of a file; the readers below it are plain NumPy."""

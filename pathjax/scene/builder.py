@@ -30,9 +30,9 @@ def build(description: desc.Description, dtype=jnp.float32, split_rule: str = "s
         InputError: float64 without `jax_enable_x64`; an unknown split_rule.
     """
     if split_rule not in RULES:
-        raise InputError(f"scene.build: split_rule {split_rule!r} is unknown; use one of {', '.join(RULES)}")
+        raise InputError(f"split_rule = {split_rule!r} is unknown; use one of {', '.join(RULES)}")
     if jax.dtypes.canonicalize_dtype(dtype) != np.dtype(dtype):
-        raise InputError('scene.build: float64 is off in JAX; call jax.config.update("jax_enable_x64", True) first')
+        raise InputError('dtype = float64, which is off in JAX; call jax.config.update("jax_enable_x64", True) first')
     parameters = Parameters()
     materials = bsdfs.build([shape.bsdf for shape in description.shapes], dtype, ("materials",), parameters)
     geometry, emitters, trees = build_shapes(description, dtype, parameters.known, split_rule)

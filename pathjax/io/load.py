@@ -1,0 +1,46 @@
+"""From a scene file to a scene."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections.abc import Mapping
+
+import jax.numpy as jnp
+
+from pathjax import emitters
+from pathjax.errors import InputError, InputWarning
+from pathjax.io.mitsuba import loader
+from pathjax.scene.builder import build
+from pathjax.scene.scene import Scene
+
+
+def load_scene(
+    file: str | os.PathLike,
+    *,
+    dtype=jnp.float32,
+    split_rule: str = "sah",
+    parameters: Mapping[str, object] | None = None,
+    **keywords: object,
+) -> Scene:
+    """Load a Mitsuba 3 XML scene.
+
+    Args:
+        file: path of the scene file.
+        dtype: of all real numbers; float64 needs `jax_enable_x64`.
+        split_rule: how hierarchies are split, for experiments: "sah" (least expected cost), "equal" (equal counts) or
+            "middle" (in the middle of the centroids' bounds). Images are the same; only their cost differs.
+        parameters: values that replace the defaults of the file's `$parameters`, by name.
+        keywords: the same, as `res=128`. A `$parameter` named like an argument of this function is set by `parameters`.
+    Raises:
+        InputError: what is wrong and what to do; in a file, also the file and the line.
+    Warns:
+        InputWarning: nothing in the file emits light.
+    """
+    parameters = dict(parameters or {})
+    for name in parameters.keys() & keywords.keys():
+        raise InputError(f"the parameter {name} is given twice, in parameters and as a keyword; give it once")
+    scene = build(loader.load(file, **parameters, **keywords), dtype, split_rule)
+    if dark := emitters.darkness(scene.emitters):
+        warnings.warn(f"{file}: {dark}, so images of it are black", InputWarning, stacklevel=2)
+    return scene

@@ -1,0 +1,44 @@
+"""A scene file becomes a scene of the precision, the hierarchies and the parameters that were asked for."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import pathjax as pj
+
+MESH = """
+<default name="dtype" value="0.25"/>
+<shape type="rectangle"><bsdf type="diffuse" id="wall"><rgb name="reflectance" value="$dtype"/></bsdf></shape>
+<emitter type="constant"/>
+"""
+
+
+def test_float64_reaches_every_real_number(root, x64):
+    with x64():
+        scene = pj.load_scene(root / "scenes" / "mesh.xml", dtype=np.float64, res=8)
+    kinds = {leaf.dtype for leaf in jax.tree.leaves(scene) if jnp.issubdtype(leaf.dtype, jnp.floating)}
+    assert kinds == {np.dtype(np.float64)}
+    with pytest.raises(pj.InputError, match="float64, which is off in JAX"):
+        pj.load_scene(root / "scenes" / "mesh.xml", dtype=np.float64, res=8)
+
+
+def test_split_rule_reaches_the_hierarchy(root):
+    cost = {
+        rule: pj.load_scene(root / "scenes" / "mesh.xml", split_rule=rule, res=8).about.trees["triangle"].sah_cost
+        for rule in ("sah", "equal")
+    }
+    assert cost["sah"] < cost["equal"]
+    with pytest.raises(pj.InputError, match="split_rule = 'luck' is unknown; use one of sah"):
+        pj.load_scene(root / "scenes" / "mesh.xml", split_rule="luck")
+
+
+def test_a_file_parameter_named_like_an_argument_is_set_by_the_mapping(write_scene):
+    scene = pj.load_scene(write_scene(MESH), parameters={"dtype": "0.5, 0.25, 0.125"})
+    np.testing.assert_array_equal(pj.parameters(scene)["wall.reflectance"], [0.5, 0.25, 0.125])
+    assert scene.camera.origin.dtype == np.float32
+
+
+def test_a_parameter_that_is_given_twice_is_refused(root):
+    with pytest.raises(pj.InputError, match="res is given twice"):
+        pj.load_scene(root / "scenes" / "furnace.xml", parameters={"res": 8}, res=9)
