@@ -5,7 +5,6 @@ Efficiency is 1 / (relMSE x seconds), relMSE against a converged reference of pa
 
 from __future__ import annotations
 
-import json
 import platform
 from pathlib import Path
 
@@ -18,6 +17,7 @@ from pathjax.bench.report import markdown
 from pathjax.errors import InputError
 from pathjax.system.files import check_writable, write_text
 from pathjax.system.interrupts import Interrupts
+from pathjax.system.json_text import json_text
 from pathjax.system.output import Output, say
 
 
@@ -62,7 +62,7 @@ def run(options, output: Output) -> int:
         cut_short = True
         why = "interrupted" if isinstance(error, KeyboardInterrupt) else f"{file}: {type(error).__name__}: {error}"
         say(f"{why}; {len(report['scenes'])} of {len(options.scenes)} scenes are done")
-    output.text(json.dumps(report) if options.json else markdown(report))
+    output.text(json_text(report) if options.json else markdown(report))
     return int(cut_short or any(scene["failures"] for scene in report["scenes"]))
 
 
@@ -72,7 +72,7 @@ def _write(report: dict, folder: Path, name: str, output: Output) -> None:
     if plot.available() and plot.worth_while(scene):
         place = output.file(folder / name, lambda path: plot.write(scene, path))
         scene["plot"] = name if place == folder / name else place and str(place)
-    output.file(folder / "bench.json", lambda path: write_text(path, json.dumps(report, indent=2)))
+    output.file(folder / "bench.json", lambda path: write_text(path, json_text(report, indent=2)))
     output.file(folder / "bench.md", lambda path: write_text(path, markdown(report)))
 
 

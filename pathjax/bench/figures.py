@@ -38,14 +38,14 @@ class Reference(NamedTuple):
         """relMSE that the images have in common, noise of their mean and the reference's gone, and its standard error.
 
         An unbiased estimate, so it may be negative. Its mean is 0 where independent images have the reference's mean.
-        None of one image.
+        nan of one image.
         """
         mean, variance, count = moments(images)
         if count < 2:
-            return {"rel_mse": None, "standard_error": None}
+            return {"rel_mse": math.nan, "standard_error": math.nan}
         squares = ((mean - self.image) ** 2 - variance - self.variance) / self._scale
         pixels = squares.mean(-1).ravel()  # channels share their paths
-        return {"rel_mse": finite(float(pixels.mean())), "standard_error": finite(standard_error(pixels))}
+        return {"rel_mse": float(pixels.mean()), "standard_error": standard_error(pixels)}
 
 
 def moments(images) -> tuple[np.ndarray, np.ndarray, int]:
@@ -71,7 +71,7 @@ def row(asked_spp: int, spp: int, seconds, errors, noise: float, paths: int) -> 
     Args:
         errors: relMSE of each to the reference; noise: that of the reference.
         paths: of a render of one sample a pixel.
-    Unknown figures are None: the error of images that are not finite, the efficiency where there is no noise.
+    The error of images that are not finite is not either; the efficiency is None where there is no noise.
     """
     run, measured = statistics.median(seconds), statistics.fmean(errors)
     error = measured - noise
@@ -82,9 +82,9 @@ def row(asked_spp: int, spp: int, seconds, errors, noise: float, paths: int) -> 
         "seconds": list(seconds),
         "run_seconds": run,
         "mpaths_per_second": paths * spp / run / 1e6,
-        "rel_mse": finite(error),
-        "rel_mse_standard_error": finite(standard_error(errors)),
-        "rel_mse_to_reference": finite(measured),
+        "rel_mse": error,
+        "rel_mse_standard_error": standard_error(errors),
+        "rel_mse_to_reference": measured,
         "reference_too_noisy": noisy and error < noise,
         "efficiency": 1 / (error * run) if noisy and error > 0 else None,
     }
@@ -94,17 +94,12 @@ def deviation(image, exact) -> dict:
     """How images differ from exact ones: relMSE, and the largest |I - E| / sqrt(E^2 + 0.01)."""
     exact = np.asarray(exact, float)
     relative = np.abs(image - exact) / np.sqrt(exact**2 + RELATIVE_FLOOR)
-    return {"rel_mse": finite(rel_mse(image, exact)), "largest_deviation": finite(float(relative.max()))}
+    return {"rel_mse": rel_mse(image, exact), "largest_deviation": float(relative.max())}
 
 
 def standard_error(values) -> float:
     """Of the mean; nan of less than two values."""
     return float(np.std(values, ddof=1) / math.sqrt(len(values))) if len(values) > 1 else math.nan
-
-
-def finite(x: float) -> float | None:
-    """For JSON, which has neither nan nor infinity."""
-    return x if math.isfinite(x) else None
 
 
 def slope(x, y) -> float | None:

@@ -51,7 +51,7 @@ class Subject(NamedTuple):
 
 
 def measure(file: str, defines: dict[str, str], plan: Plan) -> dict:
-    """Everything about one scene, as JSON-ready values."""
+    """Everything about one scene, as `json_text` writes it."""
     say = plan.say
     scene = pathjax.load_scene(file, parameters=defines)
     height, width = film.image_shape(scene.film)
@@ -86,7 +86,7 @@ def measure(file: str, defines: dict[str, str], plan: Plan) -> dict:
         "height": height,
         "compile_seconds": compile_seconds,
         "reference_spp": subject.reference.spp,
-        "reference_rel_mse": figures.finite(subject.reference.noise),
+        "reference_rel_mse": subject.reference.noise,
         "pathjax": rows,
         "mitsuba": peers,
         "slopes": {
@@ -184,13 +184,13 @@ def _sampler(subject: Subject, rows) -> dict:
             {
                 "spp": row["spp"],
                 "rel_mse": row["rel_mse"],
-                "independent_rel_mse": figures.finite(independent),
-                "ratio": ratio and figures.finite(ratio),
+                "independent_rel_mse": independent,
+                "ratio": ratio,
             }
         )
     return {
-        "single_rel_mse": figures.finite(single),
-        "single_rel_mse_standard_error": figures.finite(figures.standard_error(errors)),
+        "single_rel_mse": single,
+        "single_rel_mse_standard_error": figures.standard_error(errors),
         "rows": compared,
     }
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import statistics
 
 _ABOUT = """\
@@ -96,7 +97,7 @@ def _precision(precision: dict) -> list[str]:
     seconds = {name: statistics.median(precision[name]["seconds"]) for name in names}
     cells = [[name, *_run(precision[name])] for name in names]
     difference, noise = precision["rel_mse"], precision["float64"]["rel_mse"]
-    share = f", {difference / noise:.1e} of the noise" if difference is not None and noise and noise > 0 else ""
+    share = f", {difference / noise:.1e} of the noise" if math.isfinite(difference) and noise > 0 else ""
     return [
         *_table([f"precision, {spp} spp", "run s", "Mpaths/s", "relMSE", "efficiency"], cells),
         f"float32 against float64, same seeds: relMSE {_number(difference)}{share}; largest deviation "
@@ -135,7 +136,7 @@ def _run(row: dict) -> list[str]:
 def _efficiency(row: dict) -> str:
     if row["efficiency"] is not None:
         return f"{row['efficiency']:.0f}" if row["efficiency"] > 100 else f"{row['efficiency']:.3g}"
-    return "" if row["rel_mse"] is None or row["reference_too_noisy"] else "no noise"
+    return "" if not math.isfinite(row["rel_mse"]) or row["reference_too_noisy"] else "no noise"
 
 
 def _versus(row: dict) -> str:
@@ -146,18 +147,18 @@ def _versus(row: dict) -> str:
     return f"{ratio:.2f} x {row['best_peer']}{taken}"
 
 
-def _relative(value: float | None, standard_error: float | None) -> str:
+def _relative(value: float, standard_error: float) -> str:
     """With its standard error in percent."""
-    known = value and value > 0 and standard_error is not None
+    known = value > 0 and math.isfinite(standard_error)
     return _number(value) + (f" ± {standard_error / value:.0%}" if known else "")
 
 
 def _bias(bias: dict) -> str:
-    return "" if bias["rel_mse"] is None else f"{bias['rel_mse']:.1e} ± {bias['standard_error']:.1e}"
+    return "" if not math.isfinite(bias["rel_mse"]) else f"{bias['rel_mse']:.1e} ± {bias['standard_error']:.1e}"
 
 
-def _number(value: float | None) -> str:
-    return "not finite" if value is None else f"{value:.2e}"
+def _number(value: float) -> str:
+    return f"{value:.2e}" if math.isfinite(value) else "not finite"
 
 
 def _slope(value: float | None) -> str:

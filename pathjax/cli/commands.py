@@ -6,7 +6,6 @@ Exit status: 0 done, 1 the work failed (of `compare`: the images differ), 2 the 
 from __future__ import annotations
 
 import contextlib
-import json
 import math
 import os
 import threading
@@ -18,6 +17,7 @@ from pathjax.cli.arguments import parser
 from pathjax.errors import InputError, InputWarning
 from pathjax.system.files import check_writable
 from pathjax.system.interrupts import Interrupts
+from pathjax.system.json_text import json_text
 from pathjax.system.output import Output, say
 
 DONE, FAILED, WRONG = 0, 1, 2
@@ -133,13 +133,13 @@ def _render(options, output: Output) -> int:
             "load_seconds": loaded - started,
             "compile_seconds": result.compile_seconds,
             "run_seconds": result.run_seconds,
-            "error": _known(result.error),
-            "error_bound": _known(result.error_bound),
+            "error": result.error,
+            "error_bound": result.error_bound,
             "reason": result.reason,
             "not_finite_pixels": pixels_lost,
             "interrupted": interrupted,
         }
-        output.text(json.dumps(report))
+        output.text(json_text(report))
     return FAILED if missed or (options.checkpoint is not None and not saved) else DONE
 
 
@@ -222,17 +222,12 @@ def _reached(result, pixels_lost: int, place: Path | None, spp: int | None, save
     ended = {"interrupted": "interrupted", "time limit": "out of time", "spp": "out of samples"}[result.reason]
     text = f"{ended}; {place or 'the image'} holds {result.spp:.4g}{f' of {spp}' if spp else ''} spp"
     if options.error is not None:
-        bound = _known(result.error_bound)
-        reached = "unknown" if bound is None else f"at most {bound:.3g}"
+        bound = result.error_bound
+        reached = f"at most {bound:.3g}" if math.isfinite(bound) else "unknown"
         text += f", and its error is {reached}, not yet {options.error:g}"
     if saved and result.reason == "interrupted":
         text += "; the same command goes on from there"
     return text
-
-
-def _known(number: float) -> float | None:
-    """JSON has no nan."""
-    return number if math.isfinite(number) else None
 
 
 def _interruptible(call):
@@ -307,10 +302,10 @@ def _fit(options, output: Output) -> int:
     facts = {"scene": str(options.scene), "target": str(options.target), "spp": options.spp, "seed": options.seed}
     facts |= report.facts(fit)
     with Interrupts():
-        output.file(table, lambda path: write_text(path, json.dumps(facts, indent=1) + "\n"))
+        output.file(table, lambda path: write_text(path, json_text(facts, indent=1) + "\n"))
         if fit.images:
             output.file(picture, lambda path: files.write_png(path, report.picture(fit, [target.image])))
-        output.text(json.dumps(facts) if options.json else report.text(fit))
+        output.text(json_text(facts) if options.json else report.text(fit))
     return DONE if fit.converged else FAILED
 
 
@@ -343,7 +338,7 @@ def _compare(options, output: Output) -> int:
         place = output.file(options.output, lambda path: files.write_png(path, picture))
         lines.insert(1, f"{place} shows differences of {scale:.3g} in full colour")
     facts = {"image": options.image, "reference": options.reference, **compare.facts(comparison), "differ": differ}
-    output.text(json.dumps(facts) if options.json else "\n".join(lines))
+    output.text(json_text(facts) if options.json else "\n".join(lines))
     return FAILED if differ else DONE
 
 
@@ -357,7 +352,7 @@ def _info(options, output: Output) -> int:
     facts = report.facts(scene)
     if options.tail is not None:
         facts["tail"] = report.tail_facts(scene, options.tail)
-    output.text(json.dumps(facts) if options.json else report.text(facts))
+    output.text(json_text(facts) if options.json else report.text(facts))
     return DONE
 
 

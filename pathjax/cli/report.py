@@ -18,7 +18,7 @@ _SAMPLER = "randomly shifted lattice, hashing for roulette"
 
 
 def facts(scene: Scene) -> dict:
-    """Everything as JSON-ready values."""
+    """What `json_text` writes of a scene."""
     about = scene.about
     description = about.description
     max_depth = int(scene.max_depth)
@@ -55,7 +55,7 @@ def facts(scene: Scene) -> dict:
             for kind, tree in about.trees.items()
         },
         "parameters": {
-            name: {"value": np.asarray(value).tolist(), "shape": list(value.shape), "bounds": _bounds(about, name)}
+            name: {"value": np.asarray(value), "shape": value.shape, "bounds": about.parameters[name].bounds}
             for name, value in parameters(scene).items()
         },
         "notes": [*description.notes, *([f"{dark}, so images are black"] if dark else [])],
@@ -72,17 +72,12 @@ def tail_facts(scene: Scene, error: float) -> dict:
     share, uncertainty = tail.cut_off(max_depth)
     return {
         "error": error,
-        "terms": tail.terms.tolist(),
-        "ratio": [_finite(x) for x in tail.ratio],
-        "cut_off": share.tolist() if max_depth < UNBOUNDED else [0.0] * 3,
-        "cut_off_error": [_finite(x) for x in uncertainty] if max_depth < UNBOUNDED else [0.0] * 3,
+        "terms": tail.terms,
+        "ratio": tail.ratio,
+        "cut_off": share if max_depth < UNBOUNDED else [0.0] * 3,
+        "cut_off_error": uncertainty if max_depth < UNBOUNDED else [0.0] * 3,
         "max_depth": tail.depth_for(error),
     }
-
-
-def _finite(x) -> float | None:
-    """JSON has no inf."""
-    return float(x) if np.isfinite(x) else None
 
 
 def _tail_lines(tail: dict, max_depth) -> list[str]:
@@ -96,11 +91,6 @@ def _tail_lines(tail: dict, max_depth) -> list[str]:
         lines.append(f"            max_depth {max_depth} cuts off {share:.2g} +- {uncertainty:.1g} of all light")
     lines.append(f"            max_depth {tail['max_depth']} would cut off no more than {tail['error']:g}")
     return lines
-
-
-def _bounds(about, name):
-    low, high = about.parameters[name].bounds
-    return [low, None if high == np.inf else high]
 
 
 def _primitives(part) -> int:
@@ -140,9 +130,8 @@ def text(facts: dict) -> str:
     lines.append("parameters" if facts["parameters"] else "parameters  none")
     for name, parameter in facts["parameters"].items():
         low, high = parameter["bounds"]
-        value = parameter["value"]
-        shown = ", ".join(f"{x:g}" for x in value) if isinstance(value, list) else f"{value:g}"
-        lines.append(f"  {name:32} {shown:28} in [{low:g}, {'inf' if high is None else format(high, 'g')}]")
+        shown = ", ".join(f"{x:g}" for x in parameter["value"].ravel())
+        lines.append(f"  {name:32} {shown:28} in [{low:g}, {high:g}]")
     lines += [f"note        {note}" for note in facts["notes"]]
     return "\n".join(lines)
 

@@ -201,7 +201,7 @@ def _read_errors(files, shape) -> list[np.ndarray | None]:
 
 
 def facts(comparison: Comparison) -> dict:
-    """JSON-ready; what is infinite or unknown is null."""
+    """What `json_text` writes of a comparison."""
     c = comparison
     height, width = c.compared.shape
     values = {
@@ -219,7 +219,7 @@ def facts(comparison: Comparison) -> dict:
     if c.z is not None:
         z = c.z[c.compared]
         values |= {"mean_z2": float(np.mean(z**2)), "max_z": float(np.abs(z).max()), "p": c.p, "exact": c.exact}
-    return {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in values.items()}
+    return values
 
 
 def text(comparison: Comparison) -> str:

@@ -14,18 +14,14 @@ _FULL_SCALE = 3
 
 
 def facts(fit: Fit) -> dict:
-    """JSON-ready; what is infinite or undefined is null."""
-
-    def plain(x):
-        return [plain(y) for y in x] if np.ndim(x) else (float(x) if math.isfinite(x) else None)
-
+    """What `json_text` writes of a fit."""
     return {
         "converged": fit.converged,
         "message": fit.message,
-        "values": {name: plain(value) for name, value in fit.values.items()},
-        "standard_errors": {name: plain(error) for name, error in fit.standard_errors.items()},
+        "values": fit.values,
+        "standard_errors": fit.standard_errors,
         "components": fit.components,
-        "covariance": plain(fit.covariance),
+        "covariance": fit.covariance,
         "undetermined": fit.undetermined,
         "at_bound": fit.at_bound,
         "compile_seconds": fit.compile_seconds,

@@ -1,7 +1,6 @@
 """Parameters from images: recovery, bounds, what is not determined, views, solvers, interruptions, bad input."""
 
 import functools
-import json
 
 import jax
 import numpy as np
@@ -11,6 +10,7 @@ import pytest
 import pathjax as pj
 from pathjax.images.image import read_rgb, write_exr, write_png
 from pathjax.inverse import fitting, report
+from pathjax.system.json_text import json_text
 
 # A floor and a wall that light each other under a sky.
 ROOM = """
@@ -160,7 +160,7 @@ def test_what_images_do_not_determine_is_named(make_scene, store):
     # The image is fitted all the same: what is left is noise.
     assert fit.converged
     assert "not determined" in report.text(fit)
-    json.dumps(report.facts(fit), allow_nan=False)
+    json_text(report.facts(fit))
 
 
 def test_a_parameter_that_does_not_show_is_named(make_scene, store):
@@ -212,7 +212,7 @@ def test_an_interrupted_fit_returns_what_it_has(room, target):
     assert not fit.converged and fit.message == "interrupted"
     # It was near already.
     assert all(np.abs(fit.values[n] - pj.parameters(room)[n]).max() < 0.05 for n in NAMES)
-    report.text(fit), json.dumps(report.facts(fit), allow_nan=False)
+    report.text(fit), json_text(report.facts(fit))
 
 
 @pytest.mark.parametrize("start", [0.0, 7.0])

@@ -22,6 +22,7 @@ from pathjax.rendering.progressive.replicates import one_if_equal
 from pathjax.scene.scene import Scene
 from pathjax.sensors import film
 from pathjax.system.files import write_whole
+from pathjax.system.json_text import json_text
 
 # Saving costs at most one in this many seconds.
 COST = 200
@@ -106,7 +107,7 @@ class Checkpoint:
         arrays = {}
         if state.count.any():
             arrays = {"means": state.means} | {name: one_if_equal(getattr(state, name)) for name in OF_PIXELS}
-        facts = json.dumps({"identity": self.identity, "spp": state.spp, "seconds": state.seconds})
+        facts = json_text({"identity": self.identity, "spp": state.spp, "seconds": state.seconds})
 
         try:
             write_whole(self.path, lambda file: np.savez(file, facts=np.array(facts), **arrays))
