@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 import pathjax as pj
-from pathjax.images.image import write_png
+from pathjax.images import write_png
 from pathjax.inverse import report
 
 NAMES = ["white.reflectance", "red.reflectance", "green.reflectance"]

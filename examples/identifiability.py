@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 import pathjax as pj
-from pathjax.images.image import write_png
+from pathjax.images import write_png
 from pathjax.inverse import report
 
 NAMES = ["lamp.radiance", "floor.reflectance", "wall.reflectance"]

@@ -15,7 +15,7 @@ import numpy as np
 import optimistix as optx
 
 import pathjax as pj
-from pathjax.images.image import write_png
+from pathjax.images import write_png
 
 NAMES = ["white.reflectance", "red.reflectance", "green.reflectance"]
 MEAN_COLOR = jnp.array([0.16, 0.12, 0.09])

@@ -15,8 +15,7 @@ import numpy as np
 
 import pathjax as pj
 from pathjax import description, scene, transport
-from pathjax.images import picture
-from pathjax.images.image import write_png
+from pathjax.images import picture, write_png
 
 BLOCKS = 32  # across the image: means over blocks hide the pixels' noise and the patches' edges
 

@@ -13,7 +13,7 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 import pathjax as pj
-from pathjax.images.image import linear_to_srgb
+from pathjax.images import linear_to_srgb
 from pathjax.inverse import report
 
 NAMES = ["glass.int_ior", "pattern.color0", "pattern.color1"]

@@ -10,7 +10,7 @@ import pytest
 
 import pathjax as pj
 from pathjax.derivatives import gradient, ior_step
-from pathjax.images.image import write_exr
+from pathjax.images import write_exr
 from pathjax.scene import parameters as named
 from pathjax.sensors.film import pixel_count
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pathjax.images.compare import RELATIVE_FLOOR, ROUNDING, rel_mse
+from pathjax.images.metrics import RELATIVE_FLOOR, ROUNDING, rel_mse
 
 # What rounding alone leaves; a render at or below has no noise.
 NO_NOISE = ROUNDING**2

@@ -251,11 +251,10 @@ def _interruptible(call):
 
 
 def _write(path: Path, result, layers, options) -> None:
-    from pathjax import __version__
-    from pathjax.images import image as files
+    from pathjax import __version__, images
 
     if path.suffix.lower() == ".png":
-        files.write_png(path, result.image)
+        images.write_png(path, result.image)
         return
     header = {
         "pathjax.version": __version__,
@@ -265,7 +264,7 @@ def _write(path: Path, result, layers, options) -> None:
         "pathjax.seed": options.seed,
     }
     channels = {name: result.image[..., i] for i, name in enumerate("RGB")}
-    files.write_exr(path, channels | layers, header)
+    images.write_exr(path, channels | layers, header)
 
 
 # ---- fit ----------------------------------------------------------------------------------------------------------
@@ -275,8 +274,7 @@ def _fit(options, output: Output) -> int:
     from rich.console import Console
     from rich.markup import escape
 
-    from pathjax import inverse
-    from pathjax.images import image as files
+    from pathjax import images, inverse
     from pathjax.inverse import report
     from pathjax.inverse.fitting import step_text
     from pathjax.system.files import write_text
@@ -304,7 +302,7 @@ def _fit(options, output: Output) -> int:
     with Interrupts():
         output.file(table, lambda path: write_text(path, json_text(facts, indent=1) + "\n"))
         if fit.images:
-            output.file(picture, lambda path: files.write_png(path, report.picture(fit, [target.image])))
+            output.file(picture, lambda path: images.write_png(path, report.picture(fit, [target.image])))
         output.text(json_text(facts) if options.json else report.text(fit))
     return DONE if fit.converged else FAILED
 
@@ -313,14 +311,14 @@ def _fit(options, output: Output) -> int:
 
 
 def _compare(options, output: Output) -> int:
-    from pathjax.images import compare
-    from pathjax.images import image as files
+    from pathjax import images
+    from pathjax.images import comparison as reports
 
     if options.output:
         if Path(options.output).suffix.lower() != ".png":
             raise InputError(f"{options.output}: the picture is written as .png")
         check_writable(options.output, [options.image, options.reference])
-    comparison = compare.compare(options.image, options.reference, options.errors)
+    comparison = images.compare(options.image, options.reference, options.errors)
     if options.max_flip is not None and comparison.flip is None:
         raise InputError("--max-flip: FLIP needs its authors' package: pip install 'pathjax[flip]'")
     differ = []
@@ -332,12 +330,12 @@ def _compare(options, output: Output) -> int:
         differ.append(f"FLIP {comparison.flip:.4g} is above {options.max_flip:g}")
     if options.errors and comparison.p < options.alpha:
         differ.append(f"p {comparison.p:.3g} is below {options.alpha:g}")
-    lines = [compare.text(comparison), *(f"the images differ: {reason}" for reason in differ)]
+    lines = [reports.text(comparison), *(f"the images differ: {reason}" for reason in differ)]
     if options.output:
-        picture, scale = compare.picture(comparison)
-        place = output.file(options.output, lambda path: files.write_png(path, picture))
+        picture, scale = reports.picture(comparison)
+        place = output.file(options.output, lambda path: images.write_png(path, picture))
         lines.insert(1, f"{place} shows differences of {scale:.3g} in full colour")
-    facts = {"image": options.image, "reference": options.reference, **compare.facts(comparison), "differ": differ}
+    facts = {"image": options.image, "reference": options.reference, **reports.facts(comparison), "differ": differ}
     output.text(json_text(facts) if options.json else "\n".join(lines))
     return FAILED if differ else DONE
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from pathjax.errors import InputError
-from pathjax.images import image as files
+from pathjax.images import exr, file_format, linear_to_srgb, png, read_rgb, srgb_to_linear
 
 # What EXR files of these compressions hold differs from what was written, alike in neighbouring pixels.
 _LOSSY = ("B44", "B44A", "DWAA", "DWAB")
@@ -53,12 +53,12 @@ def read_target(path: str | Path) -> Target:
     Raises:
         InputError: no such file, another format or a damaged one, or one whose compression changes its pixels.
     """
-    found = files.file_format(path)
+    found = file_format(path)
     if found not in ("OpenEXR", "PNG"):
         raise InputError(f"{path}: {found} changes the pixels that it is given; use OpenEXR or PNG for targets")
-    image = files.read_rgb(path).astype(np.float64)
+    image = read_rgb(path).astype(np.float64)
     if found == "OpenEXR":
-        compression, half = files.exr_storage(path)
+        compression, half = exr.storage(path)
         if compression in _LOSSY:
             raise InputError(f"{path}: {compression} compression changes pixels; write the file with ZIP, or none")
         if not half:
@@ -67,9 +67,9 @@ def read_target(path: str | Path) -> Target:
         below = np.minimum(np.abs(image), np.nextafter(largest, np.float16(0)))
         step = np.spacing(below.astype(np.float16)).astype(np.float64)
         return Target(image, np.nan_to_num(step), float(largest))
-    levels, opaque = files.png_storage(path)
-    code = np.rint(files.linear_to_srgb(image) * levels)
-    low, high = (files.srgb_to_linear(np.clip((code + off) / levels, 0, None)) for off in (-0.5, 0.5))
+    levels, opaque = png.storage(path)
+    code = np.rint(linear_to_srgb(image) * levels)
+    low, high = (srgb_to_linear(np.clip((code + off) / levels, 0, None)) for off in (-0.5, 0.5))
     # Of 0 too the noise is that of a whole step: all of its half lies on one side.
     step = np.where(code > 0, high - low, 2 * high)
-    return Target(image, step, float(files.srgb_to_linear(1 - 0.5 / levels)), opaque[..., None])
+    return Target(image, step, float(srgb_to_linear(1 - 0.5 / levels)), opaque[..., None])

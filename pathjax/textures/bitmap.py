@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pathjax.core.math import at
-from pathjax.images.image import read_rgb
+from pathjax.images import read_rgb
 from pathjax.kinds import Column, Instance, PerRow, Shared, Table
 from pathjax.textures.texture import Texture
 

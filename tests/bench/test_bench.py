@@ -13,7 +13,7 @@ from PIL import Image
 import pathjax
 from pathjax.bench import alone, bench, mitsuba_peer
 from pathjax.cli import main
-from pathjax.images.compare import rel_mse
+from pathjax.images import rel_mse
 
 ROOT = Path(__file__).resolve().parents[2]
 CORNELL, FURNACE = (str(ROOT / "scenes" / f"{name}.xml") for name in ("cornell_box", "furnace"))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pathjax.bench import figures
-from pathjax.images.compare import RELATIVE_FLOOR
+from pathjax.images.metrics import RELATIVE_FLOOR
 
 
 def rows(spps, seconds, errors):

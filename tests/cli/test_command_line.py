@@ -16,10 +16,9 @@ import pytest
 import trimesh
 
 import pathjax as pj
-from pathjax import inverse
+from pathjax import images, inverse
 from pathjax.cli import commands as cli
-from pathjax.images import image
-from pathjax.images.image import linear_to_srgb, read_exr, read_rgb, write_exr, write_png
+from pathjax.images import linear_to_srgb, read_exr, read_rgb, write_exr, write_png
 from pathjax.rendering import bounces
 from pathjax.rendering.progressive import until
 from pathjax.system.interrupts import SIGNALS
@@ -377,11 +376,11 @@ def test_names_that_are_not_utf8_in_messages(refused, tmp_path):
 def test_a_signal_while_the_image_is_written_costs_nothing(run, tmp_path, monkeypatch, number):
     earlier = signal.signal(number, signal.default_int_handler)
 
-    def write(*arguments, plain=image.write_exr):
+    def write(*arguments, plain=images.write_exr):
         signal.raise_signal(number)
         plain(*arguments)
 
-    monkeypatch.setattr(image, "write_exr", write)
+    monkeypatch.setattr(images, "write_exr", write)
     try:
         assert run("render", FURNACE, *SMALL, "-o", tmp_path / "a.exr", "--spp", 4)[0] == 0
     finally:

@@ -10,8 +10,7 @@ from PIL import Image
 from scipy import stats
 
 from pathjax.cli import commands as cli
-from pathjax.images import compare
-from pathjax.images.image import read_rgb, write_exr, write_png
+from pathjax.images import comparison, metrics, read_rgb, write_exr, write_png
 
 GREY = np.full((16, 24, 3), 0.3, np.float32)
 
@@ -55,26 +54,26 @@ def noisy(seed, error=0.02):
 
 def test_measures_of_a_known_difference():
     reference = np.full((2, 2, 3), 0.3)
-    assert compare.mse(reference + 0.1, reference) == pytest.approx(0.01)
-    assert compare.rel_mse(reference + 0.1, reference) == pytest.approx(0.01 / 0.1)
-    assert compare.psnr(reference + 0.1, reference, 1) == pytest.approx(20)
-    assert compare.psnr(reference + 0.1, reference, 10) == pytest.approx(40)
-    assert compare.psnr(reference, reference, 1) == math.inf
-    assert compare.psnr(reference, 0 * reference, 0) == -math.inf
+    assert metrics.mse(reference + 0.1, reference) == pytest.approx(0.01)
+    assert metrics.rel_mse(reference + 0.1, reference) == pytest.approx(0.01 / 0.1)
+    assert metrics.psnr(reference + 0.1, reference, 1) == pytest.approx(20)
+    assert metrics.psnr(reference + 0.1, reference, 10) == pytest.approx(40)
+    assert metrics.psnr(reference, reference, 1) == math.inf
+    assert metrics.psnr(reference, 0 * reference, 0) == -math.inf
 
 
 def test_level_is_the_mean_of_what_is_lit_but_for_its_brightest_quarter():
     lit = [[0.1, 0.2, 0.3], [0.4, 0.4, 0.4], [0.5, 0.6, 1.0], [1e9, 0, 0]]
     dark = [[0.0, 0.0, 0.0]] * 96
     for image in (lit, lit + dark, [*lit, [np.nan, 1, 1], [np.inf, 1, 1]]):
-        assert compare.level(image) == pytest.approx((0.2 + 0.4 + 0.7) / 3)
-    assert compare.level(lit[:1]) == pytest.approx(0.2)
+        assert metrics.level(image) == pytest.approx((0.2 + 0.4 + 0.7) / 3)
+    assert metrics.level(lit[:1]) == pytest.approx(0.2)
 
 
 @pytest.mark.parametrize("value", [0, -1, np.nan, np.inf, 1e-32])
 def test_level_of_nothing_is_not_known(value):
     image = np.full((2, 3, 3), value, np.float32)
-    assert math.isnan(compare.level(image)) and math.isnan(compare.relative_error(image, image))
+    assert math.isnan(metrics.level(image)) and math.isnan(metrics.relative_error(image, image))
 
 
 @pytest.mark.parametrize("unit", [1e-25, 1e-10, 0.1, 1, 1e10, 1e25])
@@ -83,24 +82,24 @@ def test_relative_error_knows_no_unit(unit):
     reference = np.zeros((4, 4, 3))
     reference[2:] = unit
     expected = 0.1 / math.sqrt(2 * 1.01)
-    assert compare.relative_error(1.1 * reference, reference) == pytest.approx(expected)
-    assert compare.relative_error(reference.astype(np.float32), reference) == pytest.approx(0, abs=1e-7)
+    assert metrics.relative_error(1.1 * reference, reference) == pytest.approx(expected)
+    assert metrics.relative_error(reference.astype(np.float32), reference) == pytest.approx(0, abs=1e-7)
 
 
 @pytest.mark.parametrize("hdr", [True, False])
 def test_flip_is_0_for_equal_images_and_grows_with_the_difference(hdr):
     pytest.importorskip("flip_evaluator")
-    means = [compare.flip(GREY * scale, GREY, hdr).mean() for scale in (1, 1.05, 1.5)]
+    means = [metrics.flip(GREY * scale, GREY, hdr).mean() for scale in (1, 1.05, 1.5)]
     assert means[0] == 0
     assert 0 < means[1] < means[2] < 1
-    assert compare.flip(GREY, GREY, hdr).shape == GREY.shape[:2]
+    assert metrics.flip(GREY, GREY, hdr).shape == GREY.shape[:2]
 
 
 def test_flip_meets_black_references_and_negative_values():
     pytest.importorskip("flip_evaluator")
     for dark in (0 * GREY, 1e-9 * GREY, -GREY):
-        assert compare.flip(dark, dark, True).max() == 0
-        assert compare.flip(GREY, dark, True).min() > 0.5
+        assert metrics.flip(dark, dark, True).max() == 0
+        assert metrics.flip(GREY, dark, True).min() > 0.5
 
 
 @pytest.mark.parametrize("power", [-80, -66, -30])
@@ -110,15 +109,15 @@ def test_flip_of_high_dynamic_range_knows_no_unit(power):
     rng = np.random.default_rng(0)
     reference = rng.lognormal(size=GREY.shape).astype(np.float32)
     image = (reference * rng.normal(1, 0.1, GREY.shape)).astype(np.float32)
-    expected = compare.flip(image, reference, True)
+    expected = metrics.flip(image, reference, True)
     assert expected.mean() > 0.01
-    scaled = compare.flip(np.ldexp(image, power), np.ldexp(reference, power), True)
+    scaled = metrics.flip(np.ldexp(image, power), np.ldexp(reference, power), True)
     np.testing.assert_allclose(scaled, expected, rtol=1e-4)
 
 
 def test_z_scores_of_known_numbers():
     image, reference = np.array([1.0, 1, 1, 1, 0, 1]), np.array([0.5, 1, 2, 1 + 1e-7, 0, 1 + 1e-3])
-    z = compare.z_scores(image, reference, np.array([0.3, 0, 0, 0, 0, 0.001]), np.array([0.4, 0, 0, 0, 0, 0]))
+    z = metrics.z_scores(image, reference, np.array([0.3, 0, 0, 0, 0, 0.001]), np.array([0.4, 0, 0, 0, 0, 0]))
     np.testing.assert_allclose(z, [1, 0, -np.inf, 0, 0, -1])
 
 
@@ -128,21 +127,21 @@ def test_sidak_p_meets_the_definition(count):
         z = np.zeros(count)
         z[-1] = -farthest
         expected = 1 - (1 - 2 * stats.norm.sf(farthest)) ** count
-        assert compare.sidak_p(z) == pytest.approx(expected, rel=1e-6, abs=1e-9)
+        assert metrics.sidak_p(z) == pytest.approx(expected, rel=1e-6, abs=1e-9)
 
 
 def test_sidak_p_is_exact_in_the_far_tail():
-    assert compare.sidak_p([0.0, 20.0]) == pytest.approx(2 * 2 * stats.norm.sf(20), rel=1e-12)
-    assert compare.sidak_p([37.0]) == pytest.approx(2 * stats.norm.sf(37), rel=1e-9)
-    assert compare.sidak_p([1e6]) == compare.sidak_p([np.inf, 0]) == 0
-    assert compare.sidak_p(np.zeros(5)) == 1
+    assert metrics.sidak_p([0.0, 20.0]) == pytest.approx(2 * 2 * stats.norm.sf(20), rel=1e-12)
+    assert metrics.sidak_p([37.0]) == pytest.approx(2 * stats.norm.sf(37), rel=1e-9)
+    assert metrics.sidak_p([1e6]) == metrics.sidak_p([np.inf, 0]) == 0
+    assert metrics.sidak_p(np.zeros(5)) == 1
 
 
 def test_equal_scenes_are_told_apart_as_often_as_alpha_says():
     rng, alpha, trials = np.random.default_rng(0), 0.1, 1000
     errors = rng.uniform(0.01, 0.1, (2, 200))
     p = np.array(
-        [compare.sidak_p(compare.z_scores(*(1 + errors * rng.normal(size=(2, 200))), *errors)) for _ in range(trials)]
+        [metrics.sidak_p(metrics.z_scores(*(1 + errors * rng.normal(size=(2, 200))), *errors)) for _ in range(trials)]
     )
     assert stats.kstest(p, "uniform").pvalue > 1e-3
     assert stats.binomtest(int((p < alpha).sum()), trials, alpha).pvalue > 1e-3
@@ -152,13 +151,13 @@ def test_equal_scenes_are_told_apart_as_often_as_alpha_says():
 
 
 def test_comparison_of_noisy_files(exr):
-    c = compare.compare(exr("a.exr", noisy(1), 0.02), exr("b.exr", noisy(2, 0.01), 0.01), errors=True)
-    facts = compare.facts(c)
+    c = comparison.compare(exr("a.exr", noisy(1), 0.02), exr("b.exr", noisy(2, 0.01), 0.01), errors=True)
+    facts = comparison.facts(c)
     assert facts["mean_z2"] == pytest.approx(1, abs=5 * math.sqrt(2 / GREY.size))
     assert facts["max_z"] == np.abs(c.z).max()
     assert 1e-3 < facts["p"] <= 1
     assert facts["exact"] is None
-    assert facts["rel_mse"] == compare.rel_mse(c.image, c.reference)
+    assert facts["rel_mse"] == metrics.rel_mse(c.image, c.reference)
     assert facts["psnr_peak"] == c.reference.max()
 
 
@@ -166,7 +165,7 @@ def test_a_small_shift_in_one_pixel_is_found(exr):
     image = noisy(1)
     image[3, 4, 1] += 0.5
     a, b = exr("a.exr", image, 0.02), exr("b.exr", noisy(2), 0.02)
-    facts = compare.facts(compare.compare(a, b, errors=True))
+    facts = comparison.facts(comparison.compare(a, b, errors=True))
     assert facts["p"] < 1e-10
     assert 10 < facts["max_z"] < 25
 
@@ -174,7 +173,7 @@ def test_a_small_shift_in_one_pixel_is_found(exr):
 def test_a_file_without_errors_is_taken_as_exact(exr, run):
     a, b = exr("a.exr", noisy(1), 0.02), exr("b.exr", GREY)
     for image, reference in ((a, b), (b, a)):
-        c = compare.compare(image, reference, errors=True)
+        c = comparison.compare(image, reference, errors=True)
         assert c.exact == b
         assert np.mean(c.z**2) == pytest.approx(1, abs=5 * math.sqrt(2 / GREY.size))
     assert f"{b} holds no standard errors and was taken as exact" in run(a, b, "--errors")[1]
@@ -184,11 +183,11 @@ def test_pixels_that_are_not_finite_are_counted_and_left_out(exr, run):
     image, reference, errors = GREY + np.float32(0.1), GREY.copy(), np.full(GREY.shape, 0.1, np.float32)
     image[0, 0, 1], reference[1, 1, 0], errors[2, 2, 2] = np.nan, np.inf, np.nan
     a, b = exr("a.exr", image, errors), exr("b.exr", reference, 0)
-    c = compare.compare(a, b, errors=True)
-    assert (~c.compared).sum() == compare.facts(c)["not_finite_pixels"] == 3
+    c = comparison.compare(a, b, errors=True)
+    assert (~c.compared).sum() == comparison.facts(c)["not_finite_pixels"] == 3
     assert c.rel_mse == pytest.approx(0.1, rel=1e-5)
-    assert compare.facts(c)["mean_z2"] == pytest.approx(1, rel=1e-5)
-    assert compare.facts(compare.compare(a, b))["not_finite_pixels"] == 2
+    assert comparison.facts(c)["mean_z2"] == pytest.approx(1, rel=1e-5)
+    assert comparison.facts(comparison.compare(a, b))["not_finite_pixels"] == 2
     status, out, _ = run(a, b, "--errors")
     assert status == 0 and "3 pixels are not finite" in out
 
@@ -196,7 +195,7 @@ def test_pixels_that_are_not_finite_are_counted_and_left_out(exr, run):
 def test_display_referred_files_are_compared_as_linear_light(tmp_path, run):
     write_png(tmp_path / "a.png", GREY)
     Image.fromarray(np.full((16, 24, 3), 128, np.uint8)).save(tmp_path / "b.jpg", quality=100)
-    c = compare.compare(str(tmp_path / "a.png"), str(tmp_path / "b.jpg"))
+    c = comparison.compare(str(tmp_path / "a.png"), str(tmp_path / "b.jpg"))
     assert not c.hdr and c.peak == 1
     assert c.mse == pytest.approx(np.mean((read_rgb(tmp_path / "a.png") - 0.2158605) ** 2), rel=1e-4)
 
@@ -254,7 +253,7 @@ def test_limits_decide_the_status(exr, run):
     assert status == 1
     assert "relMSE 0.1 is above 0.09" in out
     pytest.importorskip("flip_evaluator")
-    flip = compare.compare(a, b).flip
+    flip = comparison.compare(a, b).flip
     assert run(a, b, "--max-flip", flip * 1.1)[0] == 0
     assert run(a, b, "--max-flip", flip * 0.9)[0] == 1
     assert run(a, a, "--max-flip", 0, "--max-relmse", 0)[0] == 0
@@ -278,7 +277,7 @@ def test_no_error_is_claimed_relative_to_black(exr, run):
 
 def test_alpha_decides_the_status(exr, run):
     a, b = exr("a.exr", noisy(1), 0.02), exr("b.exr", noisy(2), 0.02)
-    p = compare.compare(a, b, errors=True).p
+    p = comparison.compare(a, b, errors=True).p
     assert run(a, b, "--errors")[0] == 0
     assert run(a, b, "--errors", "--alpha", p / 1.1)[0] == 0
     assert run(a, b, "--errors", "--alpha", p * 1.1)[0] == 1

@@ -12,17 +12,17 @@ import pytest
 from PIL import Image
 
 from pathjax.errors import InputError
-from pathjax.images.compare import compare
-from pathjax.images.image import (
+from pathjax.images import (
+    compare,
     file_format,
     linear_to_srgb,
     read_exr,
     read_rgb,
-    read_stored,
     srgb_to_linear,
     write_exr,
     write_png,
 )
+from pathjax.images.png import read_stored
 
 
 @pytest.fixture

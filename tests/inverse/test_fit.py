@@ -8,7 +8,7 @@ import optimistix as optx
 import pytest
 
 import pathjax as pj
-from pathjax.images.image import read_rgb, write_exr, write_png
+from pathjax.images import read_rgb, write_exr, write_png
 from pathjax.inverse import fitting, report
 from pathjax.system.json_text import json_text
 

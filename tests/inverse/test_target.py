@@ -6,7 +6,7 @@ import pytest
 from PIL import Image
 
 import pathjax as pj
-from pathjax.images.image import srgb_to_linear, write_exr, write_png
+from pathjax.images import srgb_to_linear, write_exr, write_png
 
 
 def grey_png(path, codes, mode):

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from pathjax.description import Description, Mesh
 from pathjax.errors import InputError
-from pathjax.images.image import read_exr, read_rgb, write_exr, write_png
+from pathjax.images import read_exr, read_rgb, write_exr, write_png
 from pathjax.io import mesh
 from pathjax.io.mitsuba.loader import load
 

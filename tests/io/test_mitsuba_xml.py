@@ -9,7 +9,7 @@ import pytest
 from pathjax import description as d
 from pathjax.bsdfs.ior import IOR
 from pathjax.errors import InputError
-from pathjax.images.image import write_exr, write_png
+from pathjax.images import write_exr, write_png
 from pathjax.io.mitsuba.loader import load
 from pathjax.kinds import Instance
 

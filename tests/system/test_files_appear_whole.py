@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pathjax.errors import InputError
-from pathjax.images.image import read_exr, write_exr, write_png
+from pathjax.images import read_exr, write_exr, write_png
 from pathjax.system.files import check_writable, encodable, write_text
 
 PIXELS = {name: np.full((4, 4), 0.5, np.float32) for name in "RGB"}

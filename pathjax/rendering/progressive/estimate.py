@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pathjax.images.compare import RELATIVE_FLOOR, level, mean_of_channels
+from pathjax.images.metrics import RELATIVE_FLOOR, level, mean_of_channels
 from pathjax.rendering.progressive.replicates import blocks
 
 # Weight of a pixel's own variance; its eight neighbours share the rest.
@@ -23,7 +23,7 @@ LEAST_SHARE = 0.25
 
 
 class ImageError(NamedTuple):
-    """`compare.relative_error` of an image against the truth; nan where nothing is known."""
+    """`images.relative_error` of an image against the truth; nan where nothing is known."""
 
     estimate: float
     bound: float  # that the error exceeds in some 5 % of renders
@@ -74,7 +74,7 @@ def _floor(image: np.ndarray) -> float:
 
 
 def image_error(image: np.ndarray, variance: np.ndarray) -> ImageError:
-    """Of (..., 3). Pixels that are not finite are left out; nan where the image has no `compare.level`.
+    """Of (..., 3). Pixels that are not finite are left out; nan where the image has no `images.level`.
 
     The bound takes pixels as draws from a population: where few of them make up most of the error, their number is
     small and the bound high. Where single samples do (skewness beyond 6), the error exceeds it more often.

@@ -42,7 +42,7 @@ class RenderResult:
     samples: np.ndarray  # (H, W) int32 of each pixel
     compile_seconds: float  # of this call
     run_seconds: float  # of all calls that shared the checkpoint
-    error: float  # estimate of `compare.relative_error`, of the pixels that are finite; nan where it cannot be made
+    error: float  # estimate of `images.relative_error`, of the pixels that are finite; nan where it cannot be made
     error_bound: float  # that the error exceeds in some 5 % of renders; what is compared with the target
     reason: str  # why it ended: "target error", "time limit", "spp", "interrupted", "no estimate"
 
@@ -61,7 +61,7 @@ def render_until(
     """Render until the first of three limits is reached.
 
     The error is sqrt(mean((I - R)^2 / (R^2 + 0.01 L^2))) of the image I against the truth R, where L is the level of R:
-    the mean of what is lit, but for its brightest quarter, such as lamps in view (`compare.level`). So 0.02 is 2 % in
+    the mean of what is lit, but for its brightest quarter, such as lamps in view (`images.level`). So 0.02 is 2 % in
     any unit of radiance. It is estimated as long as float32 holds the radiances, some 1e-31 to 1e36. A target is never
     claimed of an image that is black, darker than that or not finite: a render that nothing else would end then ends
     with the reason "no estimate", after the pilot or when the finite pixels are on target.

@@ -10,7 +10,7 @@ import pytest
 
 import pathjax as pj
 from pathjax.compile import runtime
-from pathjax.images.compare import relative_error
+from pathjax.images import relative_error
 from pathjax.rendering.progressive import estimate, until
 from pathjax.rendering.progressive import passes as progressive
 from pathjax.system.interrupts import SIGNALS
