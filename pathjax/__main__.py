@@ -12,7 +12,7 @@ def main() -> int:
     sys.stderr = _Messages(sys.stderr)
     try:
         _end_like_ctrl_c()
-        from pathjax.cli import commands as cli
+        from pathjax import cli
 
         gc.freeze()  # modules live to the end; to search them for garbage, at exit too, takes a fifth of a second
         return cli.main()

@@ -21,20 +21,24 @@ from pathjax.system.json_text import json_text
 from pathjax.system.output import Output, say
 
 
-def run(options, output: Output) -> int:
-    """The command: `options` as `pathjax.cli` parses them. Returns 1 where a part of the work failed."""
-    folder = None if options.output is None else Path(options.output)
+def run(
+    files: list[str], defines: dict[str, str], plan: Plan, folder: Path | None, output: Output
+) -> tuple[dict, bool]:
+    """Measure scenes one after another; after each one the report of all is in the folder, if there is one.
+
+    Returns:
+        The report, and whether all was measured. What ends it early, Ctrl-C too, costs no scene that is done.
+    Raises:
+        InputError: a scene, the folder or the peer is not as it must be; nothing was measured.
+    """
     if folder is not None and not folder.parent.is_dir():
         raise InputError(f"{folder}: there is no folder {folder.parent}; make it first")
     if folder is not None and folder.exists() and not folder.is_dir():
         raise InputError(f"{folder}: is a file; name a folder")
-    defines = dict(options.defines)
-    for file in options.scenes:
+    for file in files:
         pathjax.load_scene(file, parameters=defines)  # a wrong one is refused before an hour of work on the others
-    if options.against == "mitsuba":
-        _find_mitsuba(options.scenes[0], defines)
-    plan = Plan(sorted(set(options.spp)), options.repeat, options.reference_spp, options.against, options.quick, say)
-    report = {"machine": machine(), "against": options.against, "repeat": options.repeat, "scenes": []}
+    if plan.against == "mitsuba":
+        _find_mitsuba(files[0], defines)
     if folder is not None:
         try:
             folder.mkdir(exist_ok=True)
@@ -44,26 +48,27 @@ def run(options, output: Output) -> int:
             check_writable(folder / name)
         if not plot.available():
             say("no plots, for there is no matplotlib: pip install 'pathjax[bench]'")
-    cut_short = False
-    try:
-        for name, file in _plot_names(options.scenes):
-            scene = measure(file, defines, plan)
-            with Interrupts() as interrupts:
-                for failure in scene["failures"]:
-                    say(f"{file}: {failure}")
-                report["scenes"].append({**scene, "plot": None})
-                if folder is not None:
-                    _write(report, folder, name, output)
-            if interrupts.heard:
-                raise KeyboardInterrupt
-    except (KeyboardInterrupt, Exception) as error:
-        if not report["scenes"]:
-            raise
-        cut_short = True
-        why = "interrupted" if isinstance(error, KeyboardInterrupt) else f"{file}: {type(error).__name__}: {error}"
-        say(f"{why}; {len(report['scenes'])} of {len(options.scenes)} scenes are done")
-    output.text(json_text(report) if options.json else markdown(report))
-    return int(cut_short or any(scene["failures"] for scene in report["scenes"]))
+    report = {"machine": machine(), "against": plan.against, "repeat": plan.repeat, "scenes": []}
+    whole = True
+    with Interrupts() as interrupts:
+        for name, file in _plot_names(files):
+            try:
+                with interrupts.raised():
+                    scene = measure(file, defines, plan)
+            except (KeyboardInterrupt, Exception) as error:
+                if not report["scenes"]:
+                    raise
+                stopped = isinstance(error, KeyboardInterrupt)
+                why = "interrupted" if stopped else f"{file}: {type(error).__name__}: {error}"
+                say(f"{why}; {len(report['scenes'])} of {len(files)} scenes are done")
+                return report, False
+            for failure in scene["failures"]:
+                say(f"{file}: {failure}")
+            whole &= not scene["failures"]
+            report["scenes"].append({**scene, "plot": None})
+            if folder is not None:
+                _write(report, folder, name, output)
+    return report, whole
 
 
 def _write(report: dict, folder: Path, name: str, output: Output) -> None:

@@ -1,5 +1,51 @@
-"""The command line."""
+"""The command line: parses, calls, prints. Results on stdout; progress and messages on stderr.
 
-from pathjax.cli.commands import main
+A command is a module of its name, whose `run(options, output)` returns the exit status: 0 done, 1 the work failed (of
+`compare`: the images differ), 2 the command or a file is wrong.
+"""
 
-__all__ = ["main"]
+from __future__ import annotations
+
+import contextlib
+import importlib
+import warnings
+
+from pathjax.cli.arguments import parser
+from pathjax.errors import InputError, InputWarning
+from pathjax.system.interrupts import leave
+from pathjax.system.output import Output, say
+
+DONE, FAILED, WRONG = 0, 1, 2
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run a command and return its exit status."""
+    options, output = parser().parse_args(arguments), Output()
+    with _warnings_as_messages():
+        try:
+            # Only the command that is asked for: the solvers of `fit` alone take half a second.
+            status = importlib.import_module(f"pathjax.cli.{options.command}").run(options, output)
+        except InputError as error:
+            say(str(error))
+            status = WRONG
+        except KeyboardInterrupt:
+            say("interrupted" if output.written else "interrupted; nothing was written")
+            status = FAILED
+    return leave(FAILED if output.failed and status == DONE else status)
+
+
+@contextlib.contextmanager
+def _warnings_as_messages():
+    """Print an InputWarning as a message; never raise it, whatever Python was told to do with warnings."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("default", InputWarning)
+        plain = warnings.showwarning
+
+        def show(message, category, *place):
+            if issubclass(category, InputWarning):
+                say(str(message))
+            else:
+                plain(message, category, *place)
+
+        warnings.showwarning = show
+        yield

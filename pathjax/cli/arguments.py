@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Callable
 
 
-def parser(commands: dict[str, Callable]) -> argparse.ArgumentParser:
-    """commands: by name what `run` of the parsed options is."""
+def parser() -> argparse.ArgumentParser:
+    """Of the whole command line; `command` of what it parses is the command's name."""
     program = argparse.ArgumentParser(prog="pathjax", description="A differentiable Monte Carlo path tracer.")
-    subparsers = program.add_subparsers(required=True, metavar="COMMAND")
+    subparsers = program.add_subparsers(required=True, dest="command", metavar="COMMAND")
 
     render = subparsers.add_parser("render", help="render a scene to an image")
     _add_scene(render)
@@ -81,8 +80,6 @@ def parser(commands: dict[str, Callable]) -> argparse.ArgumentParser:
     picture = "a picture: A, B, their difference (red: A is brighter) and, with --errors, its z-scores"
     compare.add_argument("-o", "--output", metavar="DIFF.png", help=picture)
     compare.add_argument("--json", action="store_true", help="print one JSON object on stdout")
-    for name, run in commands.items():
-        subparsers.choices[name].set_defaults(run=run)
     return program
 
 

@@ -34,6 +34,7 @@ from pathjax.inverse.programs import Stepper, kept
 from pathjax.inverse.uncertainty import Evidence
 from pathjax.scene.parameters import with_parameters
 from pathjax.scene.scene import Scene
+from pathjax.system.interrupts import Interrupts
 
 # Samples per pixel of the approach. Newton's method begins with a part of the samples that `fit` is given.
 APPROACH_SPP, COARSE_PART = 16, 4
@@ -174,11 +175,13 @@ class _Run:
         self.free, self.scale = np.ones(self.n, bool), self.coordinates.scale(self.v)
 
     def run(self, scan: bool) -> Fit:
-        try:
-            converged, message = self._stages(scan)
-        except KeyboardInterrupt:
-            converged, message = False, "interrupted"
-        return self._result(converged, message)
+        with Interrupts() as interrupts:
+            try:
+                with interrupts.raised():
+                    converged, message = self._stages(scan)
+            except KeyboardInterrupt:
+                converged, message = False, "interrupted"
+            return self._result(converged, message)
 
     def _stages(self, scan):
         candidates = self._scanned() if scan else [self.v]

@@ -1,24 +1,33 @@
-"""Signals that ask the program to end, held back while work is finished."""
+"""Signals that ask the program to end: Ctrl-C, `kill` and a closed terminal. The whole package hears them here.
+
+Work that must not be left half done stands within `Interrupts`, where signals are only noted; parts of it that may
+be given up stand within its `raised`. What cannot be stopped, since it runs in XLA, is waited for by `wait_for`; so is
+what takes long in Python, as an exception that is raised while Python collects garbage is lost.
+"""
 
 from __future__ import annotations
 
+import os
 import signal
+import sys
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 
-# Ctrl-C, `kill`, and a terminal that was closed, which not every system knows.
+# Not every system has the one of a closed terminal.
 SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
+
+_waited_for: list[threading.Thread] = []
 
 
 class Interrupts:
-    """Within it the signals are only noted, so that no work is left half done; a second one acts as ever.
+    """Within it signals are noted, however many come, and nothing else happens.
 
     In other threads than the main one, where Python hears no signals, and for signals that the process ignores it does
     nothing.
     """
 
-    heard = False
+    heard = False  # whether a signal came, also to an `Interrupts` around or within this one
     _raises = False
 
     def __enter__(self):
@@ -26,12 +35,21 @@ class Interrupts:
         if threading.current_thread() is threading.main_thread():
             for number in SIGNALS:
                 if signal.getsignal(number) != signal.SIG_IGN:
-                    self._earlier[number] = signal.signal(number, self._hear)
+                    self._earlier[number] = signal.signal(number, self._note)
+        owners = {getattr(handler, "__self__", None) for handler in self._earlier.values()}
+        self._around = [owner for owner in owners if isinstance(owner, Interrupts)]
+        self.heard = any(around.heard for around in self._around)
         return self
 
+    def __exit__(self, *_):
+        for number, handler in self._earlier.items():
+            signal.signal(number, signal.SIG_DFL if handler is None else handler)
+        for around in self._around:
+            around.heard |= self.heard
+
     @contextmanager
-    def let_through(self) -> Iterator[None]:
-        """For a part of the work that may be given up: a signal raises KeyboardInterrupt, also one heard before."""
+    def raised(self) -> Iterator[None]:
+        """For a part of the work that may be given up: a signal raises KeyboardInterrupt, also one that came before."""
         self._raises = True
         try:
             if self.heard:
@@ -40,16 +58,45 @@ class Interrupts:
         finally:
             self._raises = False
 
-    def _hear(self, number, frame):
+    def _note(self, number, frame):
         self.heard = True
-        self._restore()
         if self._raises:
             raise KeyboardInterrupt
 
-    def __exit__(self, *_):
-        self._restore()
 
-    def _restore(self):
-        while self._earlier:
-            number, handler = self._earlier.popitem()
-            signal.signal(number, signal.SIG_DFL if handler is None else handler)
+def wait_for(call: Callable):
+    """Return the call's result, or raise KeyboardInterrupt as soon as a signal does, while the call itself goes on.
+
+    It goes on in a thread of its own, so the program must end by `leave`.
+    """
+    outcome = []
+
+    def work():
+        try:
+            outcome.append((True, call()))
+        except BaseException as error:
+            outcome.append((False, error))
+
+    thread = threading.Thread(target=work, daemon=True)
+    _waited_for.append(thread)
+    thread.start()
+    while thread.is_alive():
+        thread.join(0.1)
+    _waited_for.remove(thread)
+    succeeded, result = outcome[0]
+    if not succeeded:
+        raise result
+    return result
+
+
+def leave(status: int) -> int:
+    """Return a program's exit status; or end it, if a call that it no longer waits for goes on.
+
+    XLA aborts the process if the interpreter ends under such a call.
+    """
+    if any(thread.is_alive() for thread in _waited_for):
+        for stream in (sys.stdout, sys.stderr):
+            with suppress(Exception):
+                stream.flush()
+        os._exit(status)
+    return status

@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 
 import numpy as np
@@ -16,8 +17,7 @@ import pytest
 import trimesh
 
 import pathjax as pj
-from pathjax import images, inverse
-from pathjax.cli import commands as cli
+from pathjax import cli, images, inverse
 from pathjax.images import linear_to_srgb, read_exr, read_rgb, write_exr, write_png
 from pathjax.rendering import bounces
 from pathjax.rendering.progressive import until
@@ -403,6 +403,42 @@ def test_bounces_that_fail_cost_no_image(run, tmp_path, monkeypatch, error, says
     assert set(read_exr(tmp_path / "a.exr")[0]) == {"R", "G", "B", "error.R", "error.G", "error.B"}
 
 
+@sends_signals
+def test_signals_that_come_after_the_image_is_rendered_cost_the_bounces_alone(run, tmp_path, monkeypatch):
+    """One while the bounces are rendered, and two more while the image is written."""
+    numbers = [signal.SIGINT, signal.SIGTERM]
+    earlier = [signal.signal(number, signal.default_int_handler) for number in numbers]
+    rendering, written = [], threading.Event()
+
+    def render_bounces(*arguments):
+        rendering.append(threading.current_thread())
+        signal.raise_signal(signal.SIGINT)
+        written.wait(30)
+        return pj.render_bounces(*arguments)
+
+    def write(*arguments, plain=images.write_exr):
+        for number in numbers:
+            signal.raise_signal(number)
+        plain(*arguments)
+        written.set()
+        rendering[0].join()
+
+    monkeypatch.setattr(bounces, "render_bounces", render_bounces)
+    monkeypatch.setattr(images, "write_exr", write)
+    arguments = ("-D", "max_depth=3", "--aov", "error,bounces", "--spp", 4)
+    try:
+        status, _, err = run("render", FURNACE, *SMALL, "-o", tmp_path / "a.exr", *arguments)
+    finally:
+        for number, handler in zip(numbers, earlier, strict=True):
+            signal.signal(number, handler)
+    assert status == 1
+    assert "interrupted; the bounces are left out" in err
+    channels, _ = read_exr(tmp_path / "a.exr")
+    assert set(channels) == {*"RGB", "error.R", "error.G", "error.B"}
+    expected = pj.render_until(pj.load_scene(FURNACE, res=8, max_depth=3), spp=4).image
+    np.testing.assert_array_equal(channels["R"], expected[..., 0])
+
+
 def test_a_terminal_that_lacks_letters_shows_their_codes(run, root, tmp_path, monkeypatch):
     scene = tmp_path / "a.xml"
     scene.write_text((root / FURNACE).read_text().replace('"wall"', '"weiß"'), encoding="utf-8")
@@ -761,12 +797,13 @@ def first_line_with(stream, text):
     raise AssertionError(f"{text!r} did not come")
 
 
-# Says when a mesh begins to load, when the first call of the kernel begins, and when some calls are done, so that the
-# signal comes at a known time; then runs the same command line.
+# Says when a mesh begins to load, when the first call of the kernel begins, when some calls are done, and when bounces
+# begin, so that the signal comes at a known time; then runs the same command line.
 TELLTALE = """
 import sys
-from pathjax.cli import commands as cli
+from pathjax import cli
 from pathjax.rendering.progressive import passes as progressive
+from pathjax.rendering import bounces
 from pathjax.io import mesh
 
 def tell(what):
@@ -786,6 +823,11 @@ def extend(*arguments, plain=progressive.extend):
             tell("kernel ran")
         yield
 
+def render_bounces(*arguments, plain=bounces.render_bounces):
+    tell("bounces begin")
+    return plain(*arguments)
+
+bounces.render_bounces = render_bounces
 mesh.load, progressive.compile, progressive.extend = load, compile, extend
 sys.exit(cli.main(sys.argv[1:]))
 """
@@ -845,6 +887,18 @@ def test_interrupt_keeps_what_is_done(interrupt, tmp_path):
 
 
 @sends_signals
+def test_interrupt_while_bounces_are_compiled_writes_the_image_at_once(interrupt, tmp_path):
+    output = tmp_path / "a.exr"
+    arguments = ("render", "scenes/cornell_box.xml", "-D", "res=32", "-o", output, "--spp", 16, "--aov", "bounces")
+    status, _, err, seconds = interrupt(arguments, "bounces begin", 0.2)
+    assert status == 1
+    assert "Traceback" not in err
+    assert "interrupted; the bounces are left out" in err
+    assert seconds < SOON
+    assert set(read_exr(output)[0]) == {"R", "G", "B"}
+
+
+@sends_signals
 @pytest.mark.parametrize("event, wait", [("mesh loads", 0.1), ("kernel compiles", 1.5)])
 def test_interrupt_before_the_first_pass_ends_quickly_and_writes_nothing(interrupt, tmp_path, event, wait):
     arguments = ("render", "scenes/mesh.xml", "-o", tmp_path / "a.exr", "--spp", 1_000_000)
@@ -861,7 +915,7 @@ def test_interrupt_before_the_first_pass_ends_quickly_and_writes_nothing(interru
 # The same command line; then says how many programs were wanted of the cache, and how many it held.
 COUNTED = """
 import sys
-from pathjax.cli import commands as cli
+from pathjax import cli
 import jax
 
 events = []

@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 from scipy import stats
 
-from pathjax.cli import commands as cli
+from pathjax import cli
 from pathjax.images import comparison, metrics, read_rgb, write_exr, write_png
 
 GREY = np.full((16, 24, 3), 0.3, np.float32)

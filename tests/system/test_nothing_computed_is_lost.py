@@ -99,7 +99,7 @@ def test_text_is_escaped_for_a_terminal_that_lacks_letters(monkeypatch):
 SCRIPT = """
 import sys
 from pathjax import __main__ as program
-from pathjax.cli import commands as cli
+from pathjax import cli
 from pathjax.system.output import Output, say
 
 def main():

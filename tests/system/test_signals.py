@@ -8,7 +8,7 @@ import threading
 
 import pytest
 
-from pathjax.system.interrupts import SIGNALS, Interrupts
+from pathjax.system.interrupts import SIGNALS, Interrupts, leave, wait_for
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="sends signals")
 
@@ -21,35 +21,39 @@ def number(request):
     signal.signal(request.param, earlier)
 
 
-def test_the_first_signal_is_noted_and_the_second_acts(number):
-    with pytest.raises(KeyboardInterrupt):
-        with Interrupts() as interrupts:
+def test_signals_are_noted_however_many_come(number):
+    with Interrupts() as interrupts:
+        assert not interrupts.heard
+        for _ in range(3):
             signal.raise_signal(number)
             assert interrupts.heard
-            signal.raise_signal(number)
     assert signal.getsignal(number) is signal.default_int_handler
 
 
-def test_what_is_nested_notes_one_signal_each(number):
+def test_what_is_heard_within_is_heard_around_it_and_after_it(number):
     with Interrupts() as outer:
+        with Interrupts():
+            pass
+        assert not outer.heard
         with Interrupts() as inner:
             signal.raise_signal(number)
-            assert inner.heard and not outer.heard
-            signal.raise_signal(number)
-            assert outer.heard
+            assert inner.heard
+        assert outer.heard
+        with Interrupts() as later:
+            assert later.heard
 
 
 def test_work_that_may_be_given_up_is(number):
     with Interrupts() as interrupts:
-        with pytest.raises(KeyboardInterrupt), interrupts.let_through():
+        with pytest.raises(KeyboardInterrupt), interrupts.raised():
             signal.raise_signal(number)
-        with pytest.raises(KeyboardInterrupt), interrupts.let_through():
+        with pytest.raises(KeyboardInterrupt), interrupts.raised():
             pytest.fail("it began after a signal")
 
 
 def test_a_signal_after_such_work_is_noted(number):
     with Interrupts() as interrupts:
-        with interrupts.let_through():
+        with interrupts.raised():
             pass
         signal.raise_signal(number)
     assert interrupts.heard
@@ -72,6 +76,37 @@ def test_other_threads_change_nothing(number):
     thread.start()
     thread.join()
     assert handlers == [signal.default_int_handler]
+
+
+# ---- calls that cannot be stopped -----------------------------------------------------------------------------------
+
+
+def test_the_result_of_a_call_and_its_error_arrive():
+    assert wait_for(lambda: threading.current_thread().daemon) is True
+    with pytest.raises(ZeroDivisionError):
+        wait_for(lambda: 1 / 0)
+    assert leave(2) == 2
+
+
+# Waits for a call that takes a minute, and leaves as if it had failed.
+STUCK = """
+import time
+from pathjax.system.interrupts import leave, wait_for
+try:
+    wait_for(lambda: print("begun", flush=True) or time.sleep(60))
+except KeyboardInterrupt:
+    print("left", end="")
+raise SystemExit(leave(7))
+"""
+
+
+def test_a_signal_ends_the_waiting_and_the_program_though_the_call_goes_on(root):
+    command, pipe = [sys.executable, "-c", STUCK], subprocess.PIPE
+    with subprocess.Popen(command, cwd=root, stdout=pipe, text=True, start_new_session=True) as process:
+        assert process.stdout.readline() == "begun\n"
+        process.send_signal(signal.SIGINT)
+        out, _ = process.communicate(timeout=30)
+    assert (process.returncode, out) == (7, "left")
 
 
 # ---- the tests themselves -------------------------------------------------------------------------------------------

@@ -1,10 +1,12 @@
-"""What `pathjax info` tells: what a scene holds, what is compiled for it, its parameters, its hierarchies."""
+"""`pathjax info`: what a scene holds, what is compiled for it, its parameters, its hierarchies."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from pathjax import bsdfs, emitters
+from pathjax.cli import DONE
+from pathjax.cli.inputs import load
 from pathjax.rendering import bounces
 from pathjax.scene.parameters import parameters
 from pathjax.scene.scene import UNBOUNDED, Scene
@@ -13,11 +15,22 @@ from pathjax.shapes import geometry
 from pathjax.shapes.accel.leaves import rows_of
 from pathjax.shapes.box import Boxes
 from pathjax.shapes.planar import Planar
+from pathjax.system.json_text import json_text
+from pathjax.system.output import Output
 
 _SAMPLER = "randomly shifted lattice, hashing for roulette"
 
 
-def facts(scene: Scene) -> dict:
+def run(options, output: Output) -> int:
+    scene = load(options)
+    facts = scene_facts(scene)
+    if options.tail is not None:
+        facts["tail"] = tail_facts(scene, options.tail)
+    output.text(json_text(facts) if options.json else text(facts))
+    return DONE
+
+
+def scene_facts(scene: Scene) -> dict:
     """What `json_text` writes of a scene."""
     about = scene.about
     description = about.description

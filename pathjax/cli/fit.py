@@ -1,0 +1,46 @@
+"""`pathjax fit`: parameters from an image of the scene."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from rich.console import Console
+from rich.markup import escape
+
+from pathjax import images, inverse
+from pathjax.cli import DONE, FAILED
+from pathjax.cli.inputs import load, numbers
+from pathjax.inverse import report
+from pathjax.inverse.fitting import step_text
+from pathjax.system.files import check_writable, write_text
+from pathjax.system.interrupts import Interrupts
+from pathjax.system.json_text import json_text
+from pathjax.system.output import Output
+
+
+def run(options, output: Output) -> int:
+    table, picture = (Path(f"{Path(options.output)}{suffix}") for suffix in (".json", ".png"))
+    for path in (table, picture):
+        check_writable(path, [options.target, options.scene])
+    start, names = {}, []
+    for text in options.params:
+        name, equals, value = text.partition("=")
+        names.append(name)
+        if equals:
+            start[name] = numbers("--param", name, value)
+    target = inverse.read_target(options.target)
+    scene = load(options)
+    with Interrupts():
+        with Console(stderr=True).status("compiling") as status:
+
+            def show(entry):
+                status.update(escape(step_text(entry)))
+
+            fit = inverse.fit(scene, target, names, start=start, spp=options.spp, seed=options.seed, progress=show)
+        facts = {"scene": str(options.scene), "target": str(options.target), "spp": options.spp, "seed": options.seed}
+        facts |= report.facts(fit)
+        output.file(table, lambda path: write_text(path, json_text(facts, indent=1) + "\n"))
+        if fit.images:
+            output.file(picture, lambda path: images.write_png(path, report.picture(fit, [target.image])))
+        output.text(json_text(facts) if options.json else report.text(fit))
+    return DONE if fit.converged else FAILED

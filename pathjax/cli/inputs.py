@@ -1,0 +1,31 @@
+"""What commands take: scenes, with their parameters set, and numbers."""
+
+from __future__ import annotations
+
+from pathjax.compile import runtime
+from pathjax.errors import InputError
+from pathjax.io.mitsuba import loader
+from pathjax.scene.builder import build
+from pathjax.scene.parameters import with_parameters
+from pathjax.scene.scene import Scene
+from pathjax.system.interrupts import wait_for
+
+
+def load(options) -> Scene:
+    """The scene of a command, with its `-D` and `--set`. Whether it is dark is not told here."""
+    return wait_for(lambda: _load(options))
+
+
+def _load(options) -> Scene:
+    runtime.keep_kernels()
+    scene = build(loader.load(options.scene, **dict(options.defines)))
+    return with_parameters(scene, {name: numbers("--set", name, text) for name, text in options.settings})
+
+
+def numbers(option: str, name: str, text: str) -> float | list[float]:
+    """The value of `option NAME=text`."""
+    try:
+        values = [float(part) for part in text.split(",")]
+    except ValueError:
+        raise InputError(f"{option} {name}={text}: a value is a number, or three separated by commas") from None
+    return values[0] if len(values) == 1 else values
