@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from pathjax.errors import InputError
-from pathjax.inverse.coordinates import Coordinates
+from pathjax.images.metrics import ROUNDING
+from pathjax.inverse.parameter_vector import ParameterVector
 from pathjax.inverse.target import Target
 from pathjax.scene import parameters as named
 from pathjax.scene.scene import Scene
@@ -56,9 +57,28 @@ class Problem:
     scenes: list[Scene]
     targets: list[Target]  # exposed, of arrays (H, W, 3) throughout; the image is 0 where it is not measured
     exposure: float  # a power of 2 that brings the targets to a level near 1: squares of radiances may leave float32
+    rounding: float  # what float32 leaves of the mean of a pixel at that level; scenes without noise are fitted to it
     groups: list[Views]
-    coordinates: Coordinates
+    vector: ParameterVector
     start: np.ndarray  # (n,) values
+
+    @staticmethod
+    def with_values(scene: Scene, values) -> Scene:
+        """The scene with those of the values by name that it holds."""
+        return named.with_parameters(scene, {name: v for name, v in values.items() if name in scene.about.parameters})
+
+    def by_view(self, flat: np.ndarray) -> list[np.ndarray]:
+        """(N, 3) of all groups one after another to (H, W, 3) of each view, in the caller's order."""
+        images, first = {}, 0
+        for views in self.groups:
+            stack = flat[first : first + views.targets.size // 3].reshape(views.targets.shape)
+            images.update(zip(views.numbers, stack, strict=True))
+            first += views.targets.size // 3
+        return [images[number] for number in range(len(images))]
+
+    def flat(self, by_view: list[np.ndarray]) -> np.ndarray:
+        """The inverse of `by_view`."""
+        return np.concatenate([by_view[number].reshape(-1, 3) for views in self.groups for number in views.numbers])
 
 
 def build(scene, target, names, start) -> Problem:
@@ -85,8 +105,8 @@ def build(scene, target, names, start) -> Problem:
         dtype = scenes[0].camera.origin.dtype
         values[name] = named.checked(f"start of {name}:", value, found[name], dtype)
     targets = [_target(s, t, i, len(scenes)) for i, (s, t) in enumerate(zip(scenes, targets, strict=True))]
-    coordinates = Coordinates(tuple(found.items()))
-    pixels, unknowns = sum(int(t.usable.any(-1).sum()) for t in targets), len(coordinates.labels)
+    vector = ParameterVector(tuple(found.items()))
+    pixels, unknowns = sum(int(t.usable.any(-1).sum()) for t in targets), len(vector.labels)
     if not pixels:
         raise InputError("every pixel of the target is clipped or left out; give one that is exposed for the scene")
     if pixels < unknowns:
@@ -96,8 +116,9 @@ def build(scene, target, names, start) -> Problem:
     targets = [
         replace(t, image=t.image * exposure, step=t.step * exposure, ceiling=t.ceiling * exposure) for t in targets
     ]
+    rounding = ROUNDING * max(level * exposure, np.finfo(np.float32).tiny ** 0.25)  # its square must be a number
     groups = _groups(scenes, targets, exposure, names)
-    return Problem(scenes, targets, exposure, groups, coordinates, coordinates.pack(values))
+    return Problem(scenes, targets, exposure, rounding, groups, vector, vector.pack(values))
 
 
 def _target(scene, target, number, count) -> Target:

@@ -3,13 +3,15 @@
 import functools
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 import pytest
 
 import pathjax as pj
 from pathjax.images import read_rgb, write_exr, write_png
-from pathjax.inverse import fitting, report
+from pathjax.inverse import report, weights
+from pathjax.inverse.compiled_cache import identity
 from pathjax.system.json_text import json_text
 
 # A floor and a wall that light each other under a sky.
@@ -203,6 +205,27 @@ def test_a_second_fit_of_the_problem_does_not_compile(make_scene):
     assert again.values[NAMES[0]].tolist() != first.values[NAMES[0]].tolist()
 
 
+def test_programs_are_shared_by_solvers_that_are_the_same_and_by_no_others():
+    def solver(rtol=1e-4, norm=optx.max_norm, **more):
+        return optx.BFGS(rtol, 1e-4, norm=norm, **more)
+
+    assert identity(solver()) == identity(solver())
+    assert hash(identity(solver())) == hash(identity(solver()))
+    arrays = [np.zeros(2000), np.r_[np.zeros(1000), 1, np.zeros(999)]]  # of which numpy abbreviates the middle
+    norms = [lambda x: optx.max_norm(x), lambda x: optx.max_norm(x)]
+    others = [
+        solver(2e-4),
+        optx.BFGS(1e-4, 2e-4),
+        optx.LevenbergMarquardt(1e-4, 1e-4),
+        optx.BestSoFarMinimiser(solver()),
+        solver(use_inverse=False),
+        *(solver(norm=norm) for norm in norms),
+        *(solver(rtol=jnp.asarray(array)) for array in arrays),
+    ]
+    assert repr(others[-1]) == repr(others[-2])
+    assert len({identity(other) for other in (solver(), *others)}) == 1 + len(others)
+
+
 def test_an_interrupted_fit_returns_what_it_has(room, target):
     def stop(entry):
         if entry["stage"] == "refine":
@@ -283,11 +306,11 @@ def test_a_clipped_pixel_says_that_no_darker_image_fits(room, target_image):
     assert not fit.converged and "structure" in fit.message
 
 
-@pytest.mark.parametrize("margin", [fitting.CLIP_MARGIN, pytest.param(0, marks=pytest.mark.xfail(strict=True))])
+@pytest.mark.parametrize("margin", [weights.CLIP_MARGIN, pytest.param(0, marks=pytest.mark.xfail(strict=True))])
 def test_noise_that_is_clipped_does_not_move_the_answer(room, monkeypatch, margin):
     """Targets of 16 spp, the brightest 5 % clipped. Where pixels are left out for their own noise, the mean z of
     12 fits is far off; else it is known to 0.3, and one of 6 lies beyond 1.3 with a chance of 4e-5."""
-    monkeypatch.setattr(fitting, "CLIP_MARGIN", margin)
+    monkeypatch.setattr(weights, "CLIP_MARGIN", margin)
     truth, z = pj.parameters(room), []
     for seed in range(12):
         image = np.asarray(pj.render(room, 16, seed=50 + seed))
@@ -376,7 +399,7 @@ def test_ior_and_colours_are_recovered_together(ball, ball_target):
     ],
 )
 def test_bad_input_is_refused_before_anything_is_rendered(room, monkeypatch, change, words):
-    monkeypatch.setattr("pathjax.runtime.native_map", None)
+    monkeypatch.setattr("pathjax.compile.runtime.native_map", None)
     monkeypatch.setattr(jax, "jit", None)
     arguments = {"scene": room, "target": np.ones((16, 16, 3)), "names": NAMES, **change}
     if change.get("scene") == []:

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable, Hashable
 
 import equinox as eqx
 import jax
+import numpy as np
 
 
 class Stepper:
-    """An optimistix solver taken step by step."""
+    """An optimistix solver taken step by step, compiled."""
 
-    def __init__(self, solver, fn, y, arguments):
+    def __init__(self, solver, fn: Callable, y, arguments):
         def begin(y, arguments):
             f, aux = jax.eval_shape(fn, y, arguments)
             return solver.init(fn, y, arguments, {}, f, aux, frozenset())
@@ -30,8 +32,8 @@ _programs: dict = {}
 _MAX_PROGRAMS = 12
 
 
-def kept(key, make, *arguments):
-    """make(*arguments), or what it made for arguments of the same structure and shapes before; and its seconds."""
+def compiled(key: Hashable, make: Callable, *arguments):
+    """Return make(*arguments), or what it made for this key and arguments of these shapes before; and its seconds."""
     leaves, tree = jax.tree.flatten(arguments)
     key = key, tree, tuple((leaf.shape, leaf.dtype) for leaf in leaves)
     started = time.perf_counter()
@@ -40,3 +42,16 @@ def kept(key, make, *arguments):
             del _programs[next(iter(_programs))]
         _programs[key] = make(*arguments)
     return _programs[key], time.perf_counter() - started
+
+
+def identity(solver) -> Hashable:
+    """Equal for solvers of one class with the same hyperparameters, functions and arrays, and for no others."""
+    leaves, tree = jax.tree.flatten(solver)
+    return tree, tuple(_identity(leaf) for leaf in leaves)
+
+
+def _identity(leaf) -> Hashable:
+    if isinstance(leaf, jax.Array | np.ndarray):
+        leaf = np.asarray(leaf)
+        return leaf.shape, leaf.dtype, leaf.tobytes()
+    return type(leaf), leaf  # 1 and 1.0 make different programs

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -16,23 +17,20 @@ _EDGE = 1e-3
 
 
 @dataclass(frozen=True)
-class Coordinates:
-    """Components one after another: a number, or the r, g, b of a colour. Static and hashable."""
+class ParameterVector:
+    """The components of parameters one after another, such as the r, g, b of a colour. Static and hashable."""
 
     parameters: tuple[tuple[str, Parameter], ...]
 
     @property
     def labels(self) -> list[str]:
-        return [
-            name if not p.shape else f"{name}.{channel}"
-            for name, p in self.parameters
-            for channel in ("rgb" if p.shape else " ")
-        ]
+        """Of the components: `glass.int_ior`, `white.reflectance.r`, `wall.reflectance[0, 2].r`."""
+        return [f"{name}{suffix}" for name, p in self.parameters for suffix in _suffixes(p.shape)]
 
     @property
     def bounds(self) -> np.ndarray:
         """(n, 2)."""
-        return np.array([p.bounds for _, p in self.parameters for _ in range(p.shape[0] if p.shape else 1)])
+        return np.array([p.bounds for _, p in self.parameters for _ in range(math.prod(p.shape))])
 
     def pack(self, values: Mapping) -> np.ndarray:
         """(n,) float64."""
@@ -43,20 +41,17 @@ class Coordinates:
         """(n,) -> name -> array of the parameter's shape."""
         values, first = {}, 0
         for name, p in self.parameters:
-            size = p.shape[0] if p.shape else 1
+            size = math.prod(p.shape)
             values[name] = vector[first : first + size].reshape(p.shape)
             first += size
         return values
 
-    def columns(self, jacobian, image_shape):
+    def columns(self, jacobian: Mapping, image_shape: tuple[int, ...]) -> jax.Array:
         """A Jacobian by name as (*image_shape, n), 0 for names that it lacks."""
         parts = []
         for name, p in self.parameters:
-            size = p.shape[0] if p.shape else 1
-            if name in jacobian:
-                parts.append(jacobian[name].reshape(*image_shape, size))
-            else:
-                parts.append(jnp.zeros((*image_shape, size)))
+            shape = *image_shape, math.prod(p.shape)
+            parts.append(jacobian[name].reshape(shape) if name in jacobian else jnp.zeros(shape))
         return jnp.concatenate(parts, axis=-1)
 
     def bounded(self, x):
@@ -66,15 +61,22 @@ class Coordinates:
         width = jnp.where(two, high - low, 1)
         return low + jnp.where(two, width * jax.nn.sigmoid(x), jax.nn.softplus(jnp.where(two, 0, x)))
 
-    def unbounded(self, v) -> np.ndarray:
+    def unbounded(self, values) -> np.ndarray:
         """Inverse of `bounded`; values at a bound are taken a little inside."""
         low, high = self.bounds.T
         two = np.isfinite(high)
         width = np.where(two, high - low, 1)
-        share = np.clip((v - low) / width, _EDGE, np.where(two, 1 - _EDGE, np.inf))
+        share = np.clip((values - low) / width, _EDGE, np.where(two, 1 - _EDGE, np.inf))
         return np.where(two, np.log(share) - np.log1p(-np.where(two, share, 0)), share + np.log(-np.expm1(-share)))
 
-    def scale(self, v) -> np.ndarray:
+    def scale(self, values) -> np.ndarray:
         """(n,) what counts as a large change: the range between two bounds, else the value itself."""
         low, high = self.bounds.T
-        return np.where(np.isfinite(high), high - low, np.maximum(np.abs(v - np.maximum(low, 0)), _EDGE))
+        return np.where(np.isfinite(high), high - low, np.maximum(np.abs(values - np.maximum(low, 0)), _EDGE))
+
+
+def _suffixes(shape: tuple[int, ...]) -> list[str]:
+    """Of the components of a parameter; where the last of several axes has the length 3, it is r, g, b."""
+    channels = [".r", ".g", ".b"] if shape[-1:] == (3,) else [""]
+    places = np.ndindex(shape[:-1] if shape[-1:] == (3,) else shape)
+    return [f"{list(place) if place else ''}{channel}" for place in places for channel in channels]

@@ -5,13 +5,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pathjax.inverse.coordinates import Coordinates
+from pathjax.inverse.parameter_vector import ParameterVector
 from pathjax.kinds.parameter import Parameter
 
 COLOR = Parameter(("a",), (0,), (3,), (0, 1))
 IOR = Parameter(("b",), (0,), (), (1e-38, np.inf))
 RADIANCE = Parameter(("c",), (0,), (3,), (0, np.inf))
-BOTH = Coordinates((("paint.reflectance", COLOR), ("glass.int_ior", IOR), ("lamp.radiance", RADIANCE)))
+BOTH = ParameterVector((("paint.reflectance", COLOR), ("glass.int_ior", IOR), ("lamp.radiance", RADIANCE)))
 VALUES = {"paint.reflectance": [0.1, 0.5, 0.9], "glass.int_ior": 1.5, "lamp.radiance": [3.0, 20, 0.2]}
 
 
@@ -21,6 +21,19 @@ def test_components_are_named_by_channel():
         "glass.int_ior",
         *(f"lamp.radiance.{c}" for c in "rgb"),
     ]
+
+
+def test_components_of_textures_and_tables_are_named_by_their_place():
+    shapes = {"wall.reflectance": (2, 1, 3), "volume.density": (2, 2)}
+    vector = ParameterVector(tuple((name, Parameter((name,), (0,), shape, (0, 1))) for name, shape in shapes.items()))
+    assert vector.labels == [
+        *(f"wall.reflectance[{row}, 0].{c}" for row in range(2) for c in "rgb"),
+        *(f"volume.density[{i}, {j}]" for i in range(2) for j in range(2)),
+    ]
+    values = {name: np.arange(np.prod(shape)).reshape(shape) for name, shape in shapes.items()}
+    for name, value in vector.unpack(vector.pack(values)).items():
+        np.testing.assert_array_equal(value, values[name])
+    assert len(vector.bounds) == 10
 
 
 def test_unpack_inverts_pack():
@@ -45,7 +58,7 @@ def test_any_coordinates_give_values_within_the_bounds():
 
 def test_values_at_a_bound_can_be_left():
     """The derivative there must not vanish, or a start at a bound would stay."""
-    ends = Coordinates((("paint.reflectance", COLOR),))
+    ends = ParameterVector((("paint.reflectance", COLOR),))
     x = jnp.asarray(ends.unbounded(np.array([0.0, 1.0, 0.5])), jnp.float32)
     slope = np.diag(jax.jacfwd(ends.bounded)(x))
     assert (slope > 1e-4).all() and np.isfinite(slope).all()

@@ -1,0 +1,42 @@
+"""The first stage of a fit: least squares of renders with a fixed seed, which are a deterministic function."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+
+from pathjax.inverse import losses
+from pathjax.inverse.state import State
+
+APPROACH_SPP = 16
+MAX_STEPS, MAX_REJECTED = 30, 3
+
+
+def approach(state: State) -> None:
+    """Move the values to a minimum near them, as far as few samples tell."""
+    spp, vector = min(APPROACH_SPP, state.spp), state.vector
+    state.weigh(spp)
+    x = jnp.asarray(vector.unbounded(state.values), state.dtype)
+    # In units of the noise at this level; but a start far off is no more than 1 on average, since the first steps of
+    # solvers suppose numbers of that size.
+    squares = state.weights * state.evidence.residuals[0] ** 2
+    shrink = 1 / max(1, float(squares.mean()))
+    weights = jnp.asarray(state.weights * shrink)
+    arguments = state.groups, weights, jnp.uint32(spp), state.seed, state.next_draw()
+    least_squares = isinstance(state.solver, optx.AbstractLeastSquaresSolver)
+    loss = losses.residuals if least_squares else losses.loss
+    program = state.program(loss, x, arguments, solver=state.solver)
+    solver_state = program.begin(x, arguments)
+    lowest, rejected = np.inf, 0
+    for _ in range(MAX_STEPS):
+        x, solver_state, loss, done = program.step(x, solver_state, arguments)
+        loss = float(loss) / shrink
+        state.values = np.asarray(vector.bounded(x), float)
+        state.record("approach", spp, loss)
+        # The solver tells the loss one step late, and the same one again after a step that it took back. A step that
+        # gains less than the loss is uncertain by is left to the next stage.
+        rejected = rejected + 1 if loss == lowest else 0
+        if bool(done) or rejected > MAX_REJECTED or 0 < lowest - loss < max(len(x) / 2, np.sqrt(loss)):
+            break
+        lowest = min(lowest, loss)

@@ -1,0 +1,79 @@
+"""The last stage of a fit: Newton's method for the root of the score of two independent renders."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pathjax.inverse import uncertainty, weights
+from pathjax.inverse.state import State
+
+# The first steps are made with this part of the samples.
+COARSE_PART = 4
+MAX_STEPS = 8
+# The method ends with a step below this part of the standard errors, and takes none beyond this part of the scale.
+SMALL_STEP, LARGE_STEP = 0.3, 0.3
+
+
+def refine(state: State) -> tuple[bool, str]:
+    """Move the values to the root, and find their covariance. Returns whether it converged, and what to mind."""
+    low, high = state.vector.bounds.T
+    _newton(state, max(state.spp // COARSE_PART, 1), small=1)
+    while True:
+        settled = _newton(state, state.spp, SMALL_STEP)
+        outside = state.free & ((state.values < low) | (state.values > high))
+        state.values = np.clip(state.values, low, high)
+        if not settled or not outside.any():
+            break
+        # What wants to leave its bounds stays there, and the others are fitted again.
+        state.free &= ~outside
+    # Where a bound holds a component, the curvature still says how well it is known.
+    state.solve(np.ones_like(state.free))
+    rounding = _rounding_covariance(state)
+    state.solution = state.solution._replace(covariance=state.solution.covariance + rounding)
+    agreement, structured = state.structure()
+    if structured:
+        return False, (
+            f"the residuals have structure: neighbouring pixels are correlated by {agreement:.0%}. This is a "
+            "local minimum, or the scene cannot look like the target; try other starts, and look at the residuals"
+        )
+    if not settled:
+        return False, f"Newton's method did not settle in {MAX_STEPS} steps; try more spp, or another start"
+    message = "converged: the last step is small against the standard errors, the residuals are noise"
+    left_out = (state.weights == 0).mean()
+    if left_out:
+        message += f"; {left_out:.2g} of the target's values are clipped, may be, or are not measured"
+    if state.solution.undetermined.size:
+        message += "; but the images do not determine all that was asked"
+    return True, message
+
+
+def _newton(state: State, spp: int, small: float) -> bool:
+    """Steps until one is below `small` standard errors; whether one was."""
+    state.scale = state.vector.scale(state.values)
+    state.solve(state.free)
+    draw, base, z = state.next_draw(), state.values, np.zeros(len(state.values))
+    for _ in range(MAX_STEPS):
+        projector = state.solution.projector
+        moved = state.newton_step(z, base, projector, spp, draw)
+        step = np.clip(moved - z, -LARGE_STEP, LARGE_STEP)
+        z = z + step
+        state.values = base + state.scale * z
+        state.solve(state.free)
+        sigma = np.sqrt(np.diag(state.solution.covariance))
+        # The weighted product of the two renders' residuals: the misfit without their noise.
+        a, b = state.evidence.residuals
+        state.record("refine", spp, float((state.weights * a * b).sum() / 2))
+        same_rank = round(np.trace(projector)) == round(np.trace(state.solution.projector))
+        if same_rank and np.all(np.abs(step) <= small * sigma + np.finfo(state.dtype).eps):
+            return True
+    return False
+
+
+def _rounding_covariance(state: State) -> np.ndarray:
+    """(n, n) of the error that rounded values have in common, in units of the scale; noise hides it."""
+    problem = state.problem
+    if not any(target.step.any() for target in problem.targets):
+        return np.zeros_like(state.solution.covariance)
+    jacobian = state.evidence.jacobians.mean(0) * state.weights[..., None] * state.scale
+    parts = zip(*weights.target_rounding(state.halves(), problem, state.noise), strict=True)
+    return uncertainty.rounding_covariance(jacobian @ state.solution.inverse, *map(problem.flat, parts))

@@ -1,0 +1,52 @@
+"""Where a fit should begin: indices of refraction over their whole range, for a local method finds a near minimum."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+
+from pathjax.derivatives.gradient import ior_at, is_glass
+from pathjax.inverse import losses
+from pathjax.inverse.approach import approach
+from pathjax.inverse.state import State
+
+# Relative indices of refraction that are tried, from almost none to diamond's; a few at a time.
+RATIOS, SCAN_SPP, CHUNK = np.geomspace(1.02, 2.6, 64), 4, 16
+MOST_CANDIDATES = 3
+
+
+def scan(state: State) -> list[np.ndarray]:
+    """Values (n,) to begin with, the most promising first; the present ones if there is nothing to scan."""
+    parameters = state.vector.parameters
+    names = [name for name, parameter in parameters if is_glass(parameter)]
+    if not names:
+        return [state.values]
+    if len(names) < len(parameters):
+        # Colours first: a wrong index of refraction leaves them nearly right, and wrong ones may hide it.
+        approach(state)
+    state.weigh(SCAN_SPP)
+    for name in names * min(len(names), 2):
+        tried = np.stack([_at_ratio(state, name, ratio) for ratio in RATIOS])
+        misfits = np.concatenate([_misfits(state, chunk) for chunk in np.split(tried, len(RATIOS) // CHUNK)])
+        low = [i for i in range(len(RATIOS)) if misfits[i] == misfits[max(i - 1, 0) : i + 2].min()]
+        low = sorted(low, key=lambda i: misfits[i])[:MOST_CANDIDATES]
+        candidates = [tried[i] for i in low]
+        state.values = candidates[0]
+        state.record("scan", SCAN_SPP, float(misfits[low[0]]))
+    return candidates
+
+
+def _misfits(state: State, candidates: np.ndarray) -> np.ndarray:
+    """(K,) of values (K, n)."""
+    candidates, weights = (jnp.asarray(a, state.dtype) for a in (candidates, state.weights))
+    # All candidates see the same noise.
+    arguments = state.groups, weights, jnp.uint32(SCAN_SPP), state.seed, jnp.uint32(0)
+    return np.asarray(state.program(losses.misfits, candidates, arguments)(candidates, arguments))
+
+
+def _at_ratio(state: State, name: str, ratio: float) -> np.ndarray:
+    """The present values with another index of one glass, given by its relative index."""
+    scene = next(scene for scene in state.problem.scenes if name in scene.about.parameters)
+    values = state.vector.unpack(state.values.copy())
+    values[name] = ior_at(state.problem.with_values(scene, values), name, ratio)
+    return state.vector.pack(values)
