@@ -74,7 +74,7 @@ def run(
 def _write(report: dict, folder: Path, name: str, output: Output) -> None:
     """Plot the last scene, and write the report of all."""
     scene = report["scenes"][-1]
-    if plot.available() and plot.worth_while(scene):
+    if plot.available() and plot.has_noise(scene):
         place = output.file(folder / name, lambda path: plot.write(scene, path))
         scene["plot"] = name if place == folder / name else place and str(place)
     output.file(folder / "bench.json", lambda path: write_text(path, json_text(report, indent=2)))

@@ -26,7 +26,7 @@ def available() -> bool:
     return True
 
 
-def worth_while(scene: dict) -> bool:
+def has_noise(scene: dict) -> bool:
     """Whether there is something to plot: errors of a scene of the report that has noise."""
     return any(_points(rows) for rows in (scene["pathjax"], scene["mitsuba"]))
 

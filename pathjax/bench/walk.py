@@ -23,13 +23,13 @@ class Walk(NamedTuple):
 
 
 def walk(tree, vertices, origins, directions) -> Walk:
-    """Find what each ray hits first, as `shapes.bvh.traverse` does it.
+    """Find what each ray hits first, as `shapes.accel.traverse` does it.
 
     Children are visited in octant order, those whose boxes the ray meets before its closest hit so far; they are not
     looked at again when a closer hit is found in between.
 
     Args:
-        tree: `shapes.bvh_build.Tree` over the triangles.
+        tree: `shapes.accel.build.Tree` over the triangles.
         vertices: (P, 3, 3) vertex, axis.
         origins, directions: (R, 3), directions unit.
     The arithmetic is float64: boxes that a ray grazes may be counted otherwise than by a renderer in float32.
@@ -65,8 +65,8 @@ def walk(tree, vertices, origins, directions) -> Walk:
         leaves[ray] += 1
         triangles[ray] += count
         for lane in range(count.max(initial=0)):
-            some = lane < count
-            r, row = ray[some], tree.order[tree.leaf_first[leaf[some]] + lane]
+            filled_lane = lane < count
+            r, row = ray[filled_lane], tree.order[tree.leaf_first[leaf[filled_lane]] + lane]
             found = distances(vertices[row], o[r], d[r])
             closer = (found < t[r]) | ((found == t[r]) & (row < triangle[r]))
             t[r[closer]], triangle[r[closer]] = found[closer], row[closer]

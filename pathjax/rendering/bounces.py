@@ -17,7 +17,7 @@ from pathjax.errors import InputError
 from pathjax.integrators import path, pixel, terms
 from pathjax.kinds.parameter import Parameter
 from pathjax.rendering import tail
-from pathjax.rendering.progressive import estimate, replicates
+from pathjax.rendering.progressive import error_estimate, replicates
 from pathjax.rendering.render import differentiable, differentiated
 from pathjax.scene import parameters as named
 from pathjax.scene.scene import Scene
@@ -53,7 +53,7 @@ class Bounces:
         """(depth, H, W, 3), pooled over 3 x 3 pixels as that of `render_until`."""
         images, variances = np.asarray(self.terms), np.asarray(self.deviation, float) ** 2
         count = np.asarray(self.samples)
-        return np.stack([estimate.standard_error(*term, count) for term in zip(images, variances, strict=True)])
+        return np.stack([error_estimate.standard_error(*term, count) for term in zip(images, variances, strict=True)])
 
     def tail(self) -> tail.Tail:
         """How much light there is beyond these terms, in the mean over the pixels that are finite.
@@ -103,8 +103,8 @@ def render_bounces(
 def pilot(scene: Scene, seed: int = 0) -> tail.Tail:
     """The Tail after 12 terms, from 64 samples of at most 4096 pixels, spread evenly over the image."""
     count = film.pixel_count(scene.film)
-    some = np.unique(np.linspace(0, count - 1, min(PILOT_PIXELS, count)).astype(np.int32))
-    return _bounces(scene, PILOT_TERMS, jnp.asarray(some)[None], PILOT_SPP, seed, "mis", True).tail()
+    pixels = np.unique(np.linspace(0, count - 1, min(PILOT_PIXELS, count)).astype(np.int32))
+    return _bounces(scene, PILOT_TERMS, jnp.asarray(pixels)[None], PILOT_SPP, seed, "mis", True).tail()
 
 
 def _check_depth(depth) -> None:

@@ -15,10 +15,10 @@ from pathjax.system.files import encodable
 
 
 def say(message: str) -> None:
-    print(_for(sys.stderr, f"pathjax: {message}"), file=sys.stderr)
+    print(_encodable_on(sys.stderr, f"pathjax: {message}"), file=sys.stderr)
 
 
-def _for(stream, text: str) -> str:
+def _encodable_on(stream, text: str) -> str:
     return encodable(text, getattr(stream, "encoding", None) or "utf-8")
 
 
@@ -73,7 +73,7 @@ class Output:
         try:
             if sys.stdout is None:
                 raise OSError(errno.EBADF, "it is closed")
-            print(_for(sys.stdout, text), flush=True)
+            print(_encodable_on(sys.stdout, text), flush=True)
         except OSError as error:
             self.failed = True
             # A reader such as `head` that has enough is no news.

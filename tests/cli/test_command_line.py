@@ -802,7 +802,7 @@ def first_line_with(stream, text):
 TELLTALE = """
 import sys
 from pathjax import cli
-from pathjax.rendering.progressive import passes as progressive
+from pathjax.rendering.progressive import passes
 from pathjax.rendering import bounces
 from pathjax.io import mesh
 
@@ -813,11 +813,11 @@ def load(*arguments, plain=mesh.load, **keywords):
     tell("mesh loads")
     return plain(*arguments, **keywords)
 
-def compile(*arguments, plain=progressive.compile):
+def compile(*arguments, plain=passes.compile):
     tell("kernel compiles")
     return plain(*arguments)
 
-def extend(*arguments, plain=progressive.extend):
+def extend(*arguments, plain=passes.extend):
     for number, _ in enumerate(plain(*arguments)):
         if number == 20:
             tell("kernel ran")
@@ -828,7 +828,7 @@ def render_bounces(*arguments, plain=bounces.render_bounces):
     return plain(*arguments)
 
 bounces.render_bounces = render_bounces
-mesh.load, progressive.compile, progressive.extend = load, compile, extend
+mesh.load, passes.compile, passes.extend = load, compile, extend
 sys.exit(cli.main(sys.argv[1:]))
 """
 

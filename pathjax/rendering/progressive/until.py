@@ -16,8 +16,7 @@ import numpy as np
 from pathjax.compile.runtime import usual_promotion
 from pathjax.errors import InputError
 from pathjax.integrators import path
-from pathjax.rendering.progressive import estimate, replicates
-from pathjax.rendering.progressive import passes as progressive
+from pathjax.rendering.progressive import error_estimate, passes, replicates
 from pathjax.rendering.progressive.checkpoint import Checkpoint, identity
 from pathjax.scene.scene import Scene
 from pathjax.sensors import film
@@ -29,7 +28,7 @@ PILOT_SPP = 16
 # lacking, so as not to pass it by, but never less than LEAST_GROWTH.
 MOST_GROWTH, LEAST_GROWTH, CAUTION = 2.0, 1.05, 0.75
 MAX_SPP = 2**31 - 1
-UNKNOWN = estimate.ImageError(math.nan, math.nan)
+UNKNOWN = error_estimate.ImageError(math.nan, math.nan)
 
 
 @dataclass(frozen=True)
@@ -67,9 +66,9 @@ def render_until(
     with the reason "no estimate", after the pilot or when the finite pixels are on target.
 
     The image is the mean of independent replicates, so not that of `render` for the same seed. With `spp` alone all
-    pixels get as many samples; else, after a pilot, noisy neighbourhoods get more (`estimate.sample_weights`). Either
-    way the image is unbiased up to the scene's max_depth. The same arguments give the same image, bit for bit, unless a
-    time limit or an interrupt ended it.
+    pixels get as many samples; else, after a pilot, noisy neighbourhoods get more: see `error_estimate.sample_weights`.
+    Either way the image is unbiased up to the scene's max_depth. The same arguments give the same image, bit for bit,
+    unless a time limit or an interrupt ended it.
 
     Args:
         target_error: reached when the upper bound of the estimate is no higher.
@@ -102,19 +101,19 @@ class Render:
         self.spp = MAX_SPP if spp is None else int(spp)
         self.compile_seconds = 0.0
         adaptive = target_error is not None or time_limit is not None
-        self.state, self.checkpoint = progressive.start(scene), None
+        self.state, self.checkpoint = passes.start(scene), None
         if checkpoint is not None:
             self.checkpoint = Checkpoint(checkpoint, identity(scene, self.seed, strategy, adaptive))
             self.state = self.checkpoint.load(self.state)
             self.checkpoint.save(self.state)
         if not adaptive or self.state.spp > self.spp:
-            progressive.plan(self.state, self.spp)
+            passes.plan(self.state, self.spp)
         elif not self.state.spp:
-            progressive.plan(self.state, min(PILOT_SPP, self.spp))
+            passes.plan(self.state, min(PILOT_SPP, self.spp))
 
     def compile(self) -> None:
         started = time.perf_counter()
-        progressive.compile(self.scene, self.strategy)
+        passes.compile(self.scene, self.strategy)
         self.compile_seconds += time.perf_counter() - started
 
     def run(self, progress: bool = False) -> RenderResult:
@@ -145,7 +144,7 @@ class Render:
             return None
 
         while True:
-            for _ in progressive.extend(self.scene, state, self.seed, self.strategy, stopped):
+            for _ in passes.extend(self.scene, state, self.seed, self.strategy, stopped):
                 state.seconds = time.perf_counter() - started
                 if self.checkpoint is not None:
                     self.checkpoint.save_if_due(state)
@@ -160,26 +159,26 @@ class Render:
             if math.isnan(error.bound) and self.spp == MAX_SPP and self.time_limit is None:
                 return "no estimate", found
             if state.spp == PILOT_SPP:
-                state.weights = estimate.sample_weights(image, variance).ravel()
-            progressive.plan(state, min(_next_spp(state.spp, error, self.target_error), self.spp))
+                state.weights = error_estimate.sample_weights(image, variance).ravel()
+            passes.plan(state, min(_next_spp(state.spp, error, self.target_error), self.spp))
 
-    def _on_target(self, error: estimate.ImageError) -> bool:
+    def _on_target(self, error: error_estimate.ImageError) -> bool:
         return self.target_error is not None and error.bound <= self.target_error
 
-    def _evaluate(self) -> tuple[np.ndarray, np.ndarray, estimate.ImageError]:
+    def _evaluate(self) -> tuple[np.ndarray, np.ndarray, error_estimate.ImageError]:
         """Image and its variance, (H, W, 3) each, and its error."""
         shape = (*film.image_shape(self.scene.film), 3)
         image, variance = (x.reshape(shape) for x in self.state.moments())
         # While some pixels know nothing of their error, neither does the image.
         known = self.state.count.min() >= 2
-        return image, variance, estimate.image_error(image, variance) if known else UNKNOWN
+        return image, variance, error_estimate.image_error(image, variance) if known else UNKNOWN
 
     def _result(self, reason, found) -> RenderResult:
         image, variance, error = found
         count = self.state.count.reshape(image.shape[:2])
         if reason != "interrupted" and self._on_target(error):
             reason = "target error" if np.isfinite(image).all() else "no estimate"
-        standard_error = estimate.standard_error(image, variance, count)
+        standard_error = error_estimate.standard_error(image, variance, count)
         seconds = self.compile_seconds, self.state.seconds
         return RenderResult(image, standard_error, float(count.mean()), count, *seconds, *error, reason)
 
@@ -194,7 +193,7 @@ def _check(target_error, time_limit, spp) -> None:
         raise InputError(f"spp = {spp}; it must be an integer in [1, 2^31)")
 
 
-def _next_spp(spp: int, error: estimate.ImageError, target: float | None) -> int:
+def _next_spp(spp: int, error: error_estimate.ImageError, target: float | None) -> int:
     if spp < PILOT_SPP:
         return PILOT_SPP
     growth = MOST_GROWTH
@@ -220,7 +219,7 @@ def _bar(wanted: bool) -> Iterator:
     bar = Progress(*columns, console=Console(stderr=True), transient=True)
     task = bar.add_task("", total=1.0, status="")
 
-    def show(render: Render, error: estimate.ImageError) -> None:
+    def show(render: Render, error: error_estimate.ImageError) -> None:
         spp = render.state.count.mean()
         status = f"{spp:.4g} spp"
         if math.isfinite(error.estimate):
@@ -237,7 +236,7 @@ def _bar(wanted: bool) -> Iterator:
             bar.stop()
 
 
-def _share_done(render: Render, spp: float, error: estimate.ImageError) -> float:
+def _share_done(render: Render, spp: float, error: error_estimate.ImageError) -> float:
     shares = [spp / render.spp]
     if render.time_limit is not None:
         shares.append(render.state.seconds / render.time_limit)

@@ -14,8 +14,7 @@ import numpy as np
 import pytest
 
 import pathjax as pj
-from pathjax.rendering.progressive import checkpoint
-from pathjax.rendering.progressive import passes as progressive
+from pathjax.rendering.progressive import checkpoint, passes
 
 HOW = {"target_error": 0.015, "seed": 3}
 
@@ -136,7 +135,7 @@ def test_a_finished_render_is_not_done_again(cornell, undisturbed, tmp_path, mon
     first = pj.render_until(cornell, **how)
     same(first, undisturbed)
     state_before = (tmp_path / "run.npz").read_bytes()
-    monkeypatch.setattr(progressive, "compile", lambda *_: lambda *_: pytest.fail("it rendered"))
+    monkeypatch.setattr(passes, "compile", lambda *_: lambda *_: pytest.fail("it rendered"))
     again = pj.render_until(cornell, **how)
     same(again, first)
     assert again.run_seconds == first.run_seconds
@@ -234,7 +233,7 @@ def test_foreign_files(cornell, made, what):
 
 
 def test_unwritable_places_are_noticed_before_rendering(cornell, tmp_path, monkeypatch):
-    monkeypatch.setattr(progressive, "compile", lambda *_: pytest.fail("it compiled"))
+    monkeypatch.setattr(passes, "compile", lambda *_: pytest.fail("it compiled"))
     (tmp_path / "folder.npz").mkdir()
     with pytest.raises(pj.InputError, match="there is no folder"):
         pj.render_until(cornell, spp=4, checkpoint=tmp_path / "none" / "run.npz")
@@ -281,7 +280,7 @@ def test_a_failure_that_passes_costs_nothing(cornell, undisturbed, tmp_path, mon
     monkeypatch.setattr(checkpoint, "COST", 0)
     with pytest.warns(pj.InputWarning, match="MemoryError; the render goes on without"):
         same(pj.render_until(cornell, **HOW, checkpoint=tmp_path / "run.npz"), undisturbed)
-    monkeypatch.setattr(progressive, "compile", lambda *_: lambda *_: pytest.fail("it rendered"))
+    monkeypatch.setattr(passes, "compile", lambda *_: lambda *_: pytest.fail("it rendered"))
     same(pj.render_until(cornell, **HOW, checkpoint=tmp_path / "run.npz"), undisturbed)
 
 
@@ -295,7 +294,7 @@ def test_saving_takes_a_small_share_of_the_time(cornell, tmp_path, monkeypatch):
 
     monkeypatch.setattr(checkpoint, "write_whole", write_whole)
     monkeypatch.setattr(checkpoint.time, "perf_counter", lambda: clock[0])
-    store, state = checkpoint.Checkpoint(tmp_path / "run.npz", {}), progressive.start(cornell)
+    store, state = checkpoint.Checkpoint(tmp_path / "run.npz", {}), passes.start(cornell)
     store.save(state)
     state.count[:] = 1
     while clock[0] < 4000:
@@ -306,8 +305,8 @@ def test_saving_takes_a_small_share_of_the_time(cornell, tmp_path, monkeypatch):
 
 def test_before_the_first_sample_a_checkpoint_holds_no_arrays(cornell, tmp_path):
     store = checkpoint.Checkpoint(tmp_path / "run.npz", {})
-    fresh = progressive.start(cornell)
-    progressive.plan(fresh, 16)
+    fresh = passes.start(cornell)
+    passes.plan(fresh, 16)
     store.save(fresh)
     assert (tmp_path / "run.npz").stat().st_size < 1000
     assert store.load(fresh) is fresh
@@ -315,13 +314,13 @@ def test_before_the_first_sample_a_checkpoint_holds_no_arrays(cornell, tmp_path)
 
 @pytest.mark.parametrize("adaptive", [False, True])
 def test_a_state_saved_after_any_call_comes_back_as_it_was(cornell, tmp_path, monkeypatch, adaptive):
-    monkeypatch.setattr(progressive, "CHUNK_PIXELS", 100)
-    store, state = checkpoint.Checkpoint(tmp_path / "run.npz", {}), progressive.start(cornell)
+    monkeypatch.setattr(passes, "CHUNK_PIXELS", 100)
+    store, state = checkpoint.Checkpoint(tmp_path / "run.npz", {}), passes.start(cornell)
     for spp in (16, 40):
-        progressive.plan(state, spp)
-        for _ in progressive.extend(cornell, state, 5, "mis"):
+        passes.plan(state, spp)
+        for _ in passes.extend(cornell, state, 5, "mis"):
             store.save(state)
-            loaded = store.load(progressive.start(cornell))
+            loaded = store.load(passes.start(cornell))
             for name in ("means", "count", "goal", "weights"):
                 np.testing.assert_array_equal(getattr(loaded, name), getattr(state, name), strict=True)
             assert loaded.spp == spp

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from pathjax.rendering.progressive import estimate, replicates
+from pathjax.rendering.progressive import error_estimate, replicates
 
 R = replicates.COUNT
 
@@ -66,39 +66,39 @@ def test_standard_errors_are_calibrated(sigma):
     """A share of 1/4 of the own variance and 3/32 of each neighbour's makes 22.6 degrees of freedom, so z has the
     variance 22.6 / 20.6 = 1.10 (a little more at the border); 4 standard errors of the 12,288 z^2 are 0.06."""
     image, variance = normal_image(np.random.default_rng(0), sigma)
-    z = (image - 1) / estimate.standard_error(image, variance, np.full((64, 64), 64))
+    z = (image - 1) / error_estimate.standard_error(image, variance, np.full((64, 64), 64))
     assert 1.03 < (z**2).mean() < 1.17
 
 
 def test_pooling_is_a_weighted_mean_of_the_square_around():
     variance = np.random.default_rng(1).random((7, 9, 3)).astype(np.float32)
-    weights = np.full((3, 3, 1), (1 - estimate.OWN_SHARE) / 8)
-    weights[1, 1] = estimate.OWN_SHARE
+    weights = np.full((3, 3, 1), (1 - error_estimate.OWN_SHARE) / 8)
+    weights[1, 1] = error_estimate.OWN_SHARE
     expected = ndimage.correlate(variance.astype(float), weights)
-    pooled = estimate.standard_error(np.zeros_like(variance), variance, np.ones((7, 9))) ** 2
+    pooled = error_estimate.standard_error(np.zeros_like(variance), variance, np.ones((7, 9))) ** 2
     np.testing.assert_allclose(pooled[1:-1, 1:-1], expected[1:-1, 1:-1], rtol=1e-5)
 
 
 def test_pixels_that_are_not_finite_do_not_spread():
     image, variance = normal_image(np.random.default_rng(2), 1.0)
     image[10, 10], variance[10, 10] = np.nan, np.nan
-    errors = estimate.standard_error(image, variance, np.full((64, 64), 64))
+    errors = error_estimate.standard_error(image, variance, np.full((64, 64), 64))
     assert np.isnan(errors[10, 10]).all() and np.isfinite(errors).mean() > 0.999
-    assert np.isfinite(estimate.image_error(image, variance)).all()
-    assert np.isfinite(estimate.sample_weights(image, variance)).all()
+    assert np.isfinite(error_estimate.image_error(image, variance)).all()
+    assert np.isfinite(error_estimate.sample_weights(image, variance)).all()
 
 
 @pytest.mark.parametrize("shape", [(1, 1, 3), (1, 5, 3), (2, 2, 3)])
 def test_images_smaller_than_the_neighbourhood(shape):
     variance = np.full(shape, 0.25, np.float32)
     image = np.ones(shape, np.float32)
-    np.testing.assert_allclose(estimate.standard_error(image, variance, np.full(shape[:2], 64)), 0.5)
-    np.testing.assert_allclose(estimate.sample_weights(image, variance), 1)
+    np.testing.assert_allclose(error_estimate.standard_error(image, variance, np.full(shape[:2], 64)), 0.5)
+    np.testing.assert_allclose(error_estimate.sample_weights(image, variance), 1)
 
 
 def test_agreement_of_few_samples_is_not_certainty():
     image = np.full((5, 5, 3), 6.0, np.float32)
-    errors = estimate.standard_error(image, np.zeros_like(image), np.full((5, 5), 20))
+    errors = error_estimate.standard_error(image, np.zeros_like(image), np.full((5, 5), 20))
     np.testing.assert_allclose(errors, 6 / 60)
 
 
@@ -108,7 +108,7 @@ def test_agreement_of_few_samples_is_not_certainty():
 def test_image_error_is_the_root_of_rel_mse():
     """Of 12,288 normal values: its relative standard error is sqrt(2/3 / 12288) / 2 = 0.4 %; four of them."""
     image, variance = normal_image(np.random.default_rng(3), 0.5)
-    error = estimate.image_error(image, variance)
+    error = error_estimate.image_error(image, variance)
     assert error.estimate == pytest.approx(0.5 / 8 / np.sqrt(1.01), rel=0.02)
     assert error.estimate < error.bound < 1.05 * error.estimate
 
@@ -116,9 +116,9 @@ def test_image_error_is_the_root_of_rel_mse():
 def test_few_pixels_that_rule_the_error_make_it_unsure():
     image = np.ones((64, 64, 3), np.float32)
     variance = np.full_like(image, 1e-6)
-    sure = estimate.image_error(image, variance)
+    sure = error_estimate.image_error(image, variance)
     variance[3, 5] = 0.5
-    unsure = estimate.image_error(image, variance)
+    unsure = error_estimate.image_error(image, variance)
     assert sure.bound < 1.02 * sure.estimate
     assert unsure.bound > 1.5 * unsure.estimate
 
@@ -132,38 +132,38 @@ def test_bound_is_exceeded_in_few_renders():
     for _ in range(400):
         samples = 1 + scale * np.expm1(s * rng.normal(size=(R, 4, 256, 3)) - s**2 / 2)
         means = samples.mean(1).astype(np.float32)
-        bound = estimate.image_error(*replicates.moments(means, count)).bound
+        bound = error_estimate.image_error(*replicates.moments(means, count)).bound
         exceeded += bound < truth
     assert 0 < exceeded < 36
 
 
 def test_nothing_known_is_nan():
-    assert np.isnan(estimate.image_error(np.full((2, 2, 3), np.nan), np.full((2, 2, 3), np.nan))).all()
+    assert np.isnan(error_estimate.image_error(np.full((2, 2, 3), np.nan), np.full((2, 2, 3), np.nan))).all()
 
 
 def test_without_noise_the_error_is_0():
-    assert estimate.image_error(np.ones((4, 4, 3)), np.zeros((4, 4, 3))) == (0, 0)
+    assert error_estimate.image_error(np.ones((4, 4, 3)), np.zeros((4, 4, 3))) == (0, 0)
 
 
 def test_a_black_image_has_no_error():
     """There is nothing to be relative to."""
     black = np.zeros((4, 4, 3), np.float32)
-    assert np.isnan(estimate.image_error(black, black)).all()
-    assert (estimate.sample_weights(black, black) == 1).all()
+    assert np.isnan(error_estimate.image_error(black, black)).all()
+    assert (error_estimate.sample_weights(black, black) == 1).all()
 
 
 def test_one_pixel_has_its_relative_error():
     pixel = np.full((1, 1, 3), 3.0, np.float32)
-    assert estimate.image_error(pixel, 0.09 * pixel).estimate == pytest.approx(0.3 / np.sqrt(3 * (1.01 - 0.03)))
+    assert error_estimate.image_error(pixel, 0.09 * pixel).estimate == pytest.approx(0.3 / np.sqrt(3 * (1.01 - 0.03)))
 
 
 def test_a_lamp_in_view_does_not_hide_the_noise_of_the_room():
     """A tenth of the pixels, and 10^6 times brighter: the others keep their error."""
     image, variance = normal_image(np.random.default_rng(8), 0.5)
-    room = estimate.image_error(image, variance).estimate
+    room = error_estimate.image_error(image, variance).estimate
     lamp = np.arange(64) < 6
     image[lamp], variance[lamp] = 1e6, 0
-    assert estimate.image_error(image, variance).estimate == pytest.approx(room * np.sqrt(58 / 64), rel=0.05)
+    assert error_estimate.image_error(image, variance).estimate == pytest.approx(room * np.sqrt(58 / 64), rel=0.05)
 
 
 # ---- where samples go -----------------------------------------------------------------------------------------------
@@ -171,28 +171,28 @@ def test_a_lamp_in_view_does_not_hide_the_noise_of_the_room():
 
 def test_weights_never_look_at_the_pixel_itself():
     image, variance = normal_image(np.random.default_rng(5), 1.0)
-    before = estimate.sample_weights(image, variance)
+    before = error_estimate.sample_weights(image, variance)
     image[20, 30], variance[20, 30] = 7, 100
-    after = estimate.sample_weights(image, variance)
+    after = error_estimate.sample_weights(image, variance)
     assert after[20, 30] / after[50, 50] == pytest.approx(before[20, 30] / before[50, 50], rel=1e-5)
     assert after[20, 31] > 2 * before[20, 31]
 
 
 def test_weights_follow_the_relative_standard_deviation():
     sigma = np.where(np.arange(64) < 32, 1.0, 2.0)[:, None, None]
-    weights = estimate.sample_weights(*normal_image(np.random.default_rng(6), sigma * 0.1))
+    weights = error_estimate.sample_weights(*normal_image(np.random.default_rng(6), sigma * 0.1))
     assert weights.mean() == pytest.approx(1, abs=1e-6)
     assert weights[40:].mean() / weights[:24].mean() == pytest.approx(2, rel=0.05)
 
 
 def test_weights_have_a_floor():
     sigma = np.where(np.arange(64) < 32, 0.0, 1.0)[:, None, None]
-    weights = estimate.sample_weights(*normal_image(np.random.default_rng(7), sigma))
+    weights = error_estimate.sample_weights(*normal_image(np.random.default_rng(7), sigma))
     assert weights.min() > 0.2
 
 
 def test_weights_without_noise_are_even():
-    assert (estimate.sample_weights(np.ones((5, 5, 3)), np.zeros((5, 5, 3))) == 1).all()
+    assert (error_estimate.sample_weights(np.ones((5, 5, 3)), np.zeros((5, 5, 3))) == 1).all()
 
 
 # ---- the unit of radiance -------------------------------------------------------------------------------------------
@@ -202,8 +202,9 @@ def everything(means, counts):
     """What is estimated, of replicates (R, 64 * 64, 3): that in units of radiance, and that without a unit."""
     image, variance = replicates.moments(means, counts)
     image, variance = image.reshape(64, 64, 3), variance.reshape(64, 64, 3)
-    errors = estimate.standard_error(image, variance, counts.reshape(64, 64))
-    return (image, errors), (estimate.image_error(image, variance), estimate.sample_weights(image, variance))
+    errors = error_estimate.standard_error(image, variance, counts.reshape(64, 64))
+    found = error_estimate.image_error(image, variance), error_estimate.sample_weights(image, variance)
+    return (image, errors), found
 
 
 @pytest.mark.parametrize("power", [-90, -66, -40, -4, 4, 40, 66, 110])
@@ -224,4 +225,4 @@ def test_a_power_of_two_scales_every_bit_of_an_estimate(power):
 @pytest.mark.parametrize("power", [-110, -130])
 def test_an_image_too_dark_for_float32_has_no_error(power):
     image, variance = normal_image(np.random.default_rng(10), 0.5)
-    assert np.isnan(estimate.image_error(np.ldexp(image, power), np.ldexp(variance, 2 * power))).all()
+    assert np.isnan(error_estimate.image_error(np.ldexp(image, power), np.ldexp(variance, 2 * power))).all()

@@ -11,8 +11,7 @@ import pytest
 import pathjax as pj
 from pathjax.compile import runtime
 from pathjax.images import relative_error
-from pathjax.rendering.progressive import estimate, until
-from pathjax.rendering.progressive import passes as progressive
+from pathjax.rendering.progressive import error_estimate, passes, until
 from pathjax.system.interrupts import SIGNALS
 
 
@@ -141,8 +140,8 @@ def test_without_noise_the_pilot_is_enough(shipped):
 
 def test_a_target_is_not_claimed_on_an_unsure_estimate(cornell, monkeypatch):
     """The estimate alone would do."""
-    unsure = estimate.ImageError(0.01, 0.5)
-    monkeypatch.setattr(estimate, "image_error", lambda *_: unsure)
+    unsure = error_estimate.ImageError(0.01, 0.5)
+    monkeypatch.setattr(error_estimate, "image_error", lambda *_: unsure)
     result = pj.render_until(cornell, 0.1, spp=64)
     assert (result.reason, result.error, result.error_bound) == ("spp", *unsure)
 
@@ -170,7 +169,7 @@ def test_what_cannot_be_is_refused(cornell, wrong, says):
 def after_calls(monkeypatch):
     """(number of calls of the kernel, what to do then)."""
 
-    def install(number, act, plain=progressive.extend):
+    def install(number, act, plain=passes.extend):
         count = iter(range(number))
 
         def extend(*arguments):
@@ -179,7 +178,7 @@ def after_calls(monkeypatch):
                     act()
                 yield
 
-        monkeypatch.setattr(progressive, "extend", extend)
+        monkeypatch.setattr(passes, "extend", extend)
 
     return install
 
@@ -198,7 +197,7 @@ def test_signals_end_a_render_with_what_is_done(cornell, after_calls, number):
 
 
 def test_interrupt_before_the_first_samples(cornell, monkeypatch):
-    monkeypatch.setattr(progressive, "compile", lambda *_: signal.raise_signal(signal.SIGINT))
+    monkeypatch.setattr(passes, "compile", lambda *_: signal.raise_signal(signal.SIGINT))
     with pytest.raises(KeyboardInterrupt):
         pj.render_until(cornell, spp=4)
 
@@ -216,17 +215,17 @@ def test_render_in_another_thread(cornell):
 
 def test_a_state_left_after_any_call_leads_to_the_same_bits(cornell, monkeypatch):
     """Chunks of 100 pixels, so that a pass is left in its middle."""
-    monkeypatch.setattr(progressive, "CHUNK_PIXELS", 100)
+    monkeypatch.setattr(passes, "CHUNK_PIXELS", 100)
 
     def rendered(leave_after):
-        state = progressive.start(cornell)
+        state = passes.start(cornell)
         for spp in (6, 16, 90):
             if spp == 90:
                 state.weights = np.linspace(0.5, 1.5, len(state.count), dtype=np.float32)
-            progressive.plan(state, spp)
+            passes.plan(state, spp)
             left = leave_after
             while (state.count < state.goal).any():
-                for _ in progressive.extend(cornell, state, 5, "mis"):
+                for _ in passes.extend(cornell, state, 5, "mis"):
                     left -= 1
                     if left % leave_after == 0:
                         break
@@ -242,25 +241,25 @@ def test_a_state_left_after_any_call_leads_to_the_same_bits(cornell, monkeypatch
 @pytest.mark.parametrize("weight", [np.float32(1), np.nextafter(np.float32(1), np.float32(0))])
 def test_equal_weights_give_every_pixel_the_samples_asked_for(cornell, weight):
     """Also where the division by their mean has rounded."""
-    state = progressive.start(cornell)
+    state = passes.start(cornell)
     state.weights[:] = weight
-    progressive.plan(state, 32)
+    passes.plan(state, 32)
     assert (state.goal == 32).all()
 
 
 def test_no_call_begins_once_it_is_stopped(cornell, monkeypatch):
-    monkeypatch.setattr(progressive, "CHUNK_PIXELS", 100)
-    begun, stopped, compile = [], threading.Event(), progressive.compile
+    monkeypatch.setattr(passes, "CHUNK_PIXELS", 100)
+    begun, stopped, compile = [], threading.Event(), passes.compile
 
     def counted(*arguments):
         kernel = compile(*arguments)
         return lambda *numbers: begun.append(stopped.is_set()) or kernel(*numbers)
 
-    monkeypatch.setattr(progressive, "compile", counted)
-    state, whole = progressive.start(cornell), progressive.start(cornell)
+    monkeypatch.setattr(passes, "compile", counted)
+    state, whole = passes.start(cornell), passes.start(cornell)
     for one in (state, whole):
-        progressive.plan(one, 1000)
-    calls = progressive.extend(cornell, state, 5, "mis", stopped.is_set)
+        passes.plan(one, 1000)
+    calls = passes.extend(cornell, state, 5, "mis", stopped.is_set)
     next(calls)
     stopped.set()
     list(calls)
@@ -269,7 +268,7 @@ def test_no_call_begins_once_it_is_stopped(cornell, monkeypatch):
     assert (state.count < state.goal).any()
     # What is left leads on to the same bits.
     for one in (state, whole):
-        list(progressive.extend(cornell, one, 5, "mis"))
+        list(passes.extend(cornell, one, 5, "mis"))
     np.testing.assert_array_equal(state.means, whole.means)
 
 
