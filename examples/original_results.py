@@ -8,7 +8,6 @@ open, of the boxes and of the triangles that they test. Writes original_results.
 """
 
 import argparse
-from functools import partial
 from pathlib import Path
 
 import jax
@@ -18,7 +17,6 @@ from PIL import Image, ImageDraw
 import pathjax as pj
 from pathjax.bench.walk import walk
 from pathjax.io import mesh
-from pathjax.sensors.camera import sample_ray
 from pathjax.shapes.accel.build import RULES
 
 SCENES = Path(__file__).resolve().parents[1] / "scenes"
@@ -64,7 +62,7 @@ def camera_rays(scene, res):
     """One through the middle of every pixel and a random point of the lens: origins (N, 3), directions (N, 3)."""
     middles = (np.stack(np.meshgrid(range(res), range(res)), -1).reshape(-1, 2) + 0.5) / res
     lens = np.random.default_rng(0).random((len(middles), 2))
-    rays = jax.vmap(partial(sample_ray, scene.camera))(np.float32(middles), np.float32(lens))
+    rays = jax.vmap(scene.camera.sample_ray)(np.float32(middles), np.float32(lens))
     return np.asarray(rays.o), np.asarray(rays.d)
 
 

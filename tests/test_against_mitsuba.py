@@ -8,6 +8,7 @@ import pytest
 
 import pathjax as pj
 from pathjax.bench import mitsuba_peer
+from pathjax.sensors.filters import Box
 
 ROOT = Path(__file__).resolve().parents[1]
 FILES = sorted([*ROOT.glob("scenes/*.xml"), *ROOT.glob("tests/scenes/*.xml")])
@@ -75,7 +76,7 @@ def test_image_agrees_with_mitsuba(path, with_border, mitsuba, estimate, agree):
     scene = pj.load_scene(path, res=32)
     # Mitsuba's wide filters share samples among neighbours: pixels then depend on each other, and their mean tells
     # less than its variance says.
-    independent = scene.film.filter == "box"
+    independent = isinstance(scene.film.filter, Box)
     agree(estimate(scene, spp=SPP, count=SEEDS), mitsuba(path), whole=independent, rounding=ROUNDING)
 
 

@@ -15,7 +15,6 @@ from pathjax import emitters
 from pathjax.compile.runtime import native_map
 from pathjax.integrators import path
 from pathjax.rendering.render import render_pixels
-from pathjax.sensors.camera import sample_ray
 
 ROOT = Path(__file__).resolve().parents[1]
 NAMES = sorted(path.stem for path in (*ROOT.glob("scenes/*.xml"), *ROOT.glob("tests/scenes/*.xml")))
@@ -369,7 +368,7 @@ def test_random_numbers_at_their_ends_give_finite_light(shipped, name, strategy)
         def one(item, scene, choice):
             position, u, u_lens = item
             bounce = path.Bounce(u[0:2], u[2:4], u[4], u[5])
-            ray = sample_ray(scene.camera, position, u_lens)
+            ray = scene.camera.sample_ray(position, u_lens)
             return path.trace(scene, choice, ray, lambda _: bounce, strategy).L
 
         return native_map(one, items, scene, choice)

@@ -12,7 +12,6 @@ import numpy as np
 from pathjax.bench import embree_peer
 from pathjax.core.warp import square_to_sphere
 from pathjax.rendering.query import _closest_hit
-from pathjax.sensors.camera import sample_ray
 from pathjax.shapes.triangle import Triangles
 
 RAYS = 1 << 18
@@ -42,7 +41,7 @@ def rates(scene, repeat: int) -> tuple[dict, dict | None]:
 
 def _camera_rays(scene):
     positions = np.random.default_rng(0).random((RAYS, 2), np.float32)
-    rays = jax.vmap(lambda p: sample_ray(scene.camera, p, np.full(2, 0.5, np.float32)))(positions)
+    rays = jax.vmap(lambda p: scene.camera.sample_ray(p, np.full(2, 0.5, np.float32)))(positions)
     return np.asarray(rays.o), np.asarray(rays.d)
 
 

@@ -40,8 +40,8 @@ def scene_facts(scene: Scene) -> dict:
     dark = emitters.darkness(scene.emitters)
     return {
         "file": description.file,
-        "image": {"width": width, "height": height, "filter": scene.film.filter, "spp": description.spp},
-        "camera": "thinlens" if scene.camera.lens is not None else "perspective",
+        "image": {"width": width, "height": height, "filter": _type(scene.film.filter), "spp": description.spp},
+        "camera": _type(description.camera),
         "integrator": {
             "max_depth": None if max_depth == UNBOUNDED else max_depth,
             "rr_depth": int(scene.rr_depth),
@@ -104,6 +104,11 @@ def _tail_lines(tail: dict, max_depth) -> list[str]:
         lines.append(f"            max_depth {max_depth} cuts off {share:.2g} +- {uncertainty:.1g} of all light")
     lines.append(f"            max_depth {tail['max_depth']} would cut off no more than {tail['error']:g}")
     return lines
+
+
+def _type(described) -> str:
+    """What scene files call a kind."""
+    return type(described).__name__.lower()
 
 
 def _primitives(part) -> int:

@@ -16,7 +16,6 @@ from pathjax.kinds import Table
 from pathjax.scene import parameters as named
 from pathjax.scene.scene import Scene
 from pathjax.sensors import film
-from pathjax.sensors.camera import sample_ray
 from pathjax.shapes import geometry
 
 # Images move by this part of a pixel under one step, in the median: less adds noise, more adds bias.
@@ -75,7 +74,7 @@ def _motion(pixel_number, scene, row):
         """Where the ray ends that refracts wherever it can: a point, or a direction if it hits nothing."""
         varied = dielectric.with_relative_ior(table, x[0], jnp.arange(len(dielectric.relative_ior(table))) == row)
         materials = named.put(scene.materials, ("tables", place), varied)
-        ray = sample_ray(scene.camera, middle + x[1:] / size, half)
+        ray = scene.camera.sample_ray(middle + x[1:] / size, half)
 
         def extend(state):
             ray, _, met, depth, _ = state

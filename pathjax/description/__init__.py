@@ -63,30 +63,6 @@ class Shape:
 
 
 @dataclass(frozen=True)
-class Camera:
-    """Perspective; a thin lens where `aperture_radius` is not None. Looks along +z, x to the left, y up (Mitsuba's)."""
-
-    to_world: np.ndarray  # (4, 4)
-    fov: float  # degrees, along fov_axis
-    fov_axis: str = "x"  # "x", "y", "diagonal", "smaller", "larger"
-    near_clip: float = 1e-2
-    far_clip: float = 1e4
-    principal_point_offset: tuple[float, float] = (0.0, 0.0)
-    aperture_radius: float | None = None
-    focus_distance: float | None = None
-
-
-@dataclass(frozen=True)
-class Film:
-    width: int
-    height: int
-    crop: tuple[int, int, int, int]  # offset x, offset y, width, height
-    filter: str = "gaussian"  # "box", "tent", "gaussian"
-    filter_radius: float = 2.0  # pixels; box 0.5, tent 1 by default, gaussian 4 stddev
-    filter_stddev: float = 0.5  # gaussian only
-
-
-@dataclass(frozen=True)
 class Integrator:
     max_depth: int = -1  # -1: unbounded; 1: emission only
     rr_depth: int = 5
@@ -96,8 +72,8 @@ class Integrator:
 @dataclass(frozen=True)
 class Description:
     file: str
-    camera: Camera
-    film: Film
+    camera: object  # a `sensors.Sensor`
+    film: object  # a `sensors.film.HDRFilm`
     integrator: Integrator
     spp: int
     sampler: str  # the type that the file names; pathjax uses its own

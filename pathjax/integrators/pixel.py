@@ -9,7 +9,6 @@ from jax import lax
 from pathjax.core import sampler
 from pathjax.integrators import path
 from pathjax.sensors import film
-from pathjax.sensors.camera import sample_ray
 
 
 def numbers(pixels, first_sample, spp, seed):
@@ -26,7 +25,7 @@ def camera_path(scene, pixel, stream, number, points="lattice", **how):
     """
     u_film, u_lens = lax.optimization_barrier(path.camera_numbers(scene, stream, number, points))
     position, weight = film.sample_position(scene.film, pixel, u_film)
-    ray = sample_ray(scene.camera, position, u_lens)
+    ray = scene.camera.sample_ray(position, u_lens)
     return lax.optimization_barrier((path.start(scene, ray, **how), weight))
 
 

@@ -13,7 +13,6 @@ from pathjax.errors import InputError
 from pathjax.kinds import Parameters
 from pathjax.scene.metadata import About
 from pathjax.scene.scene import UNBOUNDED, Scene
-from pathjax.sensors import camera, film
 from pathjax.shapes.accel.build import RULES
 from pathjax.shapes.builder import build_shapes
 
@@ -39,8 +38,8 @@ def build(description: desc.Description, dtype=jnp.float32, split_rule: str = "s
     integrator = description.integrator
     max_depth = UNBOUNDED if integrator.max_depth < 0 else integrator.max_depth
     scene = Scene(
-        camera.build(description.camera, description.film, dtype),
-        film.build(description.film, dtype),
+        description.camera.build(description.film, dtype),
+        description.film.build(dtype),
         geometry,
         materials,
         emitters,

@@ -9,7 +9,7 @@ import jax
 from pathjax.bsdfs import Materials
 from pathjax.emitters import Emitters
 from pathjax.scene.metadata import About
-from pathjax.sensors.camera import Camera
+from pathjax.sensors import Camera
 from pathjax.sensors.film import Film
 from pathjax.shapes.geometry import Geometry
 

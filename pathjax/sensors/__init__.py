@@ -1,1 +1,16 @@
-"""Cameras and films."""
+"""What measures light: sensors, a file a kind, and the film behind them with its reconstruction filter.
+
+A sensor is two classes of `sensor`: `Sensor`, what a scene file says of one, and `Camera`, the arrays that a ray is
+made of. A filter is a class of `filters`. One row in a table makes a kind exist for scene files and in kernels.
+"""
+
+from __future__ import annotations
+
+from pathjax.sensors.perspective import Perspective
+from pathjax.sensors.sensor import Camera, Sensor
+from pathjax.sensors.thinlens import ThinLens
+
+__all__ = ["KINDS", "Camera", "Perspective", "Sensor", "ThinLens"]
+
+# By the name that scene files give them.
+KINDS: dict[str, type[Sensor]] = {"perspective": Perspective, "thinlens": ThinLens}

@@ -1,8 +1,4 @@
-"""Pixels, and the reconstruction filter that each of them looks through.
-
-Filters are sampled by importance: a pixel gathers only its own samples, with weights that average to 1, so that pixels
-stay independent of each other.
-"""
+"""Pixels, and where in them samples look."""
 
 from __future__ import annotations
 
@@ -10,51 +6,66 @@ from dataclasses import dataclass, field
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
-from pathjax import description
-from pathjax.core.math import at
-from pathjax.core.warp import tent
+from pathjax.description.fields import Fields
+from pathjax.sensors import filters
+from pathjax.sensors.filters import Filter, Gaussian
 
-# Steps of the tabulated inverse of the Gaussian's running integral; its density is sampled exactly, step by step.
-_STEPS = 1024
-
-
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class Gaussian:
-    knots: jax.Array  # (_STEPS + 1,) offsets between which equal shares of the filter lie
-    stddev: jax.Array  # ()
-    radius: jax.Array  # ()
-    scale: jax.Array  # () 1 over the filter's integral
+MAX_PIXELS = 10**9
+# Settings that concern Mitsuba's own files and blocks, with their choices; none: a boolean.
+WITHOUT_EFFECT = {
+    "file_format": ("openexr", "exr", "rgbe", "pfm"),
+    "component_format": ("float16", "float32", "uint32"),
+    "sample_border": (),
+    "compensate": (),
+}
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Film:
-    gaussian: Gaussian | None
-    radius: jax.Array  # () of a box or tent filter, in pixels
-    filter: str = field(metadata={"static": True})  # "box", "tent", "gaussian"
+    filter: Filter
     width: int = field(metadata={"static": True})
     height: int = field(metadata={"static": True})
     crop: tuple[int, int, int, int] = field(metadata={"static": True})  # offset x, y, width, height
 
 
-def build(film: description.Film, dtype) -> Film:
-    gaussian = None
-    if film.filter == "gaussian":
-        x = np.linspace(-film.filter_radius, film.filter_radius, 16 * _STEPS + 1)
-        f = _gaussian(x, film.filter_stddev, film.filter_radius, np)
-        running = np.concatenate([[0], np.cumsum((f[1:] + f[:-1]) / 2 * np.diff(x))])
-        knots = np.interp(np.linspace(0, running[-1], _STEPS + 1), running, x)
-        gaussian = Gaussian(
-            np.asarray(knots, dtype),
-            np.asarray(film.filter_stddev, dtype),
-            np.asarray(film.filter_radius, dtype),
-            np.asarray(1 / running[-1], dtype),
-        )
-    radius = np.asarray(film.filter_radius, dtype)
-    return Film(gaussian, radius, film.filter, film.width, film.height, tuple(film.crop))
+@dataclass(frozen=True)
+class HDRFilm:
+    """What a scene file says of the film."""
+
+    width: int = 768
+    height: int = 576
+    crop: tuple[int, int, int, int] | None = None  # offset x, offset y, width, height; None: all of the film
+    filter: Filter = Gaussian()
+
+    @classmethod
+    def read(cls, loader, fields: Fields) -> HDRFilm:
+        width, height = fields.integer("width", cls.width, at_least=1), fields.integer("height", cls.height, at_least=1)
+        if width * height >= MAX_PIXELS:
+            raise fields.error("width", f"times height is {width * height} pixels; it must be below {MAX_PIXELS}")
+        x, y = (fields.integer(f"crop_offset_{axis}", 0, at_least=0) for axis in "xy")
+        crop_width = fields.integer("crop_width", width, at_least=1)
+        crop_height = fields.integer("crop_height", height, at_least=1)
+        if x + crop_width > width or y + crop_height > height:
+            window = f"({x}, {y}) + ({crop_width}, {crop_height})"
+            raise fields.element.error(f"the crop window {window} reaches beyond the film, ({width}, {height})")
+        fields.string("pixel_format", "rgb", choices=("rgb",))
+        for name, choices in WITHOUT_EFFECT.items():
+            given = fields.string(name, None, choices=choices) if choices else fields.boolean(name, None)
+            if given is not None:
+                loader.notes.append(f"{fields.where(name).file}:{fields.where(name).line}: {name} has no effect")
+        nested = fields.objects("rfilter")
+        filter = loader.make(nested[0], filters.KINDS) if nested else cls.filter
+        return cls(width, height, (x, y, crop_width, crop_height), filter)
+
+    def build(self, dtype) -> Film:
+        crop = (0, 0, self.width, self.height) if self.crop is None else tuple(self.crop)
+        return Film(self.filter.build(dtype), self.width, self.height, crop)
+
+
+# By the name that scene files give them.
+KINDS = {"hdrfilm": HDRFilm}
 
 
 def sample_position(film: Film, pixel, u):
@@ -68,29 +79,8 @@ def sample_position(film: Film, pixel, u):
     """
     x0, y0, width, _ = film.crop
     center = jnp.stack([pixel % width + x0, pixel // width + y0]).astype(u.dtype) + jnp.asarray(0.5, u.dtype)
-    weight = jnp.ones_like(u[0])
-    if film.filter == "box":
-        offset = (2 * u - 1) * film.radius
-    elif film.filter == "tent":
-        offset = tent(u) * film.radius
-    else:
-        offset, weights = _sample_gaussian(film.gaussian, u)
-        weight = weights[0] * weights[1]
+    offset, weight = film.filter.sample(u)
     return (center + offset) / jnp.array([film.width, film.height], u.dtype), weight
-
-
-def _gaussian(x, stddev, radius, xp=jnp):
-    """Mitsuba's: lowered so that it ends at 0."""
-    return xp.maximum(xp.exp(-(x**2) / (2 * stddev**2)) - xp.exp(-(radius**2) / (2 * stddev**2)), 0)
-
-
-def _sample_gaussian(table: Gaussian, u):
-    step = jnp.minimum((u * _STEPS).astype(jnp.int32), _STEPS - 1)
-    low = jnp.stack([at(table.knots, step[0]), at(table.knots, step[1])])
-    high = jnp.stack([at(table.knots, step[0] + 1), at(table.knots, step[1] + 1)])
-    x = low + (u * _STEPS - step) * (high - low)
-    density = 1 / (_STEPS * (high - low))
-    return x, _gaussian(x, table.stddev, table.radius) * table.scale / density
 
 
 def pixel_count(film: Film) -> int:

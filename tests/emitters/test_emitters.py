@@ -15,6 +15,8 @@ from pathjax.bsdfs import Diffuse
 from pathjax.core.types import Ray
 from pathjax.scene import build
 from pathjax.scene.parameters import with_parameters
+from pathjax.sensors import Perspective
+from pathjax.sensors.film import HDRFilm
 from pathjax.shapes import geometry
 
 # Chance that a correct light fails one statistical comparison; seeds are fixed.
@@ -52,7 +54,7 @@ def shape(geo, radiance=RADIANCE, flip=False, name="light"):
 
 
 def scene_of(*shapes, background=None, dtype=jnp.float32):
-    camera, film = desc.Camera(np.eye(4), 45.0), desc.Film(2, 2, (0, 0, 2, 2))
+    camera, film = Perspective(np.eye(4), 45.0), HDRFilm(2, 2)
     about = desc.Description("test", camera, film, desc.Integrator(), 1, "independent", shapes, background, "sky")
     return build(about, dtype)
 

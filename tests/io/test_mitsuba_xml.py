@@ -12,6 +12,7 @@ from pathjax.errors import InputError
 from pathjax.images import write_exr, write_png
 from pathjax.io.mitsuba.loader import load
 from pathjax.kinds import Instance
+from pathjax.sensors.filters import Box, Gaussian
 
 CORNELL = Path(__file__).parents[2] / "scenes" / "cornell_box.xml"
 SENSOR = '<sensor type="perspective"/>'
@@ -67,7 +68,7 @@ def first_bsdf(scene: d.Description) -> Instance:
 
 def test_cornell_box_is_read_as_written():
     box = load(CORNELL, res=32, spp=4)
-    assert (box.film.width, box.film.height, box.spp, box.film.filter) == (32, 32, 4, "box")
+    assert (box.film.width, box.film.height, box.spp, box.film.filter) == (32, 32, 4, Box())
     assert box.integrator == d.Integrator(max_depth=8, rr_depth=5)
     assert [shape.name for shape in box.shapes][:3] == ["lamp", "floor", "ceiling"]
     lamp, floor = box.shapes[0], box.shapes[1]
@@ -520,8 +521,8 @@ def test_defaults_of_sensor_film_and_integrator_are_mitsubas(read, mitsuba):
     assert (scene.film.width, scene.film.height) == tuple(sensor.film().size())
     assert scene.spp == sensor.sampler().sample_count()
     assert (scene.camera.near_clip, scene.camera.far_clip) == pytest.approx((params["near_clip"], params["far_clip"]))
-    assert str(sensor.film().rfilter()) == f"GaussianFilter[stddev={scene.film.filter_stddev:.2f}, radius=2.00]"
-    assert (scene.film.filter, scene.film.filter_radius) == ("gaussian", 2)
+    assert str(sensor.film().rfilter()) == f"GaussianFilter[stddev={scene.film.filter.stddev:.2f}, radius=2.00]"
+    assert scene.film.filter == Gaussian(0.5, 2)
     # 50 mm on 36 x 24 mm film, measured along the diagonal; Mitsuba keeps what that makes along x
     assert scene.camera.fov_axis == "diagonal"
     x_fov = 2 * math.degrees(math.atan(math.tan(math.radians(scene.camera.fov / 2)) * 4 / 5))
@@ -553,7 +554,7 @@ def test_film_crop_filter_and_settings_without_effect(read):
       <rfilter type="gaussian"><float name="stddev" value="0.7"/></rfilter></film>"""
     scene = read("", sensor=f'<sensor type="perspective">{film}</sensor>')
     assert scene.film.crop == (4, 0, 20, 30)
-    assert (scene.film.filter_stddev, scene.film.filter_radius) == (0.7, pytest.approx(2.8))
+    assert (scene.film.filter.stddev, scene.film.filter.radius) == (0.7, pytest.approx(2.8))
     assert any("component_format has no effect" in note for note in scene.notes)
 
 

@@ -10,6 +10,8 @@ import pathjax as pj
 from pathjax import description as desc
 from pathjax.bsdfs import Diffuse
 from pathjax.scene import build
+from pathjax.sensors import Perspective
+from pathjax.sensors.film import HDRFilm
 
 SKY = '<emitter type="constant"><rgb name="radiance" value="1"/></emitter>'
 GREY = '<bsdf type="twosided"><bsdf type="diffuse"><rgb name="reflectance" value="0.5"/></bsdf></bsdf>'
@@ -186,7 +188,7 @@ def test_a_slab_that_is_a_mesh_has_both_its_faces_at_a_millionth_of_its_size(mak
 def tables_of(*geometries, dtype=np.float32):
     grey = Diffuse.instance("grey")
     shapes = tuple(desc.Shape(f"s{i}", g, grey, None, "", False) for i, g in enumerate(geometries))
-    camera, film = desc.Camera(np.eye(4), 45.0), desc.Film(2, 2, (0, 0, 2, 2))
+    camera, film = Perspective(np.eye(4), 45.0), HDRFilm(2, 2)
     description = desc.Description("test", camera, film, desc.Integrator(), 1, "independent", shapes, None)
     return build(description, dtype).geometry.tables
 

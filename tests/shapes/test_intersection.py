@@ -12,6 +12,8 @@ from pathjax.compile.runtime import native_map
 from pathjax.core.math import normalize, spawn_ray
 from pathjax.core.types import Ray
 from pathjax.scene import build
+from pathjax.sensors import Perspective
+from pathjax.sensors.film import HDRFilm
 from pathjax.shapes import geometry, triangle
 from pathjax.shapes.accel.leaves import numbers_of, rows_of
 
@@ -29,7 +31,7 @@ def x64():
 
 def scene_of(*geometries, dtype=jnp.float32, flip=False):
     shapes = tuple(desc.Shape(f"s{i}", g, GREY, None, "", flip) for i, g in enumerate(geometries))
-    camera, film = desc.Camera(np.eye(4), 45.0), desc.Film(2, 2, (0, 0, 2, 2))
+    camera, film = Perspective(np.eye(4), 45.0), HDRFilm(2, 2)
     about = desc.Description("test", camera, film, desc.Integrator(), 1, "independent", shapes, None)
     return build(about, dtype).geometry
 

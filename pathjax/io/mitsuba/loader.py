@@ -6,8 +6,6 @@ Defaults are Mitsuba's. Parameters are named after ids; an object without one is
 
 from __future__ import annotations
 
-import math
-import re
 from collections import defaultdict
 from collections.abc import Iterator
 from functools import partial
@@ -16,15 +14,14 @@ from pathlib import Path
 
 import numpy as np
 
-from pathjax import bsdfs, textures
+from pathjax import bsdfs, sensors, textures
 from pathjax import description as d
 from pathjax.description.elements import Document, Element, nearest
 from pathjax.description.fields import Fields
 from pathjax.io import mesh
 from pathjax.io.mitsuba.xml_reader import read
 from pathjax.kinds import Instance
-
-MAX_PIXELS = 10**9
+from pathjax.sensors import film
 
 
 def load(path: str | Path, /, **parameters: object) -> d.Description:
@@ -92,7 +89,8 @@ class _Loader:
             raise element.error(
                 f"{element} is not supported; use one of {', '.join(table)}{nearest(fields.type, table)}"
             )
-        made = table[fields.type](self, fields, *context)
+        read = getattr(table[fields.type], "read", table[fields.type])
+        made = read(self, fields, *context)
         fields.finish()
         return made
 
@@ -228,72 +226,12 @@ def _direct(loader: _Loader, fields: Fields) -> d.Integrator:
 # Sensors: (loader, fields) -> camera, film, samples per pixel, sampler.
 
 
-def _perspective(loader: _Loader, fields: Fields) -> tuple[d.Camera, d.Film, int, str]:
-    near, far = fields.float("near_clip", 1e-2, above=0), fields.float("far_clip", 1e4, above=0)
-    if near >= far:
-        raise fields.error("near_clip", f"must be smaller than far_clip, {far:g}; is {near:g}")
-    to_world = fields.transform("to_world")
-    if not np.allclose(to_world[:3, :3].T @ to_world[:3, :3], np.eye(3), atol=2e-3):
-        raise fields.error("to_world", "scales or shears; a camera can be turned and moved only")
-    aperture_radius = focus_distance = None
-    if fields.type == "thinlens":
-        aperture_radius = fields.float("aperture_radius", above=0)
-        focus_distance = fields.float("focus_distance", far, above=0)
-    offset = tuple(fields.float(f"principal_point_offset_{axis}", 0.0) for axis in "xy")
-    camera = d.Camera(to_world, *_field_of_view(fields), near, far, offset, aperture_radius, focus_distance)
-
+def _sensor(loader: _Loader, fields: Fields) -> tuple[sensors.Sensor, film.HDRFilm, int, str]:
+    camera = sensors.KINDS[fields.type].read(loader, fields)
     films, samplers = fields.objects("film"), fields.objects("sampler")
-    film = loader.make(films[0], FILMS) if films else d.Film(768, 576, (0, 0, 768, 576))
+    made = loader.make(films[0], film.KINDS) if films else film.HDRFilm()
     spp = loader.make(samplers[0], SAMPLERS) if samplers else 4
-    return camera, film, spp, samplers[0].attributes["type"] if samplers else "independent"
-
-
-def _field_of_view(fields: Fields) -> tuple[float, str]:
-    """Degrees, and the axis along which they are measured; a focal length is one of 35 mm film, 36 x 24 mm."""
-    if fields.has("focal_length") and (fields.has("fov") or fields.has("fov_axis")):
-        raise fields.error("focal_length", "excludes fov and fov_axis; give one or the other")
-    if fields.has("fov"):
-        axis = fields.string("fov_axis", "x", choices=("x", "y", "diagonal", "smaller", "larger"))
-        return fields.float("fov", above=0, below=180), axis
-    text = fields.string("focal_length", "50mm").strip()
-    length = re.fullmatch(r"(\d{1,9}(\.\d{1,9})?)\s*(mm)?", text)
-    if not length or float(length[1]) == 0:
-        raise fields.error("focal_length", f'must be like "50mm", is "{text[:40]}"')
-    return 2 * math.degrees(math.atan(math.hypot(36, 24) / (2 * float(length[1])))), "diagonal"
-
-
-def _hdrfilm(loader: _Loader, fields: Fields) -> d.Film:
-    width, height = fields.integer("width", 768, at_least=1), fields.integer("height", 576, at_least=1)
-    if width * height >= MAX_PIXELS:
-        raise fields.error("width", f"times height is {width * height} pixels; it must be below {MAX_PIXELS}")
-    x, y = (fields.integer(f"crop_offset_{axis}", 0, at_least=0) for axis in "xy")
-    crop_width = fields.integer("crop_width", width, at_least=1)
-    crop_height = fields.integer("crop_height", height, at_least=1)
-    if x + crop_width > width or y + crop_height > height:
-        raise fields.element.error(
-            f"the crop window ({x}, {y}) + ({crop_width}, {crop_height}) reaches beyond the film, ({width}, {height})"
-        )
-    fields.string("pixel_format", "rgb", choices=("rgb",))
-    for name, choices in WITHOUT_EFFECT.items():
-        given = fields.string(name, None, choices=choices) if choices else fields.boolean(name, None)
-        if given is not None:
-            loader.notes.append(f"{fields.where(name).file}:{fields.where(name).line}: {name} has no effect")
-    filters = fields.objects("rfilter")
-    shape = loader.make(filters[0], FILTERS) if filters else ("gaussian", 2.0, 0.5)
-    return d.Film(width, height, (x, y, crop_width, crop_height), *shape)
-
-
-def _box(loader: _Loader, fields: Fields) -> tuple[str, float]:
-    return "box", 0.5
-
-
-def _tent(loader: _Loader, fields: Fields) -> tuple[str, float]:
-    return "tent", fields.float("radius", 1.0, above=0, below=100)
-
-
-def _gaussian(loader: _Loader, fields: Fields) -> tuple[str, float, float]:
-    stddev = fields.float("stddev", 0.5, above=0, below=25)
-    return "gaussian", 4 * stddev, stddev
+    return camera, made, spp, samplers[0].attributes["type"] if samplers else "independent"
 
 
 def _sampler(loader: _Loader, fields: Fields) -> int:
@@ -312,16 +250,5 @@ SHAPES = {"sphere": _sphere, "rectangle": _rectangle, "disk": _disk, "cube": _cu
 AREA_LIGHTS = {"area": _emitter}
 BACKGROUNDS = {"constant": _emitter}
 INTEGRATORS = {"path": _path, "direct": _direct}
-SENSORS = {"perspective": _perspective, "thinlens": _perspective}
-FILMS = {"hdrfilm": _hdrfilm}
-FILTERS = {"box": _box, "tent": _tent, "gaussian": _gaussian}
-
+SENSORS = dict.fromkeys(sensors.KINDS, _sensor)
 SAMPLERS = dict.fromkeys(("independent", "stratified", "multijitter", "orthogonal", "ldsampler"), _sampler)
-
-# settings of the film that concern Mitsuba's own files and blocks, with their choices; none: a boolean
-WITHOUT_EFFECT = {
-    "file_format": ("openexr", "exr", "rgbe", "pfm"),
-    "component_format": ("float16", "float32", "uint32"),
-    "sample_border": (),
-    "compensate": (),
-}

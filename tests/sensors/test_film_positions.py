@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from pathjax import description as desc
 from pathjax.sensors import film
+from pathjax.sensors.filters import Box, Gaussian, Tent
 
 # Chance that a correct filter fails one test; seeds are fixed.
 FALSE_ALARM = 1e-4
 N = 400_000
 
 
-def built(**how):
-    return film.build(desc.Film(8, 6, (2, 1, 4, 3), **how), jnp.float32)
+def built(filter):
+    return film.HDRFilm(8, 6, (2, 1, 4, 3), filter).build(jnp.float32)
 
 
 def sampled(made, pixel, u):
@@ -30,23 +30,19 @@ def uniform(n=N, seed=1):
 
 
 FILTERS = {
-    "box": ({"filter": "box", "filter_radius": 0.5}, 0.5, lambda x: np.ones_like(x)),
-    "wide box": ({"filter": "box", "filter_radius": 1.5}, 1.5, lambda x: np.ones_like(x)),
-    "tent": ({"filter": "tent", "filter_radius": 1.0}, 1.0, lambda x: 1 - np.abs(x)),
-    "wide tent": ({"filter": "tent", "filter_radius": 2.0}, 2.0, lambda x: 1 - np.abs(x) / 2),
-    "gaussian": ({"filter": "gaussian"}, 2.0, lambda x: np.exp(-2 * x**2) - np.exp(-8)),
-    "wide gaussian": (
-        {"filter": "gaussian", "filter_stddev": 1.0, "filter_radius": 3.0},
-        3.0,
-        lambda x: np.exp(-(x**2) / 2) - np.exp(-4.5),
-    ),
+    "box": (Box(), 0.5, lambda x: np.ones_like(x)),
+    "wide box": (Box(1.5), 1.5, lambda x: np.ones_like(x)),
+    "tent": (Tent(), 1.0, lambda x: 1 - np.abs(x)),
+    "wide tent": (Tent(2.0), 2.0, lambda x: 1 - np.abs(x) / 2),
+    "gaussian": (Gaussian(), 2.0, lambda x: np.exp(-2 * x**2) - np.exp(-8)),
+    "wide gaussian": (Gaussian(1.0, 3.0), 3.0, lambda x: np.exp(-(x**2) / 2) - np.exp(-4.5)),
 }
 
 
 @pytest.mark.parametrize("name", FILTERS)
 def test_weighted_samples_have_the_filter_for_their_density(name):
-    how, radius, shape = FILTERS[name]
-    offsets, weights = sampled(built(**how), 5, uniform())
+    filter, radius, shape = FILTERS[name]
+    offsets, weights = sampled(built(filter), 5, uniform())
     assert np.abs(offsets).max() <= radius * (1 + 1e-5)
     # Mean weight 1, and each cell of x and y gets its share of the filter, by weight.
     assert abs(weights.mean() - 1) < 5 * max(weights.std() / np.sqrt(N), 1e-6)
@@ -68,12 +64,12 @@ def test_weighted_samples_have_the_filter_for_their_density(name):
 @pytest.mark.parametrize("name", FILTERS)
 def test_weights_vary_little(name):
     """Importance sampling: only the tails of a Gaussian leave a weight other than 1, most in the last of 1024 steps."""
-    weights = sampled(built(**FILTERS[name][0]), 0, uniform(50_000))[1]
+    weights = sampled(built(FILTERS[name][0]), 0, uniform(50_000))[1]
     assert weights.min() >= 0 and weights.max() < 5 and weights.std() < (0.15 if "gaussian" in name else 1e-9)
 
 
 def test_box_samples_of_a_pixel_stay_in_it():
-    made = built(filter="box", filter_radius=0.5)
+    made = built(Box())
     for pixel in (0, 3, 4, 11):
         offsets, weights = sampled(made, pixel, uniform(10_000))
         assert np.abs(offsets).max() <= 0.5 + 1e-5 and (weights == 1).all()
@@ -83,13 +79,13 @@ def test_box_samples_of_a_pixel_stay_in_it():
 def test_samples_are_finite_at_the_ends_of_the_interval(name):
     ends = [0, 0.5, 1 - 2**-24]
     offsets, weights = sampled(
-        built(**FILTERS[name][0]), 1, jnp.array([[a, b] for a in ends for b in ends], jnp.float32)
+        built(FILTERS[name][0]), 1, jnp.array([[a, b] for a in ends for b in ends], jnp.float32)
     )
     assert np.isfinite(offsets).all() and np.isfinite(weights).all()
 
 
 def test_pixels_count_rows_of_the_crop_window():
-    made = built(filter="box", filter_radius=0.5)
+    made = built(Box())
     assert film.pixel_count(made) == 12 and film.image_shape(made) == (3, 4)
     middle = jax.vmap(lambda p: film.sample_position(made, p, jnp.array([0.5, 0.5]))[0])(jnp.arange(12))
     np.testing.assert_allclose(
@@ -102,7 +98,7 @@ def test_filters_are_those_of_mitsuba(name):
     mi = pytest.importorskip("mitsuba")
     mi.set_variant("scalar_rgb")
     theirs = mi.load_dict({"type": name})
-    how, radius, shape = FILTERS[name]
+    filter, radius, shape = FILTERS[name]
     assert theirs.radius() == pytest.approx(radius)
     x = np.linspace(-radius, radius, 41)
     values = np.array([theirs.eval(float(v)) for v in x])

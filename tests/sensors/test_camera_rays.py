@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pathjax import description as desc
-from pathjax.sensors import camera
+from pathjax.sensors import Perspective, ThinLens
+from pathjax.sensors.film import HDRFilm
 
 ORIGIN, TARGET, UP = [1.0, 2.0, -4.0], [0.3, 0.2, 0.5], [0.1, 1.0, 0.2]
 
@@ -26,8 +26,8 @@ def numbers(n=200):
 
 
 def rays_of(record, width, height, positions, lens, dtype=jnp.float32):
-    built = camera.build(record, desc.Film(width, height, (0, 0, width, height)), dtype)
-    sample = jax.jit(jax.vmap(lambda p, u: camera.sample_ray(built, p, u)))
+    built = record.build(HDRFilm(width, height), dtype)
+    sample = jax.jit(jax.vmap(built.sample_ray))
     ray = sample(jnp.asarray(positions, dtype), jnp.asarray(lens, dtype))
     return np.asarray(ray.o), np.asarray(ray.d), np.asarray(ray.t_max)
 
@@ -41,7 +41,7 @@ def assert_mitsubas(record, width, height, crop=None, **more):
     film |= {"crop_offset_x": x, "crop_offset_y": y, "crop_width": w, "crop_height": h}
     sensor = mi.load_dict(
         {
-            "type": "perspective" if record.aperture_radius is None else "thinlens",
+            "type": "thinlens" if isinstance(record, ThinLens) else "perspective",
             "to_world": mi.ScalarTransform4f(record.to_world.tolist()),
             "fov": record.fov,
             "fov_axis": record.fov_axis,
@@ -64,22 +64,22 @@ def assert_mitsubas(record, width, height, crop=None, **more):
 @pytest.mark.parametrize("axis", ["x", "y", "diagonal", "smaller", "larger"])
 @pytest.mark.parametrize("size", [(60, 40), (40, 60)])
 def test_field_of_view_along_each_axis(axis, size):
-    assert_mitsubas(desc.Camera(look_at(), 50.0, axis), *size)
+    assert_mitsubas(Perspective(look_at(), 50.0, axis), *size)
 
 
 def test_crop_window_is_a_part_of_the_film():
-    assert_mitsubas(desc.Camera(look_at(), 50.0), 60, 40, (10, 5, 20, 30))
+    assert_mitsubas(Perspective(look_at(), 50.0), 60, 40, (10, 5, 20, 30))
 
 
 @pytest.mark.parametrize("crop", [None, (10, 5, 20, 30)])
 def test_principal_point_offset(crop):
-    record = desc.Camera(look_at(), 50.0, principal_point_offset=(0.1, -0.2))
+    record = Perspective(look_at(), 50.0, principal_point_offset=(0.1, -0.2))
     more = {"principal_point_offset_x": 0.1, "principal_point_offset_y": -0.2}
     assert_mitsubas(record, 60, 40, crop, **more)
 
 
 def test_clip_distances_run_along_the_axis():
-    record = desc.Camera(look_at(), 70.0, near_clip=0.5, far_clip=20.0)
+    record = Perspective(look_at(), 70.0, near_clip=0.5, far_clip=20.0)
     assert_mitsubas(record, 60, 40)
     o, d, t_max = rays_of(record, 60, 40, *numbers())
     forward = look_at()[:3, 2]
@@ -88,13 +88,13 @@ def test_clip_distances_run_along_the_axis():
 
 
 def test_thin_lens():
-    record = desc.Camera(look_at(), 50.0, aperture_radius=0.3, focus_distance=3.0)
+    record = ThinLens(look_at(), 50.0, aperture_radius=0.3, focus_distance=3.0)
     assert_mitsubas(record, 60, 40, aperture_radius=0.3, focus_distance=3.0)
 
 
 def test_thin_lens_rays_of_a_position_meet_in_the_plane_of_focus():
-    sharp = desc.Camera(look_at(), 50.0, near_clip=1e-6)
-    blurred = desc.Camera(look_at(), 50.0, near_clip=1e-6, aperture_radius=0.3, focus_distance=3.0)
+    sharp = Perspective(look_at(), 50.0, near_clip=1e-6)
+    blurred = ThinLens(look_at(), 50.0, near_clip=1e-6, aperture_radius=0.3, focus_distance=3.0)
     positions = np.repeat(numbers(10)[0], 20, 0)
     forward = look_at()[:3, 2]
     o, d, _ = rays_of(sharp, 60, 40, positions, numbers()[1])
@@ -105,15 +105,15 @@ def test_thin_lens_rays_of_a_position_meet_in_the_plane_of_focus():
 
 
 def test_a_lens_of_radius_0_is_a_pinhole():
-    pinhole = rays_of(desc.Camera(look_at(), 50.0), 60, 40, *numbers())
-    lens = rays_of(desc.Camera(look_at(), 50.0, aperture_radius=0.0, focus_distance=3.0), 60, 40, *numbers())
+    pinhole = rays_of(Perspective(look_at(), 50.0), 60, 40, *numbers())
+    lens = rays_of(ThinLens(look_at(), 50.0, aperture_radius=0.0, focus_distance=3.0), 60, 40, *numbers())
     for a, b in zip(pinhole, lens, strict=True):
         np.testing.assert_allclose(a, b, atol=1e-6, rtol=1e-6)
 
 
 def test_upper_left_corner_comes_first():
     """Camera at the origin looking along +z: x to the left of the image, y up."""
-    _, d, _ = rays_of(desc.Camera(np.eye(4), 90.0), 40, 40, [[0, 0], [1, 0], [0, 1], [0.5, 0.5]], np.zeros((4, 2)))
+    _, d, _ = rays_of(Perspective(np.eye(4), 90.0), 40, 40, [[0, 0], [1, 0], [0, 1], [0.5, 0.5]], np.zeros((4, 2)))
     np.testing.assert_allclose(d / d[:, 2:], [[1, 1, 1], [-1, 1, 1], [1, -1, 1], [0, 0, 1]], atol=1e-6)
 
 
@@ -121,5 +121,5 @@ def test_scale_in_to_world_changes_neither_directions_nor_distances():
     """Ray directions are unit whatever the matrix holds."""
     scaled = look_at()
     scaled[:3, :3] *= 3
-    for a, b in zip(*(rays_of(desc.Camera(m, 50.0), 60, 40, *numbers()) for m in (look_at(), scaled)), strict=True):
+    for a, b in zip(*(rays_of(Perspective(m, 50.0), 60, 40, *numbers()) for m in (look_at(), scaled)), strict=True):
         np.testing.assert_allclose(a, b, atol=1e-6, rtol=1e-6)

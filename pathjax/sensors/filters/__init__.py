@@ -1,0 +1,17 @@
+"""Reconstruction filters, a file a kind: through one of them each pixel looks.
+
+Filters are sampled by importance: a pixel gathers only its own samples, with weights that average to 1, so that pixels
+stay independent of each other.
+"""
+
+from __future__ import annotations
+
+from pathjax.sensors.filters.box import Box
+from pathjax.sensors.filters.filter import Filter
+from pathjax.sensors.filters.gaussian import Gaussian
+from pathjax.sensors.filters.tent import Tent
+
+__all__ = ["KINDS", "Box", "Filter", "Gaussian", "Tent"]
+
+# By the name that scene files give them.
+KINDS: dict[str, type[Filter]] = {"box": Box, "tent": Tent, "gaussian": Gaussian}

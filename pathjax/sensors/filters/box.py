@@ -1,0 +1,23 @@
+"""All of a pixel alike."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+
+from pathjax.sensors.filters.filter import Filter
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Box(Filter):
+    radius: jax.Array | float = 0.5  # () pixels
+
+    @classmethod
+    def read(cls, loader, fields) -> Box:
+        return cls()
+
+    def sample(self, u):
+        return (2 * u - 1) * self.radius, jnp.ones_like(u[0])

@@ -1,0 +1,34 @@
+"""What a reconstruction filter is."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+
+import jax
+import numpy as np
+
+from pathjax.description.fields import Fields
+
+
+class Filter(ABC):
+    """A filter, a pytree: of numbers as a scene file has them, and once built of arrays."""
+
+    @classmethod
+    @abstractmethod
+    def read(cls, loader, fields: Fields) -> Filter:
+        """Ask for what an element may hold."""
+
+    def build(self, dtype) -> Filter:
+        """What kernels take."""
+        return jax.tree.map(lambda x: np.asarray(x, dtype), self)
+
+    @abstractmethod
+    def sample(self, u):
+        """Draw where a sample of a pixel looks.
+
+        Args:
+            u: (2,) uniform in [0, 1).
+        Returns:
+            offset (2,) from the middle of the pixel, in pixels, and weight () of mean 1: weighted samples have the
+            filter for their density.
+        """

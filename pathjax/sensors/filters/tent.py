@@ -1,0 +1,24 @@
+"""A tent: weights fall from the middle of a pixel to 0."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+
+from pathjax.core.warp import tent
+from pathjax.sensors.filters.filter import Filter
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Tent(Filter):
+    radius: jax.Array | float = 1.0  # () pixels
+
+    @classmethod
+    def read(cls, loader, fields) -> Tent:
+        return cls(fields.float("radius", 1.0, above=0, below=100))
+
+    def sample(self, u):
+        return tent(u) * self.radius, jnp.ones_like(u[0])

@@ -1,0 +1,114 @@
+"""The pinhole camera."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from pathjax.core.math import dot
+from pathjax.core.types import Ray
+from pathjax.description.fields import Fields
+from pathjax.sensors.film import HDRFilm
+from pathjax.sensors.sensor import Camera, Sensor
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class PerspectiveCamera(Camera):
+    axes: jax.Array  # (3, 3) rows: unit right, up, forward in world space
+    corner: jax.Array  # (2,) x, y at distance 1 of the film's upper left corner
+    extent: jax.Array  # (2,) x, y at distance 1 from that corner to the opposite one
+    near: jax.Array  # () clip distances along the optical axis
+    far: jax.Array  # ()
+
+    def sample_ray(self, position, u_lens) -> Ray:
+        xy = self.corner + position * self.extent
+        start, local = self.through_lens(jnp.stack([xy[0], xy[1], jnp.ones_like(xy[0])]), u_lens)
+        right, up, forward = self.axes
+
+        def to_world(v):
+            return v[0] * right + v[1] * up + v[2] * forward
+
+        v = lax.optimization_barrier(to_world(local))
+        length = jnp.sqrt(dot(v, v))
+        d = v / length
+        along = length / local[2]
+        o = self.origin + to_world(start) + d * (self.near * along)
+        return Ray(o, d, (self.far - self.near) * along, jnp.int32(-1))
+
+    def through_lens(self, local, u_lens):
+        """Where on the lens a ray starts (3,), and its direction (3,) of any length; both in the camera's axes.
+
+        local: (3,) the direction through the middle of the lens, 1 along the optical axis.
+        """
+        return jnp.zeros_like(local), local
+
+
+@dataclass(frozen=True)
+class Perspective(Sensor):
+    """Looks along +z, x to the left, y up, as Mitsuba's."""
+
+    to_world: np.ndarray  # (4, 4)
+    fov: float  # degrees, along fov_axis
+    fov_axis: str = "x"  # "x", "y", "diagonal", "smaller", "larger"
+    near_clip: float = 1e-2
+    far_clip: float = 1e4
+    principal_point_offset: tuple[float, float] = (0.0, 0.0)
+
+    @classmethod
+    def read(cls, loader, fields: Fields) -> Perspective:
+        near, far = fields.float("near_clip", 1e-2, above=0), fields.float("far_clip", 1e4, above=0)
+        if near >= far:
+            raise fields.error("near_clip", f"must be smaller than far_clip, {far:g}; is {near:g}")
+        to_world = fields.transform("to_world")
+        if not np.allclose(to_world[:3, :3].T @ to_world[:3, :3], np.eye(3), atol=2e-3):
+            raise fields.error("to_world", "scales or shears; a camera can be turned and moved only")
+        lens = cls.read_lens(fields, far)
+        offset = tuple(fields.float(f"principal_point_offset_{axis}", 0.0) for axis in "xy")
+        return cls(to_world, *_field_of_view(fields), near, far, offset, **lens)
+
+    @staticmethod
+    def read_lens(fields: Fields, far: float) -> dict[str, float]:
+        """Further fields, of cameras that have a lens."""
+        return {}
+
+    def build(self, film: HDRFilm, dtype) -> PerspectiveCamera:
+        return PerspectiveCamera(*self.arrays(film, dtype))
+
+    def arrays(self, film: HDRFilm, dtype):
+        """Of `PerspectiveCamera`."""
+        aspect = film.width / film.height
+        tan = math.tan(math.radians(self.fov) / 2)
+        tan_x = {
+            "x": tan,
+            "y": tan * aspect,
+            "diagonal": tan * aspect / math.hypot(aspect, 1),
+            "smaller": tan * max(aspect, 1),
+            "larger": tan * min(aspect, 1),
+        }[self.fov_axis]
+        half = np.array([tan_x, tan_x / aspect])
+        # The local x axis points to the left of the image.
+        axes = self.to_world[:3, :3] / np.linalg.norm(self.to_world[:3, :3], axis=0)
+        shift = 2 * half * np.array([-self.principal_point_offset[0], -self.principal_point_offset[1]])
+        numbers = self.to_world[:3, 3], axes.T, half + shift, -2 * half, self.near_clip, self.far_clip
+        return [np.asarray(x, dtype) for x in numbers]
+
+
+def _field_of_view(fields: Fields) -> tuple[float, str]:
+    """Degrees, and the axis along which they are measured; a focal length is one of 35 mm film, 36 x 24 mm."""
+    if fields.has("focal_length") and (fields.has("fov") or fields.has("fov_axis")):
+        raise fields.error("focal_length", "excludes fov and fov_axis; give one or the other")
+    if fields.has("fov"):
+        axis = fields.string("fov_axis", "x", choices=("x", "y", "diagonal", "smaller", "larger"))
+        return fields.float("fov", above=0, below=180), axis
+    text = fields.string("focal_length", "50mm").strip()
+    length = re.fullmatch(r"(\d{1,9}(\.\d{1,9})?)\s*(mm)?", text)
+    if not length or float(length[1]) == 0:
+        raise fields.error("focal_length", f'must be like "50mm", is "{text[:40]}"')
+    return 2 * math.degrees(math.atan(math.hypot(36, 24) / (2 * float(length[1])))), "diagonal"

@@ -1,0 +1,42 @@
+"""What a sensor is."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import jax
+
+from pathjax.core.types import Ray
+from pathjax.description.fields import Fields
+from pathjax.sensors.film import HDRFilm
+
+
+@dataclass(frozen=True)
+class Camera(ABC):
+    """A sensor in a scene: arrays, of the dtype of the scene. A pytree."""
+
+    origin: jax.Array  # (3,) in world space
+
+    @abstractmethod
+    def sample_ray(self, position, u_lens) -> Ray:
+        """Return the ray through a point of the film; it starts on no primitive.
+
+        Args:
+            position: (2,) in [0, 1]^2 over the whole film, from the upper left corner; a wide filter reaches beyond.
+            u_lens: (2,) uniform in [0, 1), for sensors with an aperture.
+        Differentiable in position and in the arrays.
+        """
+
+
+class Sensor(ABC):
+    """What a scene file says of a sensor, NumPy and numbers."""
+
+    @classmethod
+    @abstractmethod
+    def read(cls, loader, fields: Fields) -> Sensor:
+        """Ask for what an element may hold; its film and its sampler are the loader's."""
+
+    @abstractmethod
+    def build(self, film: HDRFilm, dtype) -> Camera:
+        """film: whose size gives the aspect ratio."""
