@@ -232,7 +232,7 @@ def test_no_primitive_of_a_derivative_is_left_to_vmap(shipped, left_to_vmap, nam
 # ---- nothing that the scene lacks -----------------------------------------------------------------------------------
 
 # Source files that the debug information of a lowered program names.
-ALWAYS = {"render.py", "path.py", "camera.py", "film.py", "sampler.py"}
+ALWAYS = {"render.py", "path.py", "perspective.py", "film.py", "sampler.py"}
 OPTIONAL = {
     "dielectric.py": {"glass_and_mirror", "glass_in_glass"},
     "conductor.py": {"glass_and_mirror"},
@@ -241,7 +241,7 @@ OPTIONAL = {
     "sphere.py": {"glass_and_mirror", "glass_in_glass"},
     "triangle.py": {"mesh"},
     "bvh.py": {"mesh"},
-    "box.py": {"cornell_box", "glass_and_mirror", "glass_in_glass"},
+    "cube.py": {"cornell_box", "glass_and_mirror", "glass_in_glass"},
     "planar.py": {"cornell_box", "glass_and_mirror", "glass_in_glass", "mesh"},
     "constant.py": set(),  # its radiance is read by the dispatch; only strategy "light" samples it
     "area.py": {"cornell_box", "glass_and_mirror", "glass_in_glass", "mesh"},

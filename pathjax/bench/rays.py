@@ -12,7 +12,6 @@ import numpy as np
 from pathjax.bench import embree_peer
 from pathjax.core.warp import square_to_sphere
 from pathjax.rendering.query import _closest_hit
-from pathjax.shapes.triangle import Triangles
 
 RAYS = 1 << 18
 
@@ -26,7 +25,7 @@ def rates(scene, repeat: int) -> tuple[dict, dict | None]:
     kinds = {"camera": _camera_rays(scene)}
     kinds["scattered"] = _scattered_rays(scene.geometry, *kinds["camera"])
     all_shapes = {name: _rate(scene.geometry, *rays, repeat) for name, rays in kinds.items()}
-    mesh = next((table for table in scene.geometry.tables if isinstance(table, Triangles)), None)
+    mesh = next((table for table in scene.geometry.tables if table.triangular), None)
     if mesh is None:
         return all_shapes, None
     only_mesh = replace(scene.geometry, tables=(mesh,))

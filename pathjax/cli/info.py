@@ -11,10 +11,7 @@ from pathjax.rendering import bounces
 from pathjax.scene.parameters import parameters
 from pathjax.scene.scene import UNBOUNDED, Scene
 from pathjax.sensors import film
-from pathjax.shapes import geometry
 from pathjax.shapes.accel.leaves import rows_of
-from pathjax.shapes.box import Boxes
-from pathjax.shapes.planar import Planar
 from pathjax.system.json_text import json_text
 from pathjax.system.output import Output
 
@@ -35,7 +32,7 @@ def scene_facts(scene: Scene) -> dict:
     about = scene.about
     description = about.description
     max_depth = int(scene.max_depth)
-    parts = [part for table in scene.geometry.tables for part in geometry.searched(table)]
+    parts = [part for table in scene.geometry.tables for part in table.searched()]
     height, width = film.image_shape(scene.film)
     dark = emitters.darkness(scene.emitters)
     return {
@@ -49,9 +46,9 @@ def scene_facts(scene: Scene) -> dict:
         },
         "sampler": {"file": description.sampler, "used": _SAMPLER},
         "shapes": len(description.shapes),
-        "primitives": {_kind(part): _primitives(part) for part in parts},
+        "primitives": {f"{part.kind}s": _primitives(part) for part in parts},
         "compiled": {
-            "shapes": [_kind(part) + (" (tree)" if part.tree else " (flat)") for part in parts],
+            "shapes": [f"{part.kind}s ({'tree' if part.tree else 'flat'})" for part in parts],
             "bsdfs": [bsdfs.name(scene.materials, kind) for kind in range(len(scene.materials.tables))],
             "light sampling": bsdfs.occurs(scene.materials, "smooth") and scene.emitters.area is not None,
             "emitters": [name for name in ("area", "constant") if getattr(scene.emitters, name) is not None],
@@ -113,14 +110,6 @@ def _type(described) -> str:
 
 def _primitives(part) -> int:
     return int((rows_of(part.leaves) >= 0).sum())
-
-
-def _kind(part) -> str:
-    if isinstance(part, Planar):
-        return "disks" if part.disk else "rectangles"
-    if isinstance(part, Boxes):
-        return "cubes"
-    return type(part).__name__.lower()
 
 
 def text(facts: dict) -> str:

@@ -117,6 +117,12 @@ def safe_atan2(y, x):
     return jnp.where(origin, 0, jnp.where(y < 0, -angle, angle))
 
 
+def turns(y, x):
+    """Angle of the point x, y from the x axis, in turns: 0 to 1; 0, with derivatives 0, at the origin."""
+    angle = safe_atan2(y, x) / (2 * math.pi)
+    return jnp.where(angle < 0, angle + 1, angle)
+
+
 def luminance(rgb):
     """Rec. 709 luminance of linear RGB (..., 3) -> (...)."""
     return rgb[..., 0] * 0.2126 + rgb[..., 1] * 0.7152 + rgb[..., 2] * 0.0722

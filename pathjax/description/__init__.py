@@ -14,48 +14,9 @@ from pathjax.kinds import Instance
 
 
 @dataclass(frozen=True)
-class Sphere:
-    center: np.ndarray  # (3,) float64, world
-    radius: float
-    to_world: np.ndarray  # carries the unit sphere at the origin; only its rotation matters further (uv)
-
-
-@dataclass(frozen=True)
-class Rectangle:
-    """[-1, 1]^2 in the xy plane, normal +z, carried by `to_world`."""
-
-    to_world: np.ndarray
-
-
-@dataclass(frozen=True)
-class Disk:
-    """Unit disk in the xy plane, normal +z, carried by `to_world`."""
-
-    to_world: np.ndarray
-
-
-@dataclass(frozen=True)
-class Cube:
-    """[-1, 1]^3, normals outwards, carried by `to_world`."""
-
-    to_world: np.ndarray
-
-
-@dataclass(frozen=True)
-class Mesh:
-    """World-space triangles without degenerate ones; normals follow the transform and are unit."""
-
-    vertices: np.ndarray  # (V, 3) float64
-    faces: np.ndarray  # (F, 3) int64
-    normals: np.ndarray | None  # (V, 3): smooth shading; None: face normals
-    uv: np.ndarray | None  # (V, 2)
-    dropped: int = 0  # degenerate triangles left out
-
-
-@dataclass(frozen=True)
 class Shape:
     name: str
-    geometry: Sphere | Rectangle | Disk | Cube | Mesh
+    geometry: object  # a `shapes.Shape`
     bsdf: Instance
     radiance: np.ndarray | None  # (3,) of its area emitter; None: it has none
     emitter_name: str  # "" where it has no emitter

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +14,8 @@ from pathjax.core.types import EmitterSample, Hit, Ray, Surface
 from pathjax.emitters import area, constant
 from pathjax.emitters.area import AreaLights
 from pathjax.emitters.constant import Constant
-from pathjax.shapes.geometry import Geometry
+from pathjax.kinds import Parameter
+from pathjax.shapes import Geometry, Lamp, lamp_table
 
 
 @jax.tree_util.register_dataclass
@@ -31,6 +32,32 @@ class Choice:
 
     pdf: jax.Array  # (R,)
     cdf: jax.Array  # (R,) ends at 1
+
+
+def build(description, geometry: Geometry, lamps: list[Lamp], dtype, parameters) -> tuple[Emitters, Geometry]:
+    """The lights of a scene, and its geometry with their numbers.
+
+    lamps: of `shapes.build`.
+    """
+    shapes = description.shapes
+    emitting = list(dict.fromkeys(lamp.shape for lamp in lamps))
+    bounds = (0, np.inf)
+    for row, shape in enumerate(shapes[number] for number in emitting):
+        place = Parameter(("emitters", "area", "radiance"), (row,), (3,), bounds)
+        parameters[f"{shape.emitter_name}.radiance"] = place
+    area = constant = None
+    if lamps:
+        rows = [emitting.index(lamp.shape) for lamp in lamps]
+        radiance = np.asarray(np.stack([shapes[number].radiance for number in emitting]), dtype)
+        area = AreaLights(radiance, np.asarray(rows, np.int32), lamp_table(lamps, dtype))
+    if description.background is not None:
+        constant = Constant(np.asarray(description.background, dtype))
+        place = Parameter(("emitters", "constant", "radiance"), (), (3,), bounds)
+        parameters[f"{description.background_name}.radiance"] = place
+    light = np.full(len(geometry.shape), -1, np.int32)
+    for number, lamp in enumerate(lamps):
+        light[lamp.primitive : lamp.primitive + lamp.count] = number
+    return Emitters(area, constant), replace(geometry, light=light)
 
 
 def darkness(emitters: Emitters) -> str | None:
@@ -50,7 +77,7 @@ def choice(emitters: Emitters, strategy: str) -> Choice | None:
     weights = []
     if emitters.area is not None:
         lights = emitters.area
-        weights.append(lights.area * luminance(lights.radiance)[lights.emitter])
+        weights.append(lights.lamps.area * luminance(lights.radiance)[lights.emitter])
     if emitters.constant is not None and strategy == "light":
         one = jnp.ones((1,), emitters.constant.radiance.dtype)
         weights = [jnp.concatenate([weights[0] / jnp.sum(weights[0]), one]) if weights else one]

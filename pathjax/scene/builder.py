@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pathjax import bsdfs
+from pathjax import bsdfs, emitters, shapes
 from pathjax import description as desc
 from pathjax.compile.runtime import usual_promotion
 from pathjax.errors import InputError
@@ -14,7 +14,6 @@ from pathjax.kinds import Parameters
 from pathjax.scene.metadata import About
 from pathjax.scene.scene import UNBOUNDED, Scene
 from pathjax.shapes.accel.build import RULES
-from pathjax.shapes.builder import build_shapes
 
 
 @usual_promotion
@@ -34,7 +33,8 @@ def build(description: desc.Description, dtype=jnp.float32, split_rule: str = "s
         raise InputError('dtype = float64, which is off in JAX; call jax.config.update("jax_enable_x64", True) first')
     parameters = Parameters()
     materials = bsdfs.build([shape.bsdf for shape in description.shapes], dtype, ("materials",), parameters)
-    geometry, emitters, trees = build_shapes(description, dtype, parameters.known, split_rule)
+    geometry, lamps, trees = shapes.build(description.shapes, dtype, split_rule)
+    lights, geometry = emitters.build(description, geometry, lamps, dtype, parameters.known)
     integrator = description.integrator
     max_depth = UNBOUNDED if integrator.max_depth < 0 else integrator.max_depth
     scene = Scene(
@@ -42,7 +42,7 @@ def build(description: desc.Description, dtype=jnp.float32, split_rule: str = "s
         description.film.build(dtype),
         geometry,
         materials,
-        emitters,
+        lights,
         np.int32(max_depth),
         np.int32(integrator.rr_depth),
         integrator.hide_emitters,

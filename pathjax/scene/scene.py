@@ -11,7 +11,7 @@ from pathjax.emitters import Emitters
 from pathjax.scene.metadata import About
 from pathjax.sensors import Camera
 from pathjax.sensors.film import Film
-from pathjax.shapes.geometry import Geometry
+from pathjax.shapes import Geometry
 
 # Depth that stands for "no limit": more bounces than any path survives roulette.
 UNBOUNDED = 1 << 30

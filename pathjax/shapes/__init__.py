@@ -1,5 +1,133 @@
 """Shapes: a file a kind, a bounding volume hierarchy over any of them, and `geometry`, which the rest of the code sees.
 
-Each kind keeps its primitives twice: in `leaves`, (L, K, W), K numbers of W primitives side by side for intersection
-in SIMD, and as rows of its own arrays, for everything that is asked of the one primitive that was hit.
+A kind is a class of `shape.Shape`, what a scene file says of one, which names the `shape.Table` that its primitives go
+into. Kinds may share a table, as cubes and rectangles do. One row in `KINDS` makes a kind exist for scene files,
+builders and kernels.
 """
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from pathjax.shapes import coincident
+from pathjax.shapes.accel.build import Tree
+from pathjax.shapes.cube import Cube
+from pathjax.shapes.disk import Disk
+from pathjax.shapes.geometry import Geometry
+from pathjax.shapes.rectangle import Rectangle
+from pathjax.shapes.shape import Lamps, Primitives, Shape, Table
+from pathjax.shapes.sphere import Sphere
+from pathjax.shapes.triangle import FORMATS, Mesh
+
+__all__ = [
+    "KINDS",
+    "Cube",
+    "Disk",
+    "Geometry",
+    "Lamp",
+    "Lamps",
+    "Mesh",
+    "Rectangle",
+    "Shape",
+    "Sphere",
+    "Table",
+    "build",
+    "lamp_table",
+]
+
+# By the name that scene files give them; of a mesh it is the format of its file.
+KINDS: dict[str, type[Shape]] = {
+    "sphere": Sphere,
+    "rectangle": Rectangle,
+    "disk": Disk,
+    "cube": Cube,
+    **dict.fromkeys(FORMATS, Mesh),
+}
+
+
+class Lamp(NamedTuple):
+    """Primitives of one shape that emit as one light."""
+
+    shape: int  # its place among the shapes
+    table: int  # of the geometry
+    first: int  # first row in that table
+    count: int
+    area: float
+    primitive: int  # number of the first one among all of the geometry
+
+
+class _Part(NamedTuple):
+    shape: int
+    primitives: Primitives
+    glass: bool  # lies between two media
+    lamp: bool
+
+
+def build(shapes, dtype, rule: str) -> tuple[Geometry, list[Lamp], dict[str, Tree]]:
+    """Tables of primitives, which lack the numbers of their lights; what emits; hierarchies by `kind`, for reports.
+
+    Args:
+        shapes: of `description.Shape`; rule: of `accel.build`.
+    """
+    order = dict.fromkeys(kind.table for kind in KINDS.values())
+    by_table: dict[type[Table], list[_Part]] = {table: [] for table in order}
+    numbers = sorted(range(len(shapes)), key=lambda number: shapes[number].geometry.comes_last)
+    for number in numbers:
+        shape = shapes[number]
+        primitives = shape.geometry.primitives(shape.flip_normals)
+        part = _Part(number, primitives, shape.bsdf.kind.sided, shape.radiance is not None)
+        by_table[shape.geometry.table].append(part)
+    by_table = {table: parts for table, parts in by_table.items() if parts}
+
+    margins = _part_coincident(by_table, dtype)
+    tables, trees, lamps, shape_of = [], {}, [], []
+    for table, parts in by_table.items():
+        lamps += _lamps(parts, len(tables), len(shape_of))
+        shape_of += [part.shape for part in parts for _ in part.primitives.areas]
+        primitives, lit = [part.primitives for part in parts], [part.lamp for part in parts]
+        made, built = table.build(primitives, lit, dtype, rule, margins.get(table))
+        tables.append(made)
+        trees |= built
+    lamps.sort(key=lambda lamp: numbers.index(lamp.shape))
+    geometry = Geometry(tuple(tables), np.asarray(shape_of, np.int32), None)
+    return geometry, lamps, {kind: tree for kind, tree in trees.items() if tree is not None}
+
+
+def lamp_table(lamps: list[Lamp], dtype) -> Lamps:
+    """For kernels."""
+    _, table, first, count, area, _ = zip(*lamps, strict=True)
+    tables = tuple(sorted(set(table)))
+    integers = (np.asarray(x, np.int32) for x in ([tables.index(each) for each in table], first, count))
+    return Lamps(*integers, np.asarray(area, dtype), tables)
+
+
+def _lamps(parts: list[_Part], table, primitive):
+    """Of one table, whose first primitive has this number."""
+    first = 0
+    for shape, primitives, _, lamp in parts:
+        areas = primitives.areas
+        if lamp and primitives.one_lamp:
+            yield Lamp(shape, table, first, len(areas), areas.sum(), primitive + first)
+        elif lamp:
+            yield from (Lamp(shape, table, first + i, 1, a, primitive + first + i) for i, a in enumerate(areas))
+        first += len(areas)
+
+
+def _part_coincident(by_table: dict[type[Table], list[_Part]], dtype):
+    """Move faces as `coincident` has it, in place, and return margins (P,) by table, where one has any."""
+    margins: dict[type[Table], list] = {table: [] for table in by_table}
+    flat = []
+    for table, parts in by_table.items():
+        faces = [part.primitives.faces(part.glass, part.lamp, dtype) for part in parts]
+        if None in faces:
+            margins[table].append(table.own_margins([part.primitives for part in parts], dtype))
+        else:
+            flat += [(table, part.primitives, each) for part, each in zip(parts, faces, strict=True)]
+    contacts = coincident.contacts([faces for *_, faces in flat], dtype)
+    for (table, primitives, _), moves, found in zip(flat, *contacts, strict=True):
+        primitives.move(moves)
+        margins[table].append(np.broadcast_to(found, len(primitives.areas)))
+    joined = {table: np.concatenate(each) for table, each in margins.items()}
+    return {table: np.asarray(each, dtype) for table, each in joined.items() if each.any()}

@@ -18,15 +18,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pathjax.shapes import box, planar, triangle
-
 # In machine epsilons of the coordinates along the normal, for each of the two primitives: an upper bound on what its
 # point, its plane and a distance from that lose by rounding (see `planar.leaf_numbers`).
-_MARGIN = 4
+MARGIN = 4
 # In machine epsilons of the scene's size, since rays come from anywhere in it.
 _GAP = 8
-# Triangles among which to look for a large one, whose plane is that of the mesh if it is flat.
-_SOME = 100
 
 
 class Faces(NamedTuple):
@@ -37,28 +33,6 @@ class Faces(NamedTuple):
     depth: np.ndarray | None  # (F,) of the body that the face closes; inf: it is a sheet
     glass: bool
     lamp: bool
-
-
-def faces_of_planar(frames, glass: bool, lamp: bool) -> Faces:
-    """Of a rectangle, a disk or a cube, by its frames (1 or 6, 4, 3)."""
-    depth = box.depths(frames) if len(frames) == box.FACES else np.full(len(frames), np.inf)
-    return Faces(planar.corners(frames), frames[:, 3], depth, glass, lamp)
-
-
-def faces_of_mesh(vertices, glass: bool, lamp: bool, dtype) -> Faces:
-    """Of triangles (P, 3, 3); one face if all lie in one plane."""
-    some = vertices[:_SOME]
-    largest = some[np.argmax(triangle.area(some))]
-    corner, edge, normal = largest[0], largest[1] - largest[0], triangle.face_normals(largest[None])[0, 0]
-    from_corner = vertices - corner
-    flat = np.abs(from_corner @ normal).max() <= 2 * _precision(dtype) * (np.abs(vertices) @ np.abs(normal)).max()
-    if not flat:
-        return Faces(vertices, None, None, glass, lamp)
-    axes = np.stack([edge, np.cross(normal, edge)]) / np.linalg.norm(edge)
-    places = from_corner @ axes.T
-    (x0, y0), (x1, y1) = places.min((0, 1)), places.max((0, 1))
-    around = corner + np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]]) @ axes
-    return Faces(around[None], normal[None], np.array([np.inf]), glass, lamp)
 
 
 def contacts(shapes: list[Faces], dtype) -> tuple[list[np.ndarray], list[np.ndarray]]:
@@ -75,7 +49,7 @@ def contacts(shapes: list[Faces], dtype) -> tuple[list[np.ndarray], list[np.ndar
     fixed = [i for i, each in enumerate(shapes) if each.normal is None]
     eps = np.finfo(dtype).eps
     # Points are projected onto planes, which in one through the origin leaves what a rounding is of a rounding.
-    least = _MARGIN * (eps * eps) * size
+    least = MARGIN * (eps * eps) * size
     for others in (movable, fixed):
         for i, row, j, partners, margin in _coplanar(shapes, movable, others, least, dtype):
             mine, other = _face(shapes[i], row), _face(shapes[j], partners[0])
@@ -99,7 +73,7 @@ class _Face(NamedTuple):
 
 def _face(faces: Faces, row) -> _Face:
     if faces.normal is None:
-        return _Face(triangle.face_normals(faces.corners[[row]])[0, 0], np.inf, faces.glass, faces.lamp)
+        return _Face(unit_normal(faces.corners[row]), np.inf, faces.glass, faces.lamp)
     return _Face(faces.normal[row], faces.depth[row], faces.glass, faces.lamp)
 
 
@@ -113,18 +87,13 @@ def _yields(face: _Face, other: _Face) -> bool:
     return face.lamp and not (other.lamp or other.glass or other_body)
 
 
-def sphere_margins(balls, dtype) -> np.ndarray:
-    """Margins (P,) of spheres (P, 4), center and radius; 0 for those that no other one coincides with."""
-    from scipy.spatial import cKDTree  # takes a sixth of a second, which `import pathjax` has not
-
-    reach = np.linalg.norm(balls[:, :3], axis=1) + balls[:, 3]
-    margins = np.zeros(len(balls))
-    pairs = cKDTree(balls).query_pairs(_precision(dtype) * reach.max(initial=0), output_type="ndarray")
-    margins[pairs] = 2 * _MARGIN * np.finfo(dtype).eps * reach[pairs]
-    return margins
+def unit_normal(vertices):
+    """(..., 3, 3) -> (..., 3) of triangles."""
+    n = np.cross(vertices[..., 1, :] - vertices[..., 0, :], vertices[..., 2, :] - vertices[..., 0, :])
+    return n / np.linalg.norm(n, axis=-1, keepdims=True)
 
 
-def _precision(dtype):
+def precision(dtype):
     """Relative difference up to which coordinates may round to the same number, after transforms have rounded them."""
     return np.finfo(dtype).eps / 2 + 8 * np.finfo(np.float64).eps
 
@@ -150,7 +119,7 @@ def _coplanar(shapes: list[Faces], movable, others, least, dtype):
 
     for i in movable:
         for row, (mine, normal) in enumerate(zip(shapes[i].corners, shapes[i].normal, strict=True)):
-            slack = _precision(dtype) * np.abs(mine).max(0)
+            slack = precision(dtype) * np.abs(mine).max(0)
             bottom, top = mine.min(0) - slack, mine.max(0) + slack
             # What may overlap along an axis is a range. It is short where the face is thin, but for tiles of a floor.
             for axis in np.argsort(top - bottom):
@@ -162,8 +131,8 @@ def _coplanar(shapes: list[Faces], movable, others, least, dtype):
             near = near[(lo[near] <= top).all(1) & (hi[near] >= bottom).all(1) & (owner[near] != i)]
             # The size of coordinates along the normal, to which rounding is relative.
             reach = (np.abs(mine).max(0) + np.abs(corners[near]).max(1)) @ np.abs(normal)
-            within = np.abs((corners[near] - mine[0]) @ normal).max(1, initial=0) <= _precision(dtype) * reach
-            near, margin = near[within], least + _MARGIN * np.finfo(dtype).eps * reach[within]
+            within = np.abs((corners[near] - mine[0]) @ normal).max(1, initial=0) <= precision(dtype) * reach
+            near, margin = near[within], least + MARGIN * np.finfo(dtype).eps * reach[within]
             for j in np.unique(owner[near]):
                 touches = owner[near] == j
                 partners = rows[near[touches]], margin[touches]

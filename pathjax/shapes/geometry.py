@@ -16,30 +16,24 @@ from jax import lax
 from pathjax.compile.lanes import one_by_one
 from pathjax.core.math import at, integer_like, smaller
 from pathjax.core.types import Hit, Ray, Surface
-from pathjax.shapes import box, planar, sphere, triangle
 from pathjax.shapes.accel import traverse as bvh
-from pathjax.shapes.box import Boxes
-from pathjax.shapes.planar import Planar
-from pathjax.shapes.sphere import Spheres
-from pathjax.shapes.triangle import Triangles
+from pathjax.shapes.shape import Lamps, LampSample, Searched, Table
 
 # As a primitive: none. As the bits of a float32 distance: beyond infinity.
 NO_HIT = np.int32(0x7FFFFFFF)
-
-_MODULES = {Triangles: triangle, Planar: planar, Boxes: box, Spheres: sphere}
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Geometry:
-    tables: tuple  # one entry per kind of shape present; primitives are numbered through all of them in this order
+    tables: tuple[Table, ...]  # one for each kind of primitive present, through which these are numbered in this order
     shape: jax.Array  # (P,) int32 of each primitive, its place in the scene file
-    light: jax.Array  # (P,) int32 row in the table of lights; -1: emits nothing
+    light: jax.Array | None  # (P,) int32 number of its light; -1: emits nothing. None: lights are not built yet
 
 
 def firsts(geometry: Geometry) -> list[int]:
     """Number of the first primitive of each table."""
-    counts = [_MODULES[type(table)].count(table) for table in geometry.tables]
+    counts = [table.count for table in geometry.tables]
     return np.cumsum([0, *counts])[:-1].tolist()
 
 
@@ -96,8 +90,7 @@ def surface(geometry: Geometry, ray: Ray, hit: Hit) -> Surface:
     primitive = jnp.maximum(hit.primitive, 0)
 
     def of(table, start):
-        module = _MODULES[type(table)]
-        return lambda: module.surface(table, jnp.maximum(primitive - start, 0), ray.o, ray.d, hit.t)
+        return lambda: table.surface(jnp.maximum(primitive - start, 0), ray.o, ray.d, hit.t)
 
     return switch_by_range(primitive, first, [of(*pair) for pair in zip(geometry.tables, first, strict=True)])
 
@@ -105,6 +98,39 @@ def surface(geometry: Geometry, ray: Ray, hit: Hit) -> Surface:
 def emits(geometry: Geometry, hit: Hit):
     """() bool: whether what was hit is a light."""
     return (hit.primitive >= 0) & (at(geometry.light, jnp.maximum(hit.primitive, 0)) >= 0)
+
+
+def sample_lamp(geometry: Geometry, lamps: Lamps, lamp, ref, u, u_part) -> LampSample:
+    """A point of a lamp as seen from `ref` (3,): uniform in area, for spheres in the cone that they fill.
+
+    Args:
+        lamp: () int32 row of `lamps`; u: (2,); u_part: () chooses the triangle of a mesh.
+    """
+    first = firsts(geometry)
+
+    def of(index):
+        def draw():
+            drawn = geometry.tables[index].sample_lamp(lamps, lamp, ref, u, u_part)
+            return drawn._replace(primitive=drawn.primitive + first[index])
+
+        return draw
+
+    return _switch_by_lamp(lamps, lamp, of)
+
+
+def lamp_density(geometry: Geometry, lamps: Lamps, lamp, ray: Ray, hit: Hit, surface: Surface):
+    """Density () [1/sr] with which `sample_lamp`, seen from ray.o, finds what the ray hit, a point of this lamp."""
+    first = firsts(geometry)
+
+    def of(index):
+        return lambda: geometry.tables[index].lamp_density(lamps, lamp, first[index], ray, hit, surface)
+
+    return _switch_by_lamp(lamps, lamp, of)
+
+
+def _switch_by_lamp(lamps, lamp, of):
+    branches = [of(index) for index in lamps.tables]
+    return branches[0]() if len(branches) == 1 else lax.switch(at(lamps.table, lamp), branches)
 
 
 def switch_by_range(number, first: list[int], branches):
@@ -119,22 +145,14 @@ def _visit(geometry: Geometry, ray: Ray, leaf_test, t, primitive):
     """Give every leaf that the ray may meet to `leaf_test(distances (W,), rows (W,), first, t, primitive)`, which
     returns t, primitive. The primitives are first + rows: W sums that only a hit wants."""
     for table, first in zip(geometry.tables, firsts(geometry), strict=True):
-        for part in searched(table):
+        for part in table.searched():
             t, primitive = _visit_table(part, first, ray, leaf_test, t, primitive)
     return t, primitive
 
 
-def searched(table):
-    """What of a table is searched, each with leaves and a tree of its own."""
-    parts = [table, table.boxes] if isinstance(table, Planar) else [table]
-    return [part for part in parts if part is not None and len(part.leaves)]
-
-
-def _visit_table(table, first, ray, leaf_test, t, primitive):
-    module = _MODULES[type(table)]
-
+def _visit_table(table: Searched, first, ray, leaf_test, t, primitive):
     def leaf(prepared, exclude, number, t, primitive):
-        distances, rows = module.intersect(table, number, prepared, exclude - first)
+        distances, rows = table.intersect(number, prepared, exclude - first)
         return leaf_test(distances, rows, first, t, primitive)
 
     # A search goes its own way for each ray; what it starts from is made for all of them.
@@ -143,7 +161,7 @@ def _visit_table(table, first, ray, leaf_test, t, primitive):
         of_ray = partial(leaf, lax.optimization_barrier(prepared), exclude)
         return bvh.traverse(table.tree, of_ray, slabs, entry, t, primitive)
 
-    prepared = lax.optimization_barrier(module.prepare(ray.o, ray.d))
+    prepared = lax.optimization_barrier(table.prepare(ray.o, ray.d))
     if table.tree is not None:
         slabs = lax.optimization_barrier(bvh.prepare(ray.o, ray.d))
         entry = lax.optimization_barrier(bvh.enter(table.tree, slabs, t))

@@ -1,35 +1,181 @@
-"""Rectangles (parallelograms where sheared) and disks (ellipses): a plane, and two coordinates on it.
+"""What rectangles and disks have in common: a plane, and two coordinates on it.
 
-A point of the plane is c + x a + y b; the shape is |x|, |y| <= 1 for a rectangle and x^2 + y^2 <= 1 for a disk.
-One test stands for the two triangles of a rectangle, and a disk is exact.
+A point of the plane is c + x a + y b; the shape is |x|, |y| <= 1 for a rectangle (a parallelogram where sheared) and
+x^2 + y^2 <= 1 for a disk (an ellipse). One test stands for the two triangles of a rectangle, and a disk is exact.
 """
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, field
+from abc import abstractmethod
+from dataclasses import dataclass
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pathjax.core.math import at, dot, larger, safe_atan2, safe_divide, safe_sqrt
+from pathjax.core.math import at, dot, safe_divide
 from pathjax.core.types import Surface
-from pathjax.core.warp import square_to_disk
-from pathjax.shapes.accel.leaves import numbers_of, rows_of
+from pathjax.description.fields import Fields
+from pathjax.shapes.accel.leaves import numbers_of, pack, rows_of
 from pathjax.shapes.accel.traverse import Tree
-from pathjax.shapes.box import Boxes
+from pathjax.shapes.coincident import Faces
+from pathjax.shapes.shape import Primitives, Searched, Shape, Table
+
+# Of [-1, 1]^2 in the xy plane, or of what lies in it: as in `Frames`.
+FLAT = np.array([[[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]], float)
 
 
-@jax.tree_util.register_dataclass
+@dataclass
+class Frames(Primitives):
+    frames: np.ndarray  # (F, 4, 3) centre, directions of u and v as long as half the sides, unit normal
+    areas: np.ndarray  # (F,)
+    found_by: ClassVar[type[Searched] | None] = None  # instead of one by one
+
+    def depths(self):
+        """(F,) of the body that the face closes; inf: it is a sheet."""
+        return np.full(len(self.frames), np.inf)
+
+    def faces(self, glass, lamp, dtype):
+        return Faces(corners(self.frames), self.frames[:, 3], self.depths(), glass, lamp)
+
+    def move(self, moves):
+        self.frames[:, 0] += moves
+
+
 @dataclass(frozen=True)
-class Planar:
-    leaves: jax.Array  # (L, 15, W) bits of `leaf_numbers`, NaN in empty lanes; row of each lane
-    tree: Tree | None  # None: L = 1, every ray tests all
+class PlanarShape(Shape):
+    to_world: np.ndarray  # (4, 4)
+    local: ClassVar[np.ndarray] = FLAT
+    made: ClassVar[type[Frames]] = Frames
+
+    @classmethod
+    def read(cls, loader, fields: Fields):
+        return cls(fields.transform("to_world"))
+
+    def primitives(self, flip):
+        linear = self.to_world[:3, :3]
+        points = self.local[:, :1] @ linear.T + self.to_world[:3, 3]
+        directions = self.local[:, 1:3] @ linear.T
+        normals = self.local[:, 3:] @ np.linalg.inv(linear)
+        normals = normals / np.linalg.norm(normals, axis=-1, keepdims=True) * (-1 if flip else 1)
+        frames = np.concatenate([points, directions, normals], 1)
+        return self.made(frames, self.table.areas_of(frames))
+
+
+@dataclass(frozen=True)
+class Planar(Table):
+    leaves: jax.Array  # of `leaf_numbers`
+    tree: Tree | None
     frames: jax.Array  # (P, 4, 3): c, a, b, unit normal
-    boxes: Boxes | None  # which find the last of the rectangles, in place of the leaves
     margins: jax.Array | None  # (P,) of `coincident`; None: no other primitive lies in any of these
-    disk: bool = field(metadata={"static": True})
+    more: Searched | None  # which finds the last of them, in place of the leaves; None: there are no such
+
+    unit_area: ClassVar[float]  # where a and b are unit and orthogonal
+
+    @classmethod
+    def build(cls, parts, lit, dtype, rule, margins):
+        frames = np.concatenate([part.frames for part in parts])
+        single = sum(len(part.frames) for part in parts if part.found_by is None)
+        alone, faces = frames[:single], frames[single:]
+        packed, tree, built = pack(leaf_numbers(alone), *cls.bounds(alone), dtype, rule)
+        more, trees = None, {cls.kind: built}
+        if len(faces):
+            finder = parts[-1].found_by
+            more, trees[finder.kind] = finder.build(faces, single, dtype, rule)
+        return cls(packed, tree, np.asarray(frames, dtype), margins, more), trees
+
+    @classmethod
+    def bounds(cls, frames):
+        """(P, 4, 3) -> two (P, 3)."""
+        c, a, b, _ = np.moveaxis(frames, 1, 0)
+        reach = cls.reach(a, b)
+        return c - reach, c + reach
+
+    @staticmethod
+    @abstractmethod
+    def reach(a, b):
+        """(P, 3) from the middle to the bounds."""
+
+    @classmethod
+    def areas_of(cls, frames):
+        return np.linalg.norm(np.cross(frames[:, 1], frames[:, 2]), axis=-1) * cls.unit_area
+
+    def areas(self):
+        return self.areas_of(np.asarray(self.frames, float))
+
+    def searched(self):
+        return super().searched() + ([] if self.more is None else [self.more])
+
+    def intersect(self, leaf, prepared, start):
+        """The border is inclusive by the rounding error of the coordinate, so faces that share an edge leave no gap."""
+        o, d = prepared
+        block = at(self.leaves, leaf)
+        leaf = numbers_of(block, d.dtype)
+        c, n, dual_a, dual_b, error = leaf[0:3], leaf[3:6], leaf[6:9], leaf[9:12], leaf[12:14]
+        to_c = [c[axis] - o[axis] for axis in range(3)]
+        t = dot(n, to_c) / dot(n, d)
+        p = [t * d[axis] - to_c[axis] for axis in range(3)]
+        x, y = dot(dual_a, p), dot(dual_b, p)
+        error = error * (4 * np.finfo(leaf.dtype).eps)
+        inside = self.inside(x, y, (1 + error[0]) + t * error[1])
+        rows = rows_of(block)
+        return jnp.where(inside & (rows != start), t, jnp.inf), rows
+
+    @staticmethod
+    @abstractmethod
+    def inside(x, y, reach):
+        """(W,) bool: whether the point of these coordinates lies in the shape of this size, 1 but for rounding."""
+
+    @property
+    def count(self):
+        return self.frames.shape[0]
+
+    def surface(self, row, o, d, t):
+        """No margin where nothing else lies in the plane: the primitive is excluded by number, and its few neighbours
+        err only within rounding of the shared edge. So a sheet of glass may be as thin as the coordinates can tell.
+        """
+        c, a, b, n = at(self.frames, row)
+        from_c = o - c
+        distance = -safe_divide(dot(n, from_c), dot(n, d))
+        q = from_c + distance * d
+        p = c + (q - dot(n, q) * n)
+        margin = jnp.zeros_like(distance) if self.margins is None else at(self.margins, row)
+        aa, ab, bb = dot(a, a), dot(a, b), dot(b, b)
+        qa, qb = dot(q, a), dot(q, b)
+        scale = 1 / (aa * bb - ab * ab)
+        return Surface(p, n, margin, n, self.uv((bb * qa - ab * qb) * scale, (aa * qb - ab * qa) * scale))
+
+    @staticmethod
+    @abstractmethod
+    def uv(x, y):
+        """(2,) of the point of these coordinates."""
+
+    @staticmethod
+    @abstractmethod
+    def from_unit_square(u):
+        """Coordinates x, y that are uniform in area: u (2,) -> (2,)."""
+
+    def sample(self, row, u):
+        return self.point(row, self.from_unit_square(u))
+
+    def point(self, row, xy):
+        """The point (3,) of coordinates (2,), the normal (3,), and the rounding error along it ()."""
+        c, a, b, n = at(self.frames, row)
+        margin = dot(jnp.abs(n), jnp.abs(c) + jnp.abs(a) + jnp.abs(b)) * (4 * np.finfo(c.dtype).eps)
+        return c + xy[0] * a + xy[1] * b, n, margin
+
+    def to_square(self, row, p):
+        c, a, b, _ = at(self.frames, row)
+        q = p - c
+        aa, ab, bb, qa, qb = dot(a, a), dot(a, b), dot(b, b), dot(q, a), dot(q, b)
+        x, y = jnp.stack([bb * qa - ab * qb, aa * qb - ab * qa]) / (aa * bb - ab * ab)
+        return self.square(x, y)
+
+    @staticmethod
+    @abstractmethod
+    def square(x, y):
+        """(2,) in [0, 1], in which equal areas are equal."""
 
 
 def leaf_numbers(frames):
@@ -50,80 +196,3 @@ def corners(frames):
     """(P, 4, 3) -> (P, 4, 3) of the rectangle, or of that around the disk."""
     c, a, b, _ = np.moveaxis(frames, 1, 0)
     return np.stack([c - a - b, c + a - b, c + a + b, c - a + b], 1)
-
-
-def bounds(frames, disk):
-    """(P, 4, 3) -> two (P, 3)."""
-    c, a, b, _ = np.moveaxis(frames, 1, 0)
-    reach = np.sqrt(a**2 + b**2) if disk else np.abs(a) + np.abs(b)
-    return c - reach, c + reach
-
-
-def prepare(o, d):
-    return o, d
-
-
-def intersect(table: Planar, leaf, prepared, start):
-    """Of the W shapes of a leaf.
-
-    Args:
-        start: () int32 row of the shape that the ray starts on, which is flat and not hit again, or of nothing here.
-    Returns:
-        distances (W,), NaN or inf where missed, possibly negative where behind; rows (W,).
-    The border is inclusive by the rounding error of the coordinate, so faces that share an edge leave no gap.
-    """
-    o, d = prepared
-    block = at(table.leaves, leaf)
-    leaf = numbers_of(block, d.dtype)
-    c, n, dual_a, dual_b, error = leaf[0:3], leaf[3:6], leaf[6:9], leaf[9:12], leaf[12:14]
-    to_c = [c[axis] - o[axis] for axis in range(3)]
-    t = dot(n, to_c) / dot(n, d)
-    p = [t * d[axis] - to_c[axis] for axis in range(3)]
-    x, y = dot(dual_a, p), dot(dual_b, p)
-    error = error * (4 * np.finfo(leaf.dtype).eps)
-    reach = (1 + error[0]) + t * error[1]
-    inside = x * x + y * y <= reach * reach if table.disk else larger(jnp.abs(x), jnp.abs(y)) <= reach
-    rows = rows_of(block)
-    return jnp.where(inside & (rows != start), t, jnp.inf), rows
-
-
-def count(table: Planar) -> int:
-    return table.frames.shape[0]
-
-
-def surface(table: Planar, row, o, d, t) -> Surface:
-    """Differentiable in the ray; the point lies on the plane to the last bits.
-
-    No margin where nothing else lies in the plane: the primitive is excluded by number, and its few neighbours err only
-    within rounding of the shared edge. So a sheet of glass may be as thin as the coordinates can tell.
-    """
-    c, a, b, n = at(table.frames, row)
-    from_c = o - c
-    distance = -safe_divide(dot(n, from_c), dot(n, d))
-    q = from_c + distance * d
-    p = c + (q - dot(n, q) * n)
-    margin = jnp.zeros_like(distance) if table.margins is None else at(table.margins, row)
-    aa, ab, bb = dot(a, a), dot(a, b), dot(b, b)
-    qa, qb = dot(q, a), dot(q, b)
-    scale = 1 / (aa * bb - ab * ab)
-    x, y = (bb * qa - ab * qb) * scale, (aa * qb - ab * qa) * scale
-    if table.disk:
-        r = safe_sqrt(x * x + y * y)
-        angle = safe_atan2(y, x) / (2 * math.pi)
-        uv = jnp.stack([r, jnp.where(angle < 0, angle + 1, angle)])
-    else:
-        uv = jnp.stack([(x + 1) / 2, (y + 1) / 2])
-    return Surface(p, n, margin, n, uv)
-
-
-def sample(table: Planar, row, u):
-    """Uniform point: u (2,) -> point (3,), unit normal (3,), rounding error along it ()."""
-    c, a, b, n = at(table.frames, row)
-    xy = square_to_disk(u) if table.disk else 2 * u - 1
-    margin = dot(jnp.abs(n), jnp.abs(c) + jnp.abs(a) + jnp.abs(b)) * (4 * np.finfo(c.dtype).eps)
-    return c + xy[0] * a + xy[1] * b, n, margin
-
-
-def area(frames, disk):
-    """(P, 4, 3) -> (P,)."""
-    return np.linalg.norm(np.cross(frames[:, 1], frames[:, 2]), axis=-1) * (math.pi if disk else 4)

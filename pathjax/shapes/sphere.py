@@ -12,6 +12,7 @@ from jax import lax
 
 from pathjax.core.math import (
     at,
+    cos_sin_turns,
     dot,
     frame_from_normal,
     larger,
@@ -20,26 +21,190 @@ from pathjax.core.math import (
     safe_divide,
     safe_sqrt,
     to_world,
+    turns,
 )
 from pathjax.core.types import Surface
 from pathjax.core.warp import SPHERE_PDF, cone_pdf, square_to_cone, square_to_sphere
-from pathjax.shapes.accel.leaves import numbers_of, rows_of
+from pathjax.description.fields import Fields
+from pathjax.shapes import coincident
+from pathjax.shapes.accel.leaves import numbers_of, pack, rows_of
 from pathjax.shapes.accel.traverse import Tree
+from pathjax.shapes.shape import LampSample, Primitives, Shape, Table
+
+
+@dataclass
+class Ball(Primitives):
+    balls: np.ndarray  # (1, 4) center, radius
+    to_local: np.ndarray  # (1, 3, 3)
+    sign: np.ndarray  # (1,)
+
+    @property
+    def areas(self):
+        return _areas(self.balls)
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
-class Spheres:
-    leaves: jax.Array  # (L, 5, W) bits of center, radius, NaN in empty lanes; row of each lane
-    tree: Tree | None  # None: L = 1, every ray tests all
+class Spheres(Table):
+    leaves: jax.Array  # of center, radius
+    tree: Tree | None
     balls: jax.Array  # (P, 4) center, radius
     to_local: jax.Array  # (P, 3, 3) rotation into the frame of its uv
     sign: jax.Array  # (P,) -1 where the normal points inwards
     margins: jax.Array | None  # (P,) of `coincident`; None: no two of these coincide
 
+    kind = "sphere"
+    even_chords = True
 
-def leaf_numbers(balls):
-    return balls
+    @classmethod
+    def build(cls, parts, lit, dtype, rule, margins):
+        rows = [np.concatenate([getattr(part, name) for part in parts]) for name in ("balls", "to_local", "sign")]
+        packed, tree, built = pack(rows[0], *bounds(rows[0]), dtype, rule)
+        return cls(packed, tree, *(np.asarray(x, dtype) for x in rows), margins), {cls.kind: built}
+
+    @classmethod
+    def own_margins(cls, parts, dtype):
+        """0 for spheres that no other one coincides with."""
+        from scipy.spatial import cKDTree  # takes a sixth of a second, which `import pathjax` has not
+
+        balls = np.concatenate([part.balls for part in parts])
+        reach = np.linalg.norm(balls[:, :3], axis=1) + balls[:, 3]
+        margins = np.zeros(len(balls))
+        pairs = cKDTree(balls).query_pairs(coincident.precision(dtype) * reach.max(initial=0), output_type="ndarray")
+        margins[pairs] = 2 * coincident.MARGIN * np.finfo(dtype).eps * reach[pairs]
+        return margins
+
+    def intersect(self, leaf, prepared, start):
+        """Discriminant from the vector of closest approach, roots without cancellation (Haines, Gunther, Akenine-Moller
+        2019, "Precision improvements for ray/sphere intersection"). The sphere that the ray starts on has a root there
+        that is exactly 0.
+        """
+        o, d = prepared
+        block = at(self.leaves, leaf)
+        leaf = numbers_of(block, d.dtype)
+        radius = leaf[3]
+        f = [o[axis] - leaf[axis] for axis in range(3)]
+        b = -dot(f, d)
+        closest = [f[axis] + b * d[axis] for axis in range(3)]
+        half_chord = jnp.sqrt(radius * radius - dot(closest, closest))  # NaN: a miss, and every comparison drops it
+        f_length = jnp.sqrt(dot(f, f))
+        rows = rows_of(block)
+        c = jnp.where(rows == start, 0, (f_length - radius) * (f_length + radius))
+        q = b + jnp.copysign(half_chord, b)
+        other = c / q
+        near, far = jnp.where(q < other, q, other), jnp.where(q < other, other, q)
+        return jnp.where(near > 0, near, far), rows
+
+    @property
+    def count(self):
+        return self.balls.shape[0]
+
+    def surface(self, row, o, d, t):
+        """No margin but where two coincide."""
+        ball = at(self.balls, row)
+        center, radius = ball[:3], ball[3]
+        f = o - center
+        b = -dot(f, d)
+        closest = f + b * d
+        half_chord = safe_sqrt(radius * radius - dot(closest, closest))
+        # t says which of the two roots was found.
+        outward = normalize(closest + jnp.copysign(half_chord, t - b) * d)
+        local = at(self.to_local, row) @ outward
+        theta = safe_atan2(safe_sqrt(local[0] * local[0] + local[1] * local[1]), local[2]) / math.pi
+        uv = jnp.stack([turns(local[1], local[0]), theta])
+        n = outward * at(self.sign, row)
+        margin = jnp.zeros_like(radius) if self.margins is None else at(self.margins, row)
+        return Surface(center + radius * outward, n, margin, n, uv)
+
+    def sample_lamp(self, lamps, lamp, ref, u, u_part):
+        """Uniform over the cone that the sphere fills seen from `ref`, or over its area from inside."""
+        row = at(lamps.first, lamp)
+        ball = at(self.balls, row)
+        center, radius = ball[:3], ball[3]
+        one_minus_cos, outside = _one_minus_cos(ball, ref)
+        to_center = center - ref
+        axis = normalize(to_center)
+        frame = frame_from_normal(axis)
+        # Read by five results: without the barrier each computes it again.
+        d = lax.optimization_barrier(to_world(frame, square_to_cone(u, one_minus_cos)))
+        b = dot(to_center, d)
+        closest = b * d - to_center
+        distance = larger(b - safe_sqrt(radius * radius - dot(closest, closest)), jnp.zeros_like(b))
+        outward = normalize(ref + distance * d - center)
+
+        from_inside = square_to_sphere(u)
+        to_p = center + radius * from_inside - ref
+        d_inside = normalize(to_p)
+        distance_inside = jnp.sqrt(dot(to_p, to_p))
+
+        outward = jnp.where(outside, outward, from_inside)
+        d = jnp.where(outside, d, d_inside)
+        distance = jnp.where(outside, distance, distance_inside)
+        n, pdf = outward * at(self.sign, row), _pdf(ball, one_minus_cos, outside, outward, d, distance)
+        return LampSample(*lax.optimization_barrier((d, distance, n, pdf)), row)
+
+    def lamp_density(self, lamps, lamp, first, ray, hit, surface):
+        ball = at(self.balls, hit.primitive - first)
+        one_minus_cos, outside = _one_minus_cos(ball, ray.o)
+        return _pdf(ball, one_minus_cos, outside, surface.n, ray.d, hit.t)
+
+    @property
+    def turned_inwards(self):
+        """(P,) bool: the normal points inwards."""
+        return np.asarray(self.sign) < 0
+
+    def areas(self):
+        return _areas(np.asarray(self.balls, float))
+
+    def cell_lengths(self, size):
+        area = self.areas()
+        belts = np.maximum(np.rint(np.sqrt(area / math.pi) / size), 1)
+        return np.stack([area / (belts * size), belts * size], -1)
+
+    def to_square(self, row, p):
+        local = at(self.to_local, row) @ normalize(p - at(self.balls, row)[:3])
+        return jnp.stack([turns(local[1], local[0]), (1 - local[2]) / 2])
+
+    def from_square(self, row, xy):
+        center, radius = at(self.balls, row)[:3], at(self.balls, row)[3]
+        z = 1 - 2 * xy[1]
+        r = safe_sqrt(1 - z * z)
+        cos, sin = cos_sin_turns(xy[0])
+        outward = at(self.to_local, row).T @ jnp.stack([r * cos, r * sin, z])
+        reach, n = jnp.abs(center) + radius, outward * at(self.sign, row)
+        return center + radius * outward, n, dot(jnp.abs(n), reach) * (4 * jnp.finfo(radius.dtype).eps)
+
+
+@dataclass(frozen=True)
+class Sphere(Shape):
+    center: np.ndarray  # (3,) world
+    radius: float
+    to_world: np.ndarray  # (4, 4) carries the unit sphere at the origin; only its rotation matters further (uv)
+    table = Spheres
+
+    @classmethod
+    def read(cls, loader, fields: Fields):
+        local = np.eye(4)
+        local[:3, 3] = fields.point("center", np.zeros(3))
+        local[:3, :3] *= fields.float("radius", 1.0, above=0)
+        to_world = fields.transform("to_world") @ local
+        radius = float(np.linalg.norm(to_world[:3, 0]))
+        with np.errstate(all="ignore"):
+            unit = to_world[:3, :3] / radius
+            round_enough = np.allclose(unit.T @ unit, np.eye(3), atol=1e-3)
+        if not round_enough or not 0 < np.float32(radius) < np.inf:
+            raise fields.error("to_world", "scales unevenly or shears; a sphere must stay a sphere")
+        return cls(to_world[:3, 3], radius, to_world)
+
+    @property
+    def mirrored(self):
+        return np.linalg.det(self.to_world[:3, :3]) < 0
+
+    def primitives(self, flip):
+        linear = self.to_world[:3, :3]
+        rotation = linear / np.linalg.norm(linear, axis=0)
+        balls = np.array([[*self.center, self.radius]])
+        return Ball(balls, rotation.T[None], np.array([-1.0 if flip else 1.0]))
 
 
 def bounds(balls):
@@ -47,59 +212,8 @@ def bounds(balls):
     return balls[:, :3] - balls[:, 3:], balls[:, :3] + balls[:, 3:]
 
 
-def prepare(o, d):
-    return o, d
-
-
-def intersect(table: Spheres, leaf, prepared, start):
-    """Of the W spheres of a leaf.
-
-    Args:
-        start: () int32 row of the sphere that the ray starts on, whose root there is exactly 0, or of nothing here.
-    Returns:
-        distances (W,), NaN where missed, negative where behind; rows (W,).
-
-    Discriminant from the vector of closest approach, roots without cancellation (Haines, Gunther, Akenine-Moller 2019,
-    "Precision improvements for ray/sphere intersection").
-    """
-    o, d = prepared
-    block = at(table.leaves, leaf)
-    leaf = numbers_of(block, d.dtype)
-    radius = leaf[3]
-    f = [o[axis] - leaf[axis] for axis in range(3)]
-    b = -dot(f, d)
-    closest = [f[axis] + b * d[axis] for axis in range(3)]
-    half_chord = jnp.sqrt(radius * radius - dot(closest, closest))  # NaN: a miss, and every comparison drops it
-    f_length = jnp.sqrt(dot(f, f))
-    rows = rows_of(block)
-    c = jnp.where(rows == start, 0, (f_length - radius) * (f_length + radius))
-    q = b + jnp.copysign(half_chord, b)
-    other = c / q
-    near, far = jnp.where(q < other, q, other), jnp.where(q < other, other, q)
-    return jnp.where(near > 0, near, far), rows
-
-
-def count(table: Spheres) -> int:
-    return table.balls.shape[0]
-
-
-def surface(table: Spheres, row, o, d, t) -> Surface:
-    """Differentiable in the ray; the point is projected back onto the sphere. No margin but where two coincide."""
-    ball = at(table.balls, row)
-    center, radius = ball[:3], ball[3]
-    f = o - center
-    b = -dot(f, d)
-    closest = f + b * d
-    half_chord = safe_sqrt(radius * radius - dot(closest, closest))
-    # t says which of the two roots was found.
-    outward = normalize(closest + jnp.copysign(half_chord, t - b) * d)
-    local = at(table.to_local, row) @ outward
-    phi = safe_atan2(local[1], local[0]) / (2 * math.pi)
-    theta = safe_atan2(safe_sqrt(local[0] * local[0] + local[1] * local[1]), local[2]) / math.pi
-    uv = jnp.stack([jnp.where(phi < 0, phi + 1, phi), theta])
-    n = outward * at(table.sign, row)
-    margin = jnp.zeros_like(radius) if table.margins is None else at(table.margins, row)
-    return Surface(center + radius * outward, n, margin, n, uv)
+def _areas(balls):
+    return 4 * math.pi * balls[:, 3] ** 2
 
 
 def _one_minus_cos(ball, ref):
@@ -111,48 +225,6 @@ def _one_minus_cos(ball, ref):
     return sin2 / (1 + safe_sqrt(1 - sin2)), outside
 
 
-def sample_direction(table: Spheres, row, ref, u):
-    """Uniform over the cone that the sphere fills seen from `ref`, or over its area from inside.
-
-    Returns:
-        direction (3,) unit, distance (), unit normal there (3,), pdf [1/sr].
-    """
-    ball = at(table.balls, row)
-    center, radius = ball[:3], ball[3]
-    one_minus_cos, outside = _one_minus_cos(ball, ref)
-    to_center = center - ref
-    axis = normalize(to_center)
-    frame = frame_from_normal(axis)
-    # Read by five results: without the barrier each computes it again.
-    d = lax.optimization_barrier(to_world(frame, square_to_cone(u, one_minus_cos)))
-    b = dot(to_center, d)
-    closest = b * d - to_center
-    distance = larger(b - safe_sqrt(radius * radius - dot(closest, closest)), jnp.zeros_like(b))
-    outward = normalize(ref + distance * d - center)
-
-    from_inside = square_to_sphere(u)
-    to_p = center + radius * from_inside - ref
-    d_inside = normalize(to_p)
-    distance_inside = jnp.sqrt(dot(to_p, to_p))
-
-    outward = jnp.where(outside, outward, from_inside)
-    d = jnp.where(outside, d, d_inside)
-    distance = jnp.where(outside, distance, distance_inside)
-    return d, distance, outward * at(table.sign, row), _pdf(ball, one_minus_cos, outside, outward, d, distance)
-
-
-def pdf_direction(table: Spheres, row, ref, d, distance, n):
-    """Density [1/sr] with which `sample_direction` finds the point at `distance`, whose normal is n."""
-    ball = at(table.balls, row)
-    one_minus_cos, outside = _one_minus_cos(ball, ref)
-    return _pdf(ball, one_minus_cos, outside, n, d, distance)
-
-
 def _pdf(ball, one_minus_cos, outside, n, d, distance):
     by_area = SPHERE_PDF * safe_divide(distance * distance, jnp.abs(dot(n, d)) * ball[3] * ball[3])
     return jnp.where(outside, cone_pdf(one_minus_cos), by_area)
-
-
-def area(balls):
-    """(P, 4) -> (P,)."""
-    return 4 * math.pi * balls[:, 3] ** 2

@@ -1,4 +1,4 @@
-"""Triangles: watertight intersection, surface, area sampling."""
+"""Meshes of triangles: watertight intersection, surface, area sampling."""
 
 from __future__ import annotations
 
@@ -12,19 +12,234 @@ from jax import lax
 from pathjax.core.math import at, cross, dot, larger, normalize, rescale, safe_divide
 from pathjax.core.types import Surface
 from pathjax.core.warp import square_to_triangle
-from pathjax.shapes.accel.leaves import numbers_of, rows_of
+from pathjax.description.fields import Fields
+from pathjax.shapes.accel.leaves import numbers_of, pack, rows_of
 from pathjax.shapes.accel.traverse import Tree
+from pathjax.shapes.coincident import Faces, precision, unit_normal
+from pathjax.shapes.shape import Primitives, Shape, Table
+
+# Of the files that meshes come from: those of `io.mesh`.
+FORMATS = ("obj", "ply", "stl", "glb", "gltf")
+# Triangles among which to look for a large one, whose plane is that of the mesh if it is flat.
+_SOME = 100
+
+
+@dataclass
+class Facets(Primitives):
+    vertices: np.ndarray  # (F, 3, 3)
+    normals: np.ndarray | None  # (F, 3, 3)
+    uv: np.ndarray | None  # (F, 3, 2)
+
+    one_lamp = True
+
+    @property
+    def areas(self):
+        return _areas(self.vertices)
+
+    def faces(self, glass, lamp, dtype):
+        """One face if all triangles lie in one plane."""
+        some = self.vertices[:_SOME]
+        largest = some[np.argmax(_areas(some))]
+        corner, edge, normal = largest[0], largest[1] - largest[0], unit_normal(largest)
+        from_corner = self.vertices - corner
+        reach = (np.abs(self.vertices) @ np.abs(normal)).max()
+        if np.abs(from_corner @ normal).max() > 2 * precision(dtype) * reach:
+            return Faces(self.vertices, None, None, glass, lamp)
+        axes = np.stack([edge, np.cross(normal, edge)]) / np.linalg.norm(edge)
+        places = from_corner @ axes.T
+        (x0, y0), (x1, y1) = places.min((0, 1)), places.max((0, 1))
+        around = corner + np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]]) @ axes
+        return Faces(around[None], normal[None], np.array([np.inf]), glass, lamp)
+
+    def move(self, moves):
+        self.vertices += moves
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
-class Triangles:
-    leaves: jax.Array  # (L, 10, W) bits of x of the three vertices, y, z, NaN in empty lanes; row of each lane
-    tree: Tree | None  # None: L = 1, every ray tests all
+class Triangles(Table):
+    leaves: jax.Array  # of x of the three vertices, y, z
+    tree: Tree | None
     vertices: jax.Array  # (P, 3, 3) by row: vertex, axis
     normals: jax.Array | None  # (P, 3, 3) at the vertices; None: no triangle of the scene is smooth
     uv: jax.Array | None  # (P, 3, 2)
     margins: jax.Array | None  # (P,) of `coincident`, beside their own; None: nothing flat lies in any of these
+    area_cdf: jax.Array | None  # (P,) running share of the area of each mesh that emits; None: none does
+
+    kind = "triangle"
+    polygons = triangular = True
+
+    @classmethod
+    def build(cls, parts, lit, dtype, rule, margins):
+        def joined(arrays):
+            return np.asarray(np.concatenate(arrays), dtype)
+
+        def optional(name, default):
+            values = [getattr(part, name) for part in parts]
+            if all(value is None for value in values):
+                return None
+            return joined([default(p.vertices) if v is None else v for p, v in zip(parts, values, strict=True)])
+
+        normals = optional("normals", lambda v: np.repeat(unit_normal(v)[:, None], 3, axis=1))
+        uv = optional("uv", lambda v: np.broadcast_to(np.array([[0, 0], [1, 0], [0, 1]], float), (len(v), 3, 2)))
+        cdf = None
+        if any(lit):
+            running = ((part.areas, on) for part, on in zip(parts, lit, strict=True))
+            cdf = joined([np.cumsum(areas) / np.sum(areas) * on for areas, on in running])
+        vertices = np.concatenate([part.vertices for part in parts])
+        packed, tree, built = pack(leaf_numbers(vertices), *bounds(vertices), dtype, rule)
+        return cls(packed, tree, np.asarray(vertices, dtype), normals, uv, margins, cdf), {cls.kind: built}
+
+    def prepare(self, o, d):
+        """Constants of a ray: the shear that turns it into the z axis (Woop, Benthin, Wald 2013, JCGT 2(1)).
+
+        Returns:
+            (3,) int32 axes x, y, z, and (6,) origin and shear in that order.
+        """
+        size = jnp.abs(d)
+        z = jnp.where(size[0] > size[1], jnp.where(size[0] > size[2], 0, 2), jnp.where(size[1] > size[2], 1, 2))
+        z = z.astype(jnp.int32)
+        x = jnp.where(z == 2, 0, z + 1)
+        y = jnp.where(x == 2, 0, x + 1)
+        scale = 1 / at(d, z)
+        shear = [at(d, x) * scale, at(d, y) * scale, scale]
+        return jnp.stack([x, y, z]), jnp.stack([at(o, x), at(o, y), at(o, z), *shear])
+
+    def intersect(self, leaf, prepared, start):
+        """Watertight: edges are inclusive by the rounding error of their edge function. (Contraction to fused
+        multiply-adds leaves the plain functions of two triangles that share an edge with different signs.)
+        """
+        axes, ray = prepared
+        _, _, width = self.leaves.shape
+
+        def coordinates(axis):
+            start = [jnp.asarray(i, jnp.uint32) for i in (leaf, 3 * axis, 0)]
+            block = lax.dynamic_slice(self.leaves, start, (1, 3, width), allow_negative_indices=False)[0]
+            return list(numbers_of(block, ray.dtype))
+
+        # Vertex by vertex: XLA does not vectorise loops over (3, W).
+        z = [c - ray[2] for c in coordinates(axes[2])]
+        x = [c - ray[0] - ray[3] * z for c, z in zip(coordinates(axes[0]), z, strict=True)]
+        y = [c - ray[1] - ray[4] * z for c, z in zip(coordinates(axes[1]), z, strict=True)]
+        tolerance = 2 * np.finfo(ray.dtype).eps
+
+        def edge(i, j):
+            a, b = x[i] * y[j], y[i] * x[j]
+            return a - b, tolerance * (jnp.abs(a) + jnp.abs(b))
+
+        (u, u_error), (v, v_error), (w, w_error) = edge(2, 1), edge(0, 2), edge(1, 0)
+        front = (u >= -u_error) & (v >= -v_error) & (w >= -w_error)
+        back = (u <= u_error) & (v <= v_error) & (w <= w_error)
+        det, error = u + v + w, u_error + v_error + w_error
+        moment = u * z[0] + v * z[1] + w * z[2]
+        t = moment * ray[5] / det
+        reach = larger(larger(jnp.abs(z[0]), jnp.abs(z[1])), jnp.abs(z[2]))
+        # Seen edge-on, or tiny and far from the ray, all three errors rule and every edge is inclusive. And a ray that
+        # starts in the plane, or on a neighbour's edge, finds a distance that is rounding alone, below half the errors.
+        sound = (jnp.abs(det) > error) & (jnp.abs(moment) > reach * (error / 2))
+        rows = rows_of(at(self.leaves, leaf))
+        return jnp.where((front | back) & sound & (rows != start), t, jnp.inf), rows
+
+    @property
+    def count(self):
+        return self.vertices.shape[0]
+
+    def surface(self, row, o, d, t):
+        """The point comes from barycentrics."""
+        vertices = at(self.vertices, row)
+        edge1, edge2 = vertices[1] - vertices[0], vertices[2] - vertices[0]
+        s = o - vertices[0]
+        q = cross(s, edge1)
+        h = cross(d, edge2)
+        scale = safe_divide(1, dot(edge1, h))
+        b1 = jnp.clip(dot(s, h) * scale, 0, 1)
+        b2 = jnp.clip(dot(d, q) * scale, 0, 1 - b1)
+        b0 = 1 - b1 - b2
+        n = _normal(edge1, edge2)
+
+        def interpolate(values):
+            return b0 * values[0] + b1 * values[1] + b2 * values[2]
+
+        shading_n = n
+        if self.normals is not None:
+            shading_n = normalize(interpolate(at(self.normals, row)))
+        uv = jnp.stack([b1, b2]) if self.uv is None else interpolate(at(self.uv, row))
+        margin = dot(jnp.abs(n), _point_error(vertices))
+        if self.margins is not None:
+            margin = margin + at(self.margins, row)
+        return Surface(interpolate(vertices), n, margin, shading_n, uv)
+
+    def sample(self, row, u):
+        return self.from_square(row, square_to_triangle(u))
+
+    def row_of_lamp(self, lamps, lamp, u_part):
+        """A triangle of the mesh, chosen by area."""
+        first, count = at(lamps.first, lamp), at(lamps.count, lamp)
+
+        def halve(_, between):
+            low, high = between
+            middle = (low + high) // 2
+            above = at(self.area_cdf, first + middle) > u_part
+            return jnp.where(above, low, middle + 1), jnp.where(above, middle, high)
+
+        steps = self.count.bit_length()
+        found, _ = lax.fori_loop(0, steps, halve, (jnp.int32(0), count - 1))
+        return first + jnp.minimum(found, count - 1)
+
+    def areas(self):
+        return _areas(np.asarray(self.vertices, float))
+
+    def cell_lengths(self, size):
+        return np.sqrt(self.areas())[:, None].repeat(2, 1)
+
+    def to_square(self, row, p):
+        corner, *others = at(self.vertices, row)
+        a, b = (other - corner for other in others)
+        q = p - corner
+        aa, ab, bb, qa, qb = dot(a, a), dot(a, b), dot(b, b), dot(q, a), dot(q, b)
+        return jnp.stack([bb * qa - ab * qb, aa * qb - ab * qa]) / (aa * bb - ab * ab)
+
+    def from_square(self, row, xy):
+        vertices = at(self.vertices, row)
+        a, b = vertices[1] - vertices[0], vertices[2] - vertices[0]
+        n = _normal(a, b)
+        return vertices[0] + xy[0] * a + xy[1] * b, n, dot(jnp.abs(n), _point_error(vertices))
+
+    def edges_and_normals(self):
+        v = np.asarray(self.vertices, float)
+        a, b = v[:, 1] - v[:, 0], v[:, 2] - v[:, 0]
+        return np.stack([v[:, 0], a, b], 1), np.cross(a, b)
+
+
+@dataclass(frozen=True)
+class Mesh(Shape):
+    """Triangles without degenerate ones; normals follow the transform and are unit."""
+
+    vertices: np.ndarray  # (V, 3)
+    faces: np.ndarray  # (F, 3) int64
+    normals: np.ndarray | None  # (V, 3): smooth shading; None: face normals
+    uv: np.ndarray | None  # (V, 2)
+    dropped: int = 0  # degenerate triangles left out
+    table = Triangles
+
+    @classmethod
+    def read(cls, loader, fields: Fields):
+        return loader.read_mesh(
+            loader.find(fields, "filename"),
+            fields.type,
+            fields.transform("to_world"),
+            face_normals=fields.boolean("face_normals", False),
+            flip_tex_coords=fields.boolean("flip_tex_coords", None),
+        )
+
+    @property
+    def empty(self):
+        return not len(self.faces)
+
+    def primitives(self, flip):
+        faces = self.faces[:, ::-1] if flip else self.faces
+        normals = None if self.normals is None else self.normals[faces] * (-1 if flip else 1)
+        return Facets(self.vertices[faces], normals, None if self.uv is None else self.uv[faces])
 
 
 def leaf_numbers(vertices):
@@ -38,104 +253,6 @@ def bounds(vertices):
     return np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)
 
 
-def prepare(o, d):
-    """Constants of a ray: the shear that turns it into the z axis (Woop, Benthin, Wald 2013, JCGT 2(1)).
-
-    Returns:
-        (3,) int32 axes x, y, z, and (6,) origin and shear in that order.
-    """
-    size = jnp.abs(d)
-    z = jnp.where(size[0] > size[1], jnp.where(size[0] > size[2], 0, 2), jnp.where(size[1] > size[2], 1, 2))
-    z = z.astype(jnp.int32)
-    x = jnp.where(z == 2, 0, z + 1)
-    y = jnp.where(x == 2, 0, x + 1)
-    scale = 1 / at(d, z)
-    shear = [at(d, x) * scale, at(d, y) * scale, scale]
-    return jnp.stack([x, y, z]), jnp.stack([at(o, x), at(o, y), at(o, z), *shear])
-
-
-def intersect(table: Triangles, leaf, prepared, start):
-    """Of the W triangles of a leaf.
-
-    Args:
-        start: () int32 row of the triangle that the ray starts on, which is flat and not hit again, or of nothing here.
-    Returns:
-        distances (W,), NaN or inf where missed, possibly negative where behind; rows (W,).
-    Watertight: edges are inclusive by the rounding error of their edge function. (Contraction to fused multiply-adds
-    leaves the plain functions of two triangles that share an edge with different signs.)
-    """
-    axes, ray = prepared
-    _, _, width = table.leaves.shape
-
-    def coordinates(axis):
-        start = [jnp.asarray(i, jnp.uint32) for i in (leaf, 3 * axis, 0)]
-        block = lax.dynamic_slice(table.leaves, start, (1, 3, width), allow_negative_indices=False)[0]
-        return list(numbers_of(block, ray.dtype))
-
-    # Vertex by vertex: XLA does not vectorise loops over (3, W).
-    z = [c - ray[2] for c in coordinates(axes[2])]
-    x = [c - ray[0] - ray[3] * z for c, z in zip(coordinates(axes[0]), z, strict=True)]
-    y = [c - ray[1] - ray[4] * z for c, z in zip(coordinates(axes[1]), z, strict=True)]
-    tolerance = 2 * np.finfo(ray.dtype).eps
-
-    def edge(i, j):
-        a, b = x[i] * y[j], y[i] * x[j]
-        return a - b, tolerance * (jnp.abs(a) + jnp.abs(b))
-
-    (u, u_error), (v, v_error), (w, w_error) = edge(2, 1), edge(0, 2), edge(1, 0)
-    front = (u >= -u_error) & (v >= -v_error) & (w >= -w_error)
-    back = (u <= u_error) & (v <= v_error) & (w <= w_error)
-    det, error = u + v + w, u_error + v_error + w_error
-    moment = u * z[0] + v * z[1] + w * z[2]
-    t = moment * ray[5] / det
-    reach = larger(larger(jnp.abs(z[0]), jnp.abs(z[1])), jnp.abs(z[2]))
-    # Seen edge-on, or tiny and far from the ray, all three errors rule and every edge is inclusive. And a ray that
-    # starts in the plane, or on a neighbour's edge, finds a distance that is rounding alone, below half of the errors.
-    sound = (jnp.abs(det) > error) & (jnp.abs(moment) > reach * (error / 2))
-    rows = rows_of(at(table.leaves, leaf))
-    return jnp.where((front | back) & sound & (rows != start), t, jnp.inf), rows
-
-
-def count(table: Triangles) -> int:
-    return table.vertices.shape[0]
-
-
-def surface(table: Triangles, row, o, d, t) -> Surface:
-    """Differentiable in the ray; the point comes from barycentrics, so it lies on the triangle to the last bits."""
-    vertices = at(table.vertices, row)
-    edge1, edge2 = vertices[1] - vertices[0], vertices[2] - vertices[0]
-    s = o - vertices[0]
-    q = cross(s, edge1)
-    h = cross(d, edge2)
-    scale = safe_divide(1, dot(edge1, h))
-    b1 = jnp.clip(dot(s, h) * scale, 0, 1)
-    b2 = jnp.clip(dot(d, q) * scale, 0, 1 - b1)
-    b0 = 1 - b1 - b2
-    n = _normal(edge1, edge2)
-
-    def interpolate(values):
-        return b0 * values[0] + b1 * values[1] + b2 * values[2]
-
-    shading_n = n
-    if table.normals is not None:
-        shading_n = normalize(interpolate(at(table.normals, row)))
-    uv = jnp.stack([b1, b2]) if table.uv is None else interpolate(at(table.uv, row))
-    margin = dot(jnp.abs(n), _point_error(vertices))
-    if table.margins is not None:
-        margin = margin + at(table.margins, row)
-    return Surface(interpolate(vertices), n, margin, shading_n, uv)
-
-
-def sample(table: Triangles, row, u):
-    """Uniform point of the triangle: u (2,) -> point (3,), unit normal (3,), rounding error along it ()."""
-    vertices = at(table.vertices, row)
-    b = square_to_triangle(u)
-    edge1, edge2 = vertices[1] - vertices[0], vertices[2] - vertices[0]
-    n = _normal(edge1, edge2)
-    p = vertices[0] + b[0] * edge1 + b[1] * edge2
-    return p, n, dot(jnp.abs(n), _point_error(vertices))
-
-
 def _normal(edge1, edge2):
     # Edges of length 1 first: the square of a product of tiny ones underflows.
     return normalize(cross(rescale(edge1), rescale(edge2)))
@@ -146,12 +263,6 @@ def _point_error(vertices):
     return (3 * np.finfo(vertices.dtype).eps) * jnp.max(jnp.abs(vertices), 0)
 
 
-def face_normals(vertices):
-    """(P, 3, 3) -> (P, 3, 3), the unit normal of each triangle at its three vertices."""
-    n = np.cross(vertices[:, 1] - vertices[:, 0], vertices[:, 2] - vertices[:, 0])
-    return np.repeat((n / np.linalg.norm(n, axis=-1, keepdims=True))[:, None], 3, axis=1)
-
-
-def area(vertices):
+def _areas(vertices):
     """(P, 3, 3) -> (P,)."""
     return np.linalg.norm(np.cross(vertices[:, 1] - vertices[:, 0], vertices[:, 2] - vertices[:, 0]), axis=-1) / 2

@@ -25,9 +25,6 @@ from pathjax.core.types import Surface
 from pathjax.errors import InputError
 from pathjax.scene.scene import Scene
 from pathjax.shapes import geometry
-from pathjax.shapes.planar import Planar
-from pathjax.shapes.sphere import Spheres
-from pathjax.shapes.triangle import Triangles
 from pathjax.transport.patches import Patches, point
 
 # Points along each side of a patch, and of one whose distance is less than _NEAR times the sum of the two radii: there
@@ -43,11 +40,12 @@ MOST_BLOCKERS = 64
 
 def can(scene: Scene) -> bool:
     """Whether the scene is made of polygons, or of one sphere."""
+    return _one_sphere(scene) or all(table.polygons for table in scene.geometry.tables)
+
+
+def _one_sphere(scene) -> bool:
     tables = scene.geometry.tables
-    one_sphere = len(tables) == 1 and isinstance(tables[0], Spheres) and len(tables[0].balls) == 1
-    return one_sphere or all(
-        isinstance(table, Triangles) or isinstance(table, Planar) and not table.disk for table in tables
-    )
+    return len(tables) == 1 and tables[0].even_chords and tables[0].count == 1
 
 
 def form_factors(scene: Scene, patches: Patches, rays: int, seed: int) -> tuple[np.ndarray, np.ndarray, bool | None]:
@@ -63,7 +61,7 @@ def form_factors(scene: Scene, patches: Patches, rays: int, seed: int) -> tuple[
     """
     if not can(scene):
         raise InputError('spheres and disks, but for the inside of one sphere alone, need method="rays"')
-    if isinstance(scene.geometry.tables[0], Spheres):
+    if _one_sphere(scene):
         return _in_sphere(scene.geometry.tables[0], patches)
     planes = _planes(scene)
     corners, normals = _polygons(patches, *planes)
@@ -87,9 +85,9 @@ def form_factors(scene: Scene, patches: Patches, rays: int, seed: int) -> tuple[
 
 def _in_sphere(table, patches):
     """Chords of a sphere meet both ends at the same angle: every patch sends an equal share to equal areas."""
-    inwards = np.asarray(patches.back) == (np.asarray(table.sign)[0] > 0)
+    inwards = np.asarray(patches.back) != table.turned_inwards
     area = np.where(inwards, np.asarray(patches.area, float), 0)
-    exchange = np.outer(area, area) / (4 * math.pi * float(table.balls[0, 3]) ** 2)
+    exchange = np.outer(area, area) / table.areas()
     return exchange, np.zeros_like(exchange), bool(inwards.all())
 
 
@@ -100,15 +98,10 @@ def _planes(scene):
     """Of all primitives: corner and two edges (Q, 3, 3), whether it is a triangle (Q,), unit normal (Q, 3), float64."""
     bases, triangular, normals = [], [], []
     for table in scene.geometry.tables:
-        if isinstance(table, Planar):
-            c, a, b, n = np.moveaxis(np.asarray(table.frames, float), 1, 0)
-            bases.append(np.stack([c - a - b, 2 * a, 2 * b], 1))
-        else:
-            v = np.asarray(table.vertices, float)
-            bases.append(np.stack([v[:, 0], v[:, 1] - v[:, 0], v[:, 2] - v[:, 0]], 1))
-            n = np.cross(bases[-1][:, 1], bases[-1][:, 2])
+        edges, n = table.edges_and_normals()
+        bases.append(edges)
         normals.append(n / np.linalg.norm(n, axis=-1, keepdims=True))
-        triangular.append(np.full(len(n), isinstance(table, Triangles)))
+        triangular.append(np.full(len(n), table.triangular))
     return tuple(np.concatenate(x) for x in (bases, triangular, normals))
 
 

@@ -14,15 +14,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from pathjax import bsdfs
-from pathjax.core.math import at, cos_sin_turns, cross, dot, normalize, rescale, safe_atan2, safe_sqrt
+from pathjax.core.math import at
 from pathjax.core.warp import square_to_triangle
 from pathjax.errors import InputError
 from pathjax.scene.scene import Scene
-from pathjax.shapes import geometry, planar, sphere, triangle
-from pathjax.shapes.geometry import Geometry
-from pathjax.shapes.planar import Planar
-from pathjax.shapes.sphere import Spheres
-from pathjax.shapes.triangle import Triangles
+from pathjax.shapes import Geometry, geometry
 
 
 @jax.tree_util.register_dataclass
@@ -60,13 +56,13 @@ def cut(scene: Scene, count: int, faceted: bool = False) -> Patches:
     rows = _diffuse_rows(scene, faceted)
     shape, light = np.asarray(shapes.shape), np.asarray(shapes.light)
 
-    area = np.concatenate([_areas(table) for table in shapes.tables])
+    area = np.concatenate([table.areas() for table in shapes.tables])
     if not (area > 0).all():
         worst = _name(scene, shape[np.argmin(area > 0)])
         raise InputError(f"{worst} has a part of area 0, which neither sends nor receives light; remove it")
     size = math.sqrt(area.sum() / count)
     grid = np.concatenate([_grid(table, size) for table in shapes.tables])
-    triangular = np.concatenate([np.full(len(_areas(t)), isinstance(t, Triangles)) for t in shapes.tables])
+    triangular = np.concatenate([np.full(t.count, t.triangular) for t in shapes.tables])
     cells = np.prod(grid, axis=1)
     first = np.cumsum([0, *cells])[:-1]
     primitive = np.repeat(np.arange(len(cells)), cells)
@@ -130,28 +126,9 @@ def _diffuse_rows(scene: Scene, faceted) -> np.ndarray:
     return rows
 
 
-def _areas(table) -> np.ndarray:
-    if isinstance(table, Planar):
-        return planar.area(np.asarray(table.frames, float), table.disk)
-    if isinstance(table, Spheres):
-        return sphere.area(np.asarray(table.balls, float))
-    return triangle.area(np.asarray(table.vertices, float))
-
-
 def _grid(table, size) -> np.ndarray:
     """(P, 2) cells along the two coordinates of each primitive, whose sides are then about `size` long."""
-    area = _areas(table)
-    if isinstance(table, Planar) and not table.disk:
-        lengths = 2 * np.linalg.norm(np.asarray(table.frames, float)[:, 1:3], axis=-1)
-    elif isinstance(table, Triangles):
-        lengths = np.sqrt(area)[:, None].repeat(2, 1)
-    elif isinstance(table, Planar):
-        rings = np.maximum(np.rint(np.sqrt(area / math.pi) / size), 1)
-        lengths = np.stack([rings * size, area / (rings * size)], -1)
-    else:
-        belts = np.maximum(np.rint(np.sqrt(area / math.pi) / size), 1)
-        lengths = np.stack([area / (belts * size), belts * size], -1)
-    return np.maximum(np.rint(lengths / size), 1).astype(int)
+    return np.maximum(np.rint(table.cell_lengths(size) / size), 1).astype(int)
 
 
 # ---- of one point ---------------------------------------------------------------------------------------------------
@@ -168,8 +145,8 @@ def patch_at(patches: Patches, shapes: Geometry, primitive, p, back):
     grid = at(patches.grid, primitive)
 
     def place(table, row):
-        xy = _to_square(table, row, p)
-        if isinstance(table, Triangles):
+        xy = table.to_square(row, p)
+        if table.triangular:
             k = grid[0]
             a = jnp.clip(jnp.floor(xy[0] * k).astype(jnp.int32), 0, k - 1)
             b = jnp.clip(jnp.floor(xy[1] * k).astype(jnp.int32), 0, k - 1 - a)
@@ -195,12 +172,12 @@ def point(patches: Patches, shapes: Geometry, patch, u):
     grid = at(patches.grid, primitive)
 
     def place_of(table, row):
-        if not isinstance(table, Triangles):
-            return _from_square(table, row, (place + u) / grid)
+        if not table.triangular:
+            return table.from_square(row, (place + u) / grid)
         # Cells of odd place are turned around.
         corner = jnp.stack([place[0], place[1] // 2])
         b, turned = square_to_triangle(u), place[1] % 2 == 1
-        return _from_square(table, row, (corner + jnp.where(turned, 1 - b, b)) / grid)
+        return table.from_square(row, (corner + jnp.where(turned, 1 - b, b)) / grid)
 
     p, n, margin = _of_table(shapes, primitive, place_of)
     return primitive, p, jnp.where(at(patches.back, patch), -n, n), margin
@@ -214,55 +191,3 @@ def _of_table(shapes, primitive, f):
         return lambda: f(table, jnp.maximum(primitive - start, 0))
 
     return geometry.switch_by_range(primitive, first, [of(*pair) for pair in zip(shapes.tables, first, strict=True)])
-
-
-def _to_square(table, row, p):
-    """Point of a primitive -> the two coordinates (2,) that its grid cuts; of triangles the barycentric ones."""
-    if isinstance(table, Spheres):
-        local = at(table.to_local, row) @ normalize(p - at(table.balls, row)[:3])
-        return jnp.stack([_turns(local[1], local[0]), (1 - local[2]) / 2])
-    if isinstance(table, Triangles):
-        corner, *others = at(table.vertices, row)
-        a, b = (other - corner for other in others)
-    else:
-        corner, a, b, _ = at(table.frames, row)
-    q = p - corner
-    aa, ab, bb, qa, qb = dot(a, a), dot(a, b), dot(b, b), dot(q, a), dot(q, b)
-    x, y = jnp.stack([bb * qa - ab * qb, aa * qb - ab * qa]) / (aa * bb - ab * ab)
-    if isinstance(table, Triangles):
-        return jnp.stack([x, y])
-    if table.disk:
-        return jnp.stack([x * x + y * y, _turns(y, x)])
-    return jnp.stack([(x + 1) / 2, (y + 1) / 2])
-
-
-def _turns(y, x):
-    angle = safe_atan2(y, x) / (2 * math.pi)
-    return jnp.where(angle < 0, angle + 1, angle)
-
-
-def _from_square(table, row, xy):
-    """The inverse: point (3,), normal (3,), rounding error of the point along it ()."""
-    if isinstance(table, Spheres):
-        center, radius = at(table.balls, row)[:3], at(table.balls, row)[3]
-        z = 1 - 2 * xy[1]
-        r = safe_sqrt(1 - z * z)
-        cos, sin = cos_sin_turns(xy[0])
-        outward = at(table.to_local, row).T @ jnp.stack([r * cos, r * sin, z])
-        reach, n = jnp.abs(center) + radius, outward * at(table.sign, row)
-        p = center + radius * outward
-    elif isinstance(table, Triangles):
-        vertices = at(table.vertices, row)
-        a, b = vertices[1] - vertices[0], vertices[2] - vertices[0]
-        reach, n = jnp.max(jnp.abs(vertices), 0), normalize(cross(rescale(a), rescale(b)))
-        p = vertices[0] + xy[0] * a + xy[1] * b
-    else:
-        center, a, b, n = at(table.frames, row)
-        if table.disk:
-            cos, sin = cos_sin_turns(xy[1])
-            x, y = safe_sqrt(xy[0]) * cos, safe_sqrt(xy[0]) * sin
-        else:
-            x, y = 2 * xy[0] - 1, 2 * xy[1] - 1
-        reach = jnp.abs(center) + jnp.abs(a) + jnp.abs(b)
-        p = center + x * a + y * b
-    return p, n, dot(jnp.abs(n), reach) * (4 * jnp.finfo(p.dtype).eps)

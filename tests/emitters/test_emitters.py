@@ -17,7 +17,7 @@ from pathjax.scene import build
 from pathjax.scene.parameters import with_parameters
 from pathjax.sensors import Perspective
 from pathjax.sensors.film import HDRFilm
-from pathjax.shapes import geometry
+from pathjax.shapes import Cube, Disk, Mesh, Rectangle, Sphere, geometry
 
 # Chance that a correct light fails one statistical comparison; seeds are fixed.
 FALSE_ALARM = 1e-5
@@ -39,14 +39,14 @@ ROTATION *= np.sign(np.linalg.det(ROTATION))
 SQUARE = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], float)
 PLACED = affine(ROTATION * [0.5, 0.3, 1], [0.2, 0.1, 0.3])
 SHEARED = affine(ROTATION @ [[0.6, 0.4, 0], [0, 0.5, 0], [0, 0.2, 1.0]], [0.2, 0.1, 0.3])
-BALL = desc.Sphere(np.array([0.2, 0.1, 0.3]), 0.5, affine(0.5 * np.eye(3), [0.2, 0.1, 0.3]))
+BALL = Sphere(np.array([0.2, 0.1, 0.3]), 0.5, affine(0.5 * np.eye(3), [0.2, 0.1, 0.3]))
 CENTER = np.array([0.2, 0.1, 0.3])
 
 
 def convex_mesh(scale=0.5, subdivisions=1):
     ball = trimesh.creation.icosphere(subdivisions=subdivisions)
     vertices = ball.vertices * [scale, 0.7 * scale, 1.2 * scale] @ ROTATION.T + CENTER
-    return desc.Mesh(vertices, np.asarray(ball.faces), None, None)
+    return Mesh(vertices, np.asarray(ball.faces), None, None)
 
 
 def shape(geo, radiance=RADIANCE, flip=False, name="light"):
@@ -66,19 +66,19 @@ def carried(points, m):
 def polygons_of(geo):
     """Flat outlines (K, 3), counter-clockwise from the front."""
     match geo:
-        case desc.Rectangle(m):
+        case Rectangle(m):
             return [carried(SQUARE, m)]
-        case desc.Disk(m):
+        case Disk(m):
             a = np.linspace(0, 2 * np.pi, 4000, endpoint=False)
             return [carried(np.stack([np.cos(a), np.sin(a), 0 * a], -1), m)]
-        case desc.Cube(m):
+        case Cube(m):
             faces = []
             for axis in range(3):
                 for side in (-1, 1):
                     face = np.roll(SQUARE + [0, 0, 1], axis + 1, axis=1) * side
                     faces.append(carried(face[::side], m))
             return faces
-        case desc.Mesh(vertices, triangles):
+        case Mesh(vertices, triangles):
             return list(vertices[triangles])
 
 
@@ -100,7 +100,7 @@ def solid_angle_and_irradiance(outline, ref, normal):
 
 
 def exact(geo, ref, normal):
-    if isinstance(geo, desc.Sphere):
+    if isinstance(geo, Sphere):
         distance = np.linalg.norm(geo.center - ref)
         if distance < geo.radius:
             return 4 * np.pi, np.pi
@@ -156,12 +156,12 @@ def sample_and_trace(scene, refs, strategy="mis"):
 OUTSIDE = [CENTER + 1.7 * np.array(v) for v in ([0.6, 0.0, 0.8], [-0.48, 0.6, -0.64], [0.0, -0.8, 0.6])]
 FRONT = [CENTER + ROTATION @ v for v in ([0, 0, 1.0], [0.5, 0.2, 0.9], [1.0, -0.8, 0.9])]
 LIGHTS = {
-    "rectangle": (desc.Rectangle(PLACED), False, FRONT),
-    "sheared": (desc.Rectangle(SHEARED), False, FRONT),
-    "disk": (desc.Disk(PLACED), False, FRONT),
+    "rectangle": (Rectangle(PLACED), False, FRONT),
+    "sheared": (Rectangle(SHEARED), False, FRONT),
+    "disk": (Disk(PLACED), False, FRONT),
     "sphere": (BALL, False, [*OUTSIDE, CENTER + [0, 0, 0.51], CENTER + [40, 0, 0]]),
     "inside": (BALL, True, [CENTER, CENTER + [0.2, 0.1, -0.3]]),
-    "cube": (desc.Cube(affine(ROTATION * [0.4, 0.3, 0.5], CENTER)), False, OUTSIDE),
+    "cube": (Cube(affine(ROTATION * [0.4, 0.3, 0.5], CENTER)), False, OUTSIDE),
     "mesh": (convex_mesh(), False, OUTSIDE),
 }
 
@@ -212,8 +212,8 @@ def test_constant_background_integrates_over_the_sphere():
 
 @pytest.mark.parametrize("kind", ["rectangle", "disk", "mesh"])
 def test_lights_are_dark_behind(kind):
-    geo = desc.Mesh(carried(SQUARE, PLACED), np.array([[0, 1, 2], [0, 2, 3]]), None, None)
-    geo = {"rectangle": desc.Rectangle(PLACED), "disk": desc.Disk(PLACED), "mesh": geo}[kind]
+    geo = Mesh(carried(SQUARE, PLACED), np.array([[0, 1, 2], [0, 2, 3]]), None, None)
+    geo = {"rectangle": Rectangle(PLACED), "disk": Disk(PLACED), "mesh": geo}[kind]
     behind = CENTER + ROTATION @ [0.1, 0.2, -0.8]
     for flip in (False, True):
         drawn, (hit, _), Le, pdf = sample_and_trace(scene_of(shape(geo, flip=flip)), [behind])
@@ -224,16 +224,16 @@ def test_lights_are_dark_behind(kind):
 
 FLAT = affine(np.eye(3), [0.0, 0.0, 0.0])
 HARD = {
-    "edge-on rectangle": (desc.Rectangle(FLAT), [[3, 0.1, 0], [0, -2, 0], [1, 0, 0], [3, 0.1, 1e-7], [3, 0, -1e-30]]),
-    "edge-on disk": (desc.Disk(FLAT), [[3, 0.1, 0], [0, -2, 0], [1, 0, 0], [3, 0.1, 1e-7]]),
-    "edge-on mesh": (desc.Mesh(SQUARE, np.array([[0, 1, 2], [0, 2, 3]]), None, None), [[3, 0.1, 0], [-1, -1, 0]]),
-    "on the rectangle": (desc.Rectangle(FLAT), [[0, 0, 0], [0.25, -0.5, 0], [1, 1, 0]]),
-    "on the tilted rectangle": (desc.Rectangle(PLACED), [CENTER, carried(np.array([0.5, 0.5, 0]), PLACED)]),
+    "edge-on rectangle": (Rectangle(FLAT), [[3, 0.1, 0], [0, -2, 0], [1, 0, 0], [3, 0.1, 1e-7], [3, 0, -1e-30]]),
+    "edge-on disk": (Disk(FLAT), [[3, 0.1, 0], [0, -2, 0], [1, 0, 0], [3, 0.1, 1e-7]]),
+    "edge-on mesh": (Mesh(SQUARE, np.array([[0, 1, 2], [0, 2, 3]]), None, None), [[3, 0.1, 0], [-1, -1, 0]]),
+    "on the rectangle": (Rectangle(FLAT), [[0, 0, 0], [0.25, -0.5, 0], [1, 1, 0]]),
+    "on the tilted rectangle": (Rectangle(PLACED), [CENTER, carried(np.array([0.5, 0.5, 0]), PLACED)]),
     "on the sphere": (BALL, [CENTER + [0, 0, 0.5], CENTER + [0.3, 0, -0.4], CENTER, CENTER + [0, 0.50000006, 0]]),
-    "on the cube": (desc.Cube(FLAT), [[1, 1, 1], [1, 0, 0], [0, 0, 0], [1, 1, 0.5]]),
+    "on the cube": (Cube(FLAT), [[1, 1, 1], [1, 0, 0], [0, 0, 0], [1, 1, 0.5]]),
     "far away": (BALL, [CENTER + [1e6, 0, 0], CENTER + [0, 1e12, 0]]),
-    "of no area": (desc.Rectangle(affine(1e-24 * np.eye(3), CENTER)), [[0, 0, 0], CENTER]),
-    "tiny": (desc.Sphere(CENTER, 1e-6, FLAT), [[0, 0, 0], [1, 1, 1]]),
+    "of no area": (Rectangle(affine(1e-24 * np.eye(3), CENTER)), [[0, 0, 0], CENTER]),
+    "tiny": (Sphere(CENTER, 1e-6, FLAT), [[0, 0, 0], [1, 1, 1]]),
 }
 
 
@@ -260,7 +260,7 @@ def test_distant_sphere_keeps_its_solid_angle():
 
 
 def test_a_light_of_no_power_is_harmless():
-    scene = scene_of(shape(desc.Rectangle(PLACED), radiance=np.zeros(3)), shape(BALL, radiance=np.zeros(3), name="b"))
+    scene = scene_of(shape(Rectangle(PLACED), radiance=np.zeros(3)), shape(BALL, radiance=np.zeros(3), name="b"))
     choice = emitters.choice(scene.emitters, "mis")
     np.testing.assert_allclose(choice.pdf, 0.5)
     drawn, _, Le, pdf = sample_and_trace(scene, FRONT)
@@ -268,7 +268,7 @@ def test_a_light_of_no_power_is_harmless():
 
 
 def test_a_dark_light_beside_a_bright_one_is_never_chosen():
-    scene = scene_of(shape(desc.Rectangle(PLACED), radiance=np.zeros(3)), shape(BALL, name="b"))
+    scene = scene_of(shape(Rectangle(PLACED), radiance=np.zeros(3)), shape(BALL, name="b"))
     drawn, *_ = sample_and_trace(scene, OUTSIDE)
     assert (drawn.primitive == 0).all() and (drawn.pdf > 0).all()  # the sphere is primitive 0
 
@@ -276,10 +276,10 @@ def test_a_dark_light_beside_a_bright_one_is_never_chosen():
 @pytest.mark.parametrize("strategy", ["mis", "light"])
 def test_lights_are_chosen_by_power(strategy):
     shapes = [
-        shape(desc.Rectangle(PLACED), np.array([1.0, 5.0, 2.0])),
+        shape(Rectangle(PLACED), np.array([1.0, 5.0, 2.0])),
         shape(BALL, np.array([0.2, 0.1, 0.3]), name="ball"),
         shape(convex_mesh(), np.array([0.5, 0.5, 0.1]), name="mesh"),
-        shape(desc.Disk(SHEARED), np.array([0.01, 0.02, 0.03]), name="disk"),
+        shape(Disk(SHEARED), np.array([0.01, 0.02, 0.03]), name="disk"),
     ]
     scene = scene_of(*shapes, background=np.ones(3))
     choice = emitters.choice(scene.emitters, strategy)
@@ -316,7 +316,7 @@ def test_triangles_of_a_mesh_are_chosen_by_area():
 def test_a_small_mesh_beside_a_large_one_is_sampled_all_over():
     """A lamp of 1e-4 of the size of a window: the running area of both must keep the lamp's digits."""
     large, small = convex_mesh(100.0), convex_mesh(0.01)
-    window = desc.Mesh(large.vertices + [0, 0, 1000], large.faces, None, None)
+    window = Mesh(large.vertices + [0, 0, 1000], large.faces, None, None)
     scene = scene_of(shape(window), shape(small, RADIANCE * 1e8, name="lamp"))
     count = len(small.faces)
     counts = np.bincount(sampled_primitives(scene, CENTER), minlength=2 * count)[count:]
@@ -327,7 +327,7 @@ def test_a_small_mesh_beside_a_large_one_is_sampled_all_over():
 
 def test_derivatives_of_the_choice_are_zero():
     """Which light is drawn is not differentiated; its radiance is."""
-    scene = scene_of(shape(desc.Rectangle(PLACED)), shape(BALL, name="ball"))
+    scene = scene_of(shape(Rectangle(PLACED)), shape(BALL, name="ball"))
     def pdf(scale):
         changed = with_parameters(scene, {"light.emitter.radiance": RADIANCE * scale})
         return emitters.choice(changed.emitters, "mis").pdf

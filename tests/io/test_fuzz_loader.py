@@ -7,11 +7,12 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from pathjax.description import Description, Mesh
+from pathjax.description import Description
 from pathjax.errors import InputError
 from pathjax.images import read_exr, read_rgb, write_exr, write_png
 from pathjax.io import mesh
 from pathjax.io.mitsuba.loader import load
+from pathjax.shapes import Mesh
 
 SCENE = """<?xml version="1.0"?>
 <scene version="3.0.0">

@@ -13,6 +13,7 @@ from pathjax.images import write_exr, write_png
 from pathjax.io.mitsuba.loader import load
 from pathjax.kinds import Instance
 from pathjax.sensors.filters import Box, Gaussian
+from pathjax.shapes import Cube, Disk, Rectangle
 
 CORNELL = Path(__file__).parents[2] / "scenes" / "cornell_box.xml"
 SENSOR = '<sensor type="perspective"/>'
@@ -300,7 +301,7 @@ def test_a_mirrored_sphere_is_inside_out_as_in_mitsuba(read, mitsuba, mirror, fl
     assert read(body).shapes[0].flip_normals == (hit.sh_frame.n.z < 0)
 
 
-@pytest.mark.parametrize(("kind", "made"), [("rectangle", d.Rectangle), ("cube", d.Cube), ("disk", d.Disk)])
+@pytest.mark.parametrize(("kind", "made"), [("rectangle", Rectangle), ("cube", Cube), ("disk", Disk)])
 def test_plain_shapes_carry_their_transform(read, kind, made):
     scene = read(shape('<transform name="to_world"><scale x="-2"/></transform>', kind))
     assert isinstance(scene.shapes[0].geometry, made) and not scene.shapes[0].flip_normals

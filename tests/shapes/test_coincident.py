@@ -12,6 +12,7 @@ from pathjax.bsdfs import Diffuse
 from pathjax.scene import build
 from pathjax.sensors import Perspective
 from pathjax.sensors.film import HDRFilm
+from pathjax.shapes import Rectangle
 
 SKY = '<emitter type="constant"><rgb name="radiance" value="1"/></emitter>'
 GREY = '<bsdf type="twosided"><bsdf type="diffuse"><rgb name="reflectance" value="0.5"/></bsdf></bsdf>'
@@ -196,7 +197,7 @@ def tables_of(*geometries, dtype=np.float32):
 def rectangle(z=0.0, x=0.0):
     to_world = np.eye(4)
     to_world[:3, 3] = x, 0, z
-    return desc.Rectangle(to_world)
+    return Rectangle(to_world)
 
 
 def test_scenes_in_which_nothing_coincides_hold_nothing_for_it(shipped):

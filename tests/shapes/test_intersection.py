@@ -14,8 +14,9 @@ from pathjax.core.types import Ray
 from pathjax.scene import build
 from pathjax.sensors import Perspective
 from pathjax.sensors.film import HDRFilm
-from pathjax.shapes import geometry, triangle
+from pathjax.shapes import Cube, Disk, Mesh, Rectangle, Sphere, geometry
 from pathjax.shapes.accel.leaves import numbers_of, rows_of
+from pathjax.shapes.disk import Disks
 
 GREY = Diffuse.instance("grey")
 # Rounding of a coordinate relative to the distances it was computed from; hits closer to a border may go either way.
@@ -39,11 +40,11 @@ def scene_of(*geometries, dtype=jnp.float32, flip=False):
 def mesh(vertices, faces=None):
     vertices = np.reshape(vertices, (-1, 3)).astype(float)
     faces = np.arange(len(vertices)).reshape(-1, 3) if faces is None else np.asarray(faces)
-    return desc.Mesh(vertices, faces, None, None)
+    return Mesh(vertices, faces, None, None)
 
 
 def sphere(center, radius):
-    return desc.Sphere(np.asarray(center, float), float(radius), np.eye(4))
+    return Sphere(np.asarray(center, float), float(radius), np.eye(4))
 
 
 def affine(linear, translation):
@@ -179,7 +180,7 @@ def reference(shapes, o, d, rounding=ROUNDING):
         if hasattr(table, "balls"):
             parts.append(of_spheres(np.asarray(table.balls, np.float64), o, d, rounding))
         elif hasattr(table, "frames"):
-            parts.append(of_planars(np.asarray(table.frames, np.float64), table.disk, o, d, rounding))
+            parts.append(of_planars(np.asarray(table.frames, np.float64), isinstance(table, Disks), o, d, rounding))
         else:
             parts.append(of_triangles(np.asarray(table.vertices, np.float64), o, d, rounding))
     return Candidates(*(np.concatenate([getattr(p, k) for p in parts], 1) for k in ("t", "unsure", "error")))
@@ -235,19 +236,19 @@ SCENES = {
     "8 triangles": [triangles(8)],
     "40 triangles": [triangles(40)],
     "400 triangles": [triangles(400, size=0.1)],
-    "10 rectangles": planars(desc.Rectangle, 10),
-    "100 rectangles": planars(desc.Rectangle, 100, size=0.1),
-    "10 disks": planars(desc.Disk, 10),
-    "100 disks": planars(desc.Disk, 100, size=0.1),
+    "10 rectangles": planars(Rectangle, 10),
+    "100 rectangles": planars(Rectangle, 100, size=0.1),
+    "10 disks": planars(Disk, 10),
+    "100 disks": planars(Disk, 100, size=0.1),
     "10 spheres": spheres(10),
     "100 spheres": spheres(100, size=0.1),
-    "cubes": planars(desc.Cube, 5, size=0.2),
-    "100 cubes": planars(desc.Cube, 100, size=0.1),
-    "cubes before rectangles": [*planars(desc.Cube, 4, size=0.2), *planars(desc.Rectangle, 5, seed=4)],
+    "cubes": planars(Cube, 5, size=0.2),
+    "100 cubes": planars(Cube, 100, size=0.1),
+    "cubes before rectangles": [*planars(Cube, 4, size=0.2), *planars(Rectangle, 5, seed=4)],
     "mixed": [
         triangles(60, size=0.1),
-        *planars(desc.Rectangle, 9),
-        *planars(desc.Disk, 60, seed=4, size=0.1),
+        *planars(Rectangle, 9),
+        *planars(Disk, 60, seed=4, size=0.1),
         *spheres(9, size=0.1),
     ],
 }
@@ -298,7 +299,7 @@ def test_axis_rays_that_start_on_slab_planes_hit(tiles, sign):
         shapes = scene_of(mesh(vertices, faces))
     else:
         g = (np.arange(n) + 0.5) / n * 2 - 1
-        shapes = scene_of(*(desc.Rectangle(affine(np.diag([1 / n, 1 / n, 1]), [x, y, 1])) for x in g for y in g))
+        shapes = scene_of(*(Rectangle(affine(np.diag([1 / n, 1 / n, 1]), [x, y, 1])) for x in g for y in g))
     inner = np.abs(vertices[:, :2]).max(1) < 1
     for z in (0.0, -3.0, 0.5):
         o = vertices[inner] * [1, 1, 0] + [0, 0, z]
@@ -359,12 +360,12 @@ COPIES = [(5, "triangle"), (300, "triangle"), (300, "rectangle"), (5, "disk"), (
 def test_of_coincident_faces_the_lowest_primitive_is_hit(name, copies):
     one = {
         "triangle": mesh([[-1, -1, 1], [1, -1, 1], [0, 1, 1]]),
-        "rectangle": desc.Rectangle(affine(np.eye(3), [0, 0, 1])),
-        "disk": desc.Disk(affine(np.eye(3), [0, 0, 1])),
+        "rectangle": Rectangle(affine(np.eye(3), [0, 0, 1])),
+        "disk": Disk(affine(np.eye(3), [0, 0, 1])),
         "sphere": sphere([0, 0, 1], 0.5),
     }[name]
     # Others around, so that the copies are spread over several leaves of the tree.
-    others = [desc.Mesh(one.vertices + [5, 0, 0], one.faces, None, None)] if name == "triangle" else []
+    others = [Mesh(one.vertices + [5, 0, 0], one.faces, None, None)] if name == "triangle" else []
     shapes = scene_of(*[one] * copies, *others)
     rng = np.random.default_rng(7)
     target = np.c_[rng.uniform(-0.2, 0.2, (2000, 2)), np.ones(2000)]
@@ -376,7 +377,7 @@ def test_of_coincident_faces_the_lowest_primitive_is_hit(name, copies):
 
 def test_of_coincident_kinds_the_lowest_primitive_is_hit():
     flat = affine(np.eye(3), [0, 0, 1])
-    shapes = scene_of(mesh([[-9, -9, 1], [9, -9, 1], [0, 9, 1]]), desc.Disk(flat), desc.Rectangle(flat))
+    shapes = scene_of(mesh([[-9, -9, 1], [9, -9, 1], [0, 9, 1]]), Disk(flat), Rectangle(flat))
     o = np.zeros((1, 3))
     hit = closest(shapes, o, [[0, 0, 1.0]])
     assert hit.primitive == 0 and hit.shape == 2  # the rectangle: spheres, rectangles, disks, triangles
@@ -413,7 +414,7 @@ def test_scale_and_place_of_the_scene_change_nothing(scale, shift):
     rng = np.random.default_rng(9)
     move = np.array([1.0, -1.0, 1.0]) * shift * scale
     parts = [mesh((triangles(200, size=0.2).vertices.reshape(-1, 3, 3)) * scale + move)]
-    for kind in (desc.Rectangle, desc.Disk):
+    for kind in (Rectangle, Disk):
         linear = rng.normal(size=(60, 3, 3)) * 0.1 * scale
         parts += [kind(affine(m, c)) for m, c in zip(linear, rng.uniform(-1, 1, (60, 3)) * scale + move, strict=True)]
     parts += [sphere(rng.uniform(-1, 1, 3) * scale + move, 0.1 * scale) for _ in range(20)]
@@ -441,7 +442,7 @@ def test_a_ray_leaving_a_sphere_meets_only_its_far_side():
     row = np.arange(2000) % 10
     o = np.float32(balls[row, :3] + balls[row, 3:] * n)
     d = unit(np.random.default_rng(2).normal(size=(2000, 3)))
-    alone = [closest(scene_of(desc.Sphere(b[:3], b[3], np.eye(4))), o[row == i], d[row == i], exclude=0)
+    alone = [closest(scene_of(Sphere(b[:3], b[3], np.eye(4))), o[row == i], d[row == i], exclude=0)
              for i, b in enumerate(balls[:3])]
     for i, hit in enumerate(alone):
         cos = np.sum(n[row == i] * d[row == i], 1)
@@ -583,7 +584,7 @@ def test_closed_meshes_do_not_leak_in_ten_million_rays(kind):
 
 
 def test_a_box_of_rectangles_does_not_leak():
-    for parts in ([desc.Cube(affine(ROTATION, [0.1, 0.2, 0.3]))], planes_of_box(5)):
+    for parts in ([Cube(affine(ROTATION, [0.1, 0.2, 0.3]))], planes_of_box(5)):
         vertices, faces = cube_mesh(5)
         vertices = vertices if len(parts) > 1 else vertices @ ROTATION.T + [0.1, 0.2, 0.3]
         hit = closest(scene_of(*parts), *rays_at_edges(vertices, faces, 100_000, 3))
@@ -600,7 +601,7 @@ def test_rays_in_the_plane_of_a_face_hit_the_cube_where_they_meet_that_face(axis
     o, d = (np.where(np.arange(3) == axis, x, sign * x) for x in (o, d))
     d[:, axis] = np.copysign(0.0, sign)
     d /= np.linalg.norm(d, axis=1, keepdims=True)
-    hit = closest(scene_of(desc.Cube(np.eye(4))), np.float32(o), np.float32(d))
+    hit = closest(scene_of(Cube(np.eye(4))), np.float32(o), np.float32(d))
     np.testing.assert_allclose(hit.t, [np.inf, np.inf, 4], rtol=1e-6)
 
 
@@ -609,7 +610,7 @@ def planes_of_box(n):
     g = (np.arange(n) + 0.5) / n * 2 - 1
     flat = [affine(np.diag([1 / n, 1 / n, 1]), [x, y, z]) for x in g for y in g for z in (-1, 1)]
     turn = np.eye(4)[[1, 2, 0, 3]]
-    return [desc.Rectangle(np.linalg.matrix_power(turn, k) @ m) for m in flat for k in range(3)]
+    return [Rectangle(np.linalg.matrix_power(turn, k) @ m) for m in flat for k in range(3)]
 
 
 # ---- surfaces -------------------------------------------------------------------------------------------------------
@@ -630,7 +631,7 @@ def test_surface_points_lie_on_their_primitive_within_rounding(scale, shift):
     move = np.array([1.0, -1.0, 1.0]) * shift * scale
     rng = np.random.default_rng(9)
     frames = [affine(rng.normal(size=(3, 3)) * 0.3 * scale, rng.uniform(-1, 1, 3) * scale + move) for _ in range(10)]
-    parts = [mesh(triangles(20).vertices * scale + move), *map(desc.Rectangle, frames)]
+    parts = [mesh(triangles(20).vertices * scale + move), *map(Rectangle, frames)]
     shapes = scene_of(*parts)
     o, d = random_rays(4000)
     o = np.float32(o * scale + move)
@@ -665,7 +666,7 @@ def test_tiny_triangles_have_a_unit_normal():
 
     def normal(row):
         hit = Ray(jnp.array([0, 0, 1e-3]), jnp.array([0, 0, -1.0]), jnp.float32(1), jnp.int32(-1))
-        return triangle.surface(shapes.tables[0], row, hit.o, hit.d, jnp.float32(1e-3)).n
+        return shapes.tables[0].surface(row, hit.o, hit.d, jnp.float32(1e-3)).n
 
     n = jax.jit(jax.vmap(normal))(jnp.arange(30))
     np.testing.assert_allclose(np.linalg.norm(n, axis=1), 1, atol=1e-5)
@@ -685,8 +686,8 @@ FLAT = affine(np.eye(3), [0, 0, 0])
 DOWN = [0, 0, -1]
 SPECIAL_RAYS = {
     "sphere": (sphere([0, 0, 0], 1), [([0, 0, 3], DOWN), ([1, 0, 3], DOWN), ([0, 0, -1], [1, 0, 0])]),  # poles, tangent
-    "disk": (desc.Disk(FLAT), [([0, 0, 3], DOWN), ([1, 0, 3], DOWN), ([3, 0, 0], [-1, 0, 0])]),  # centre, rim, edge-on
-    "rectangle": (desc.Rectangle(FLAT), [([0.3, 0.2, 3], DOWN), ([1, 1, 3], DOWN), ([3, 0, 0], [-1, 0, 0])]),
+    "disk": (Disk(FLAT), [([0, 0, 3], DOWN), ([1, 0, 3], DOWN), ([3, 0, 0], [-1, 0, 0])]),  # centre, rim, edge-on
+    "rectangle": (Rectangle(FLAT), [([0.3, 0.2, 3], DOWN), ([1, 1, 3], DOWN), ([3, 0, 0], [-1, 0, 0])]),
     "triangle": (mesh(np.tril(np.ones((3, 3)), -1)), [([0, 0, 3], DOWN), ([1, 0.5, 3], DOWN), ([3, 0, 0], [-1, 0, 0])]),
 }
 
@@ -695,10 +696,9 @@ SPECIAL_RAYS = {
 def test_surface_derivatives_are_finite(kind):
     geo, rays = SPECIAL_RAYS[kind]
     table = scene_of(geo).tables[0]
-    module = geometry._MODULES[type(table)]
 
     def at(o, d):
-        s = module.surface(table, 0, o, d, jnp.float32(3.0))
+        s = table.surface(0, o, d, jnp.float32(3.0))
         return s.p, s.n, s.uv
 
     o, d = (jnp.asarray(x, jnp.float32) for x in zip(*rays, strict=True))
@@ -734,7 +734,7 @@ def test_spawned_rays_stay_inside_a_closed_mesh():
 
 def test_sheets_thinner_than_the_spawn_offset_are_not_skipped():
     # Four ulps apart, so that distances tell the sheets apart.
-    shapes = scene_of(*(desc.Rectangle(affine(np.eye(3), [0, 0, z])) for z in (1 + 2**-21, 1)))
+    shapes = scene_of(*(Rectangle(affine(np.eye(3), [0, 0, z])) for z in (1 + 2**-21, 1)))
     o, d = random_rays(1000)
     o[:, 2], d[:, 2] = 3, -1 - np.abs(d[:, 2])
     o[:, :2] *= 0.3

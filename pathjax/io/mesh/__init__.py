@@ -14,10 +14,10 @@ from pathlib import Path
 
 import numpy as np
 
-from pathjax.description import Mesh
 from pathjax.errors import InputError
 from pathjax.io.mesh import gltf, obj, ply, polygons, stl
 from pathjax.io.mesh.raw import Raw
+from pathjax.shapes import Mesh
 
 READERS = {"obj": obj.read, "ply": ply.read, "stl": stl.read, "glb": gltf.read, "gltf": gltf.read}
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterator
-from functools import partial
 from itertools import count
 from pathlib import Path
 
@@ -22,6 +21,8 @@ from pathjax.io import mesh
 from pathjax.io.mitsuba.xml_reader import read
 from pathjax.kinds import Instance
 from pathjax.sensors import film
+from pathjax.shapes import KINDS as SHAPES
+from pathjax.shapes import Mesh
 
 
 def load(path: str | Path, /, **parameters: object) -> d.Description:
@@ -101,8 +102,7 @@ class _Loader:
         if element not in self.made:
             self.making.add(element)
             kinds = bsdfs.KINDS if element.tag == "bsdf" else textures.KINDS
-            handlers = {type_name: partial(_instance, kind) for type_name, kind in kinds.items()}
-            self.made[element] = self.make(element, handlers, element.id or name)
+            self.made[element] = self.make(element, kinds, element.id or name)
             self.making.remove(element)
         return self.made[element]
 
@@ -117,6 +117,12 @@ class _Loader:
         """The file that a parameter names."""
         return self.document.find(fields.string(parameter), fields.where(parameter))
 
+    def read_mesh(self, *how: object, **choices: object) -> Mesh:
+        """Of `io.mesh.load`."""
+        made, notes = mesh.load(*how, **choices)
+        self.notes += notes
+        return made
+
     def numbered(self, name: str) -> str:
         """`name0`, `name1`, ...; the next that is free."""
         return self.unique(next(each for k in self.counts[name] if (each := f"{name}{k}") not in self.names))
@@ -129,16 +135,10 @@ class _Loader:
         return name
 
 
-def _instance(kind: type, loader: _Loader, fields: Fields, name: str) -> Instance:
-    return kind.read(loader, fields, name)
-
-
 def _shape(loader: _Loader, fields: Fields, name: str) -> d.Shape | None:
     """None where nothing of a mesh is left, as all its triangles are degenerate: no ray meets it, nor does it emit."""
-    geometry = SHAPES[fields.type](loader, fields)
-    flip_normals = fields.boolean("flip_normals", False)
-    if isinstance(geometry, d.Sphere) and np.linalg.det(geometry.to_world[:3, :3]) < 0:
-        flip_normals = not flip_normals  # Mitsuba turns a mirrored sphere inside out, other shapes not
+    geometry = SHAPES[fields.type].read(loader, fields)
+    flip_normals = fields.boolean("flip_normals", False) != geometry.mirrored
     radiance, emitter_name = None, ""
     for emitter in fields.objects("emitter"):
         if emitter not in fields.element.children:
@@ -152,52 +152,11 @@ def _shape(loader: _Loader, fields: Fields, name: str) -> d.Shape | None:
         # Mitsuba: a light that is given no bsdf reflects nothing
         grey = 0.5 if radiance is None else 0.0
         bsdf = bsdfs.Diffuse.instance(inherited or loader.numbered("bsdf"), reflectance=grey)
-    if isinstance(geometry, d.Mesh) and not len(geometry.faces):
+    if geometry.empty:
         place, light = f"{fields.element.file}:{fields.element.line}", "" if radiance is None else ", and its light too"
         loader.notes.append(f"{place}: {fields.element} is left out, as no triangle has an area{light}")
         return None
     return d.Shape(name, geometry, bsdf, radiance, emitter_name, flip_normals)
-
-
-# Shapes: (loader, fields) -> geometry.
-
-
-def _sphere(loader: _Loader, fields: Fields) -> d.Sphere:
-    local = np.eye(4)
-    local[:3, 3] = fields.point("center", np.zeros(3))
-    local[:3, :3] *= fields.float("radius", 1.0, above=0)
-    to_world = fields.transform("to_world") @ local
-    radius = float(np.linalg.norm(to_world[:3, 0]))
-    with np.errstate(all="ignore"):
-        unit = to_world[:3, :3] / radius
-        round_enough = np.allclose(unit.T @ unit, np.eye(3), atol=1e-3)
-    if not round_enough or not 0 < np.float32(radius) < np.inf:
-        raise fields.error("to_world", "scales unevenly or shears; a sphere must stay a sphere")
-    return d.Sphere(to_world[:3, 3], radius, to_world)
-
-
-def _rectangle(loader: _Loader, fields: Fields) -> d.Rectangle:
-    return d.Rectangle(fields.transform("to_world"))
-
-
-def _disk(loader: _Loader, fields: Fields) -> d.Disk:
-    return d.Disk(fields.transform("to_world"))
-
-
-def _cube(loader: _Loader, fields: Fields) -> d.Cube:
-    return d.Cube(fields.transform("to_world"))
-
-
-def _mesh(loader: _Loader, fields: Fields) -> d.Mesh:
-    made, notes = mesh.load(
-        loader.find(fields, "filename"),
-        fields.type,
-        fields.transform("to_world"),
-        face_normals=fields.boolean("face_normals", False),
-        flip_tex_coords=fields.boolean("flip_tex_coords", None),
-    )
-    loader.notes += notes
-    return made
 
 
 # Emitters: (loader, fields) -> (3,) radiance.
@@ -246,7 +205,6 @@ def _sampler(loader: _Loader, fields: Fields) -> int:
 
 
 TOP_LEVEL = ("integrator", "sensor", "emitter", "bsdf", "texture", "shape")
-SHAPES = {"sphere": _sphere, "rectangle": _rectangle, "disk": _disk, "cube": _cube} | dict.fromkeys(mesh.READERS, _mesh)
 AREA_LIGHTS = {"area": _emitter}
 BACKGROUNDS = {"constant": _emitter}
 INTEGRATORS = {"path": _path, "direct": _direct}

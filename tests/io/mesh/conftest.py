@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pathjax.description import Mesh
 from pathjax.errors import InputError
 from pathjax.io import mesh
+from pathjax.shapes import Mesh
 
 IDENTITY = np.eye(4)
 

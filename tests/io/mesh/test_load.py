@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from pathjax.errors import InputError
-from pathjax.io.mesh import load
+from pathjax.io.mesh import READERS, load
+from pathjax.shapes import KINDS, Mesh
 
 DATA = Path(__file__).parents[3] / ".." / "shared" / "data"
 IDENTITY = np.eye(4)
@@ -237,3 +238,7 @@ def test_stl_is_flat_in_both_encodings(write):
 def test_missing_mesh_file_is_refused(tmp_path):
     with pytest.raises(InputError, match=r"none\.obj"):
         load(tmp_path / "none.obj", "obj", IDENTITY)
+
+
+def test_every_format_that_can_be_read_is_a_shape_of_scene_files():
+    assert list(READERS) == [name for name, kind in KINDS.items() if kind is Mesh]

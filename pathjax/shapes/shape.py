@@ -1,0 +1,214 @@
+"""What a shape is: as a scene file has it, while a scene is built, and in kernels.
+
+Each kind keeps its primitives twice: in `leaves`, K numbers of W primitives side by side for intersection in SIMD, and
+as rows of its own arrays, for everything that is asked of the one primitive that was hit.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, field
+from typing import ClassVar, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from pathjax.core.math import at, dot, safe_divide, safe_sqrt
+from pathjax.core.types import Hit, Ray, Surface
+from pathjax.description.fields import Fields
+from pathjax.shapes.accel.build import Tree as BuiltTree
+from pathjax.shapes.accel.traverse import Tree
+from pathjax.shapes.coincident import Faces
+
+# ---- as a scene file has it -----------------------------------------------------------------------------------------
+
+
+class Shape(ABC):
+    """What a scene file says of one shape, in world space; NumPy, float64."""
+
+    table: ClassVar[type[Table]]  # that its primitives go into
+    comes_last: ClassVar[bool] = False  # in its table, after what other kinds put there
+
+    @classmethod
+    @abstractmethod
+    def read(cls, loader, fields: Fields) -> Shape:
+        """Ask for what an element may hold; its bsdf, its light and `flip_normals` are the loader's."""
+
+    @property
+    def mirrored(self) -> bool:
+        """Whether its transform turns it inside out, as Mitsuba's does spheres alone."""
+        return False
+
+    @property
+    def empty(self) -> bool:
+        """Whether there is nothing of it that a ray could meet."""
+        return False
+
+    @abstractmethod
+    def primitives(self, flip: bool) -> Primitives:
+        """flip: turn the normals around."""
+
+
+class Primitives(ABC):
+    """The primitives of one shape, P of them, while a scene is built."""
+
+    areas: np.ndarray  # (P,)
+    one_lamp: ClassVar[bool] = False  # they shine as one lamp, which is sampled uniformly in area; else each is one
+
+    def faces(self, glass: bool, lamp: bool, dtype) -> Faces | None:
+        """The flat faces, which may touch those of other shapes; None: they are curved."""
+        return None
+
+    def move(self, moves: np.ndarray) -> None:
+        """Shift the faces; moves: (F, 3), or (3,) for all."""
+        raise NotImplementedError
+
+
+# ---- in kernels -----------------------------------------------------------------------------------------------------
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Lamps:
+    """Shapes that emit: a row for each rectangle, disk, sphere and face of a cube, and one for each whole mesh."""
+
+    table: jax.Array  # (R,) int32 into `tables`
+    first: jax.Array  # (R,) int32 first row in that table
+    count: jax.Array  # (R,) int32 rows: 1 but for meshes
+    area: jax.Array  # (R,)
+    tables: tuple[int, ...] = field(metadata={"static": True})  # which tables of the geometry hold lamps
+
+
+class LampSample(NamedTuple):
+    """A point of a lamp as seen from another point."""
+
+    d: jax.Array  # (3,) unit, towards it
+    distance: jax.Array  # ()
+    n: jax.Array  # (3,) unit geometric normal there
+    pdf: jax.Array  # () 1/sr; 0 edge-on
+    primitive: jax.Array  # () int32; of a table's own function: the row
+
+
+class Searched(ABC):
+    """Primitives that rays search: one by one, or by a tree."""
+
+    kind: ClassVar[str]  # what reports call one of them
+    leaves: jax.Array  # (L, K + 1, W) of `accel.leaves`: bits of K numbers, NaN in empty lanes; row of each lane
+    tree: Tree | None  # None: every ray tests all leaves
+
+    def prepare(self, o, d):
+        """Constants of a ray from o (3,) in the unit direction d (3,), for `intersect`."""
+        return o, d
+
+    @abstractmethod
+    def intersect(self, leaf, prepared, start):
+        """Intersect the W primitives of a leaf.
+
+        Args:
+            leaf: () int32; prepared: of `prepare`.
+            start: () int32 row of the primitive that the ray starts on, which it leaves for good, or of nothing here.
+        Returns:
+            distances (W,), inf or NaN where missed, possibly negative where behind; rows (W,).
+        """
+
+
+class Table(Searched):
+    """All primitives of one kind in a scene, P rows: a pytree."""
+
+    # What of transport between patches is known of the kind.
+    polygons: ClassVar[bool] = False  # flat, with three or four straight edges: `edges_and_normals` is its own
+    triangular: ClassVar[bool] = False  # cut into triangles, of the same number along each edge
+    even_chords: ClassVar[bool] = False  # inside one of it, a chord meets both its ends at one angle
+
+    @classmethod
+    @abstractmethod
+    def build(
+        cls, parts: list[Primitives], lit: list[bool], dtype, rule: str, margins
+    ) -> tuple[Table, dict[str, BuiltTree | None]]:
+        """The table, and hierarchies by `kind`, for reports; None: there is none.
+
+        Args:
+            parts, lit: primitives by shape, and whether the shape emits.
+            rule: of `accel.build`; margins: (P,) of `coincident`, or None.
+        """
+
+    @classmethod
+    def own_margins(cls, parts: list[Primitives], dtype) -> np.ndarray:
+        """Margins (P,) of primitives that have no `faces`."""
+        raise NotImplementedError
+
+    @property
+    @abstractmethod
+    def count(self) -> int: ...
+
+    def searched(self) -> list[Searched]:
+        """What rays search to find its primitives."""
+        return [self] if len(self.leaves) else []
+
+    @abstractmethod
+    def surface(self, row, o, d, t) -> Surface:
+        """What a ray sees on the primitive that it meets at the distance t; the point lies on it to the last bits.
+
+        Differentiable in the ray o, d; t tells apart points, and is not differentiated.
+        """
+
+    # ---- light
+
+    def sample(self, row, u):
+        """Draw a point uniformly in area: u (2,) -> point (3,), unit normal (3,), rounding error along it ().
+
+        Of kinds that keep the `sample_lamp` of this class.
+        """
+        raise NotImplementedError
+
+    def sample_lamp(self, lamps: Lamps, lamp, ref, u, u_part) -> LampSample:
+        """Draw a point of the lamp of this row of `lamps`, as seen from `ref` (3,).
+
+        u: (2,) uniform in [0, 1); u_part: () chooses within a lamp of many primitives.
+        """
+        row, area = self.row_of_lamp(lamps, lamp, u_part), at(lamps.area, lamp)
+        p, n, margin = self.sample(row, u)
+        # The far end of a shadow ray stays clear of what touches the lamp, as its near end does.
+        p = p + n * jnp.copysign(margin, dot(n, ref - p))
+        to_p = p - ref
+        squared = dot(to_p, to_p)
+        distance = safe_sqrt(squared)
+        d = to_p * safe_divide(1, distance)
+        d, distance = lax.optimization_barrier((d, distance))
+        return LampSample(d, distance, n, safe_divide(squared, jnp.abs(dot(n, d)) * area), row)
+
+    def row_of_lamp(self, lamps: Lamps, lamp, u_part):
+        """() int32, the row of the primitive that a sample lies on."""
+        return at(lamps.first, lamp)
+
+    def lamp_density(self, lamps: Lamps, lamp, first: int, ray: Ray, hit: Hit, surface: Surface):
+        """Density () [1/sr] with which `sample_lamp`, seen from ray.o, finds the point that a ray hit.
+
+        first: number of the first primitive of this table.
+        """
+        cos = jnp.abs(dot(surface.n, ray.d))
+        return safe_divide(hit.t * hit.t, cos * at(lamps.area, lamp))
+
+    # ---- patches
+
+    @abstractmethod
+    def areas(self) -> np.ndarray:
+        """(P,) float64."""
+
+    @abstractmethod
+    def cell_lengths(self, size: float) -> np.ndarray:
+        """(P, 2) lengths along the two coordinates of `to_square`, cells being about `size` long."""
+
+    @abstractmethod
+    def to_square(self, row, p):
+        """Coordinates (2,) in [0, 1], in which equal areas are equal, of a point; of triangles two barycentric ones."""
+
+    @abstractmethod
+    def from_square(self, row, xy):
+        """The inverse: point (3,), unit normal (3,), rounding error of the point along it ()."""
+
+    def edges_and_normals(self) -> tuple[np.ndarray, np.ndarray]:
+        """Of polygons a corner and the two edges from there (P, 3, 3), and normals (P, 3) of any length; float64."""
+        raise NotImplementedError
