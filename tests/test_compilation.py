@@ -240,10 +240,10 @@ OPTIONAL = {
     "texture.py": {"glass_and_mirror"},
     "sphere.py": {"glass_and_mirror", "glass_in_glass"},
     "triangle.py": {"mesh"},
-    "bvh.py": {"mesh"},
+    "traverse.py": {"mesh"},
     "cube.py": {"cornell_box", "glass_and_mirror", "glass_in_glass"},
     "planar.py": {"cornell_box", "glass_and_mirror", "glass_in_glass", "mesh"},
-    "constant.py": set(),  # its radiance is read by the dispatch; only strategy "light" samples it
+    "constant.py": {"glass_and_mirror", "glass_in_glass", "mesh"},
     "area.py": {"cornell_box", "glass_and_mirror", "glass_in_glass", "mesh"},
 }
 
@@ -257,8 +257,9 @@ def test_program_holds_code_of_the_kinds_present_and_of_no_others(shipped, name)
 
 
 def test_background_is_sampled_by_strategy_light_alone(shipped):
-    text = lowered(shipped("glass_and_mirror", res=16), "light", form="loop").as_text(debug_info=True)
-    assert "/constant.py" in text
+    scene = shipped("glass_and_mirror", res=16)
+    texts = {each: lowered(scene, each, form="loop").as_text(debug_info=True) for each in ("mis", "light")}
+    assert {each: "Constant.sample" in text for each, text in texts.items()} == {"mis": False, "light": True}
 
 
 # ---- no recompilation -----------------------------------------------------------------------------------------------

@@ -412,9 +412,9 @@ def test_one_bad_number_spoils_no_other_pixel(make_scene, value):
     """Two lamps beside each other, one of them broken."""
     left, right = (shape("sphere", f'<translate x="{x}"/>', lamp(2)) for x in (-1.2, 1.2))
     scene = make_scene(left + right, depth=1, fov=60)
-    lights = scene.emitters.area
-    broken = replace(lights, radiance=lights.radiance.at[0].set(value))
-    spoiled_scene = replace(scene, emitters=replace(scene.emitters, area=broken))
+    (lights,) = scene.emitters
+    radiance = lights.table.column("radiance").values.at[0].set(value)
+    spoiled_scene = replace(scene, emitters=(replace(lights, table=lights.table.with_column("radiance", radiance)),))
     good, bad = (np.asarray(pj.render(each, 16)) for each in (scene, spoiled_scene))
     spoiled = ~np.isfinite(bad).all(-1)
     np.testing.assert_array_equal(spoiled[:, 8:], False)

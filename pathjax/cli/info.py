@@ -50,8 +50,8 @@ def scene_facts(scene: Scene) -> dict:
         "compiled": {
             "shapes": [f"{part.kind}s ({'tree' if part.tree else 'flat'})" for part in parts],
             "bsdfs": [bsdfs.name(scene.materials, kind) for kind in range(len(scene.materials.tables))],
-            "light sampling": bsdfs.occurs(scene.materials, "smooth") and scene.emitters.area is not None,
-            "emitters": [name for name in ("area", "constant") if getattr(scene.emitters, name) is not None],
+            "light sampling": bsdfs.occurs(scene.materials, "smooth") and emitters.sampled(scene.emitters),
+            "emitters": [emitters.name(lights) for lights in scene.emitters],
             "dtype": str(scene.camera.origin.dtype),
         },
         "trees": {

@@ -35,6 +35,8 @@ def at(table, *index):
     """`table[index]` for integers known to lie inside: one contiguous load. (Plain indexing, which counts negative
     indices from the end, and gathers cost a dozen instructions each in the kernel. Unsigned ones are clamped in two.)
     """
+    if all(isinstance(i, int) for i in index):
+        return table[index]
     rest = table.shape[len(index) :]
     start = [jnp.asarray(i, jnp.uint32) for i in index] + [jnp.uint32(0)] * len(rest)
     block = lax.dynamic_slice(table, start, (1,) * len(index) + rest, allow_negative_indices=False)

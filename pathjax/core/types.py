@@ -8,6 +8,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 
 
 class Ray(NamedTuple):
@@ -50,6 +51,12 @@ class BSDFSample(NamedTuple):
 class EmitterSample(NamedTuple):
     d: jax.Array  # (3,) unit, from the shaded point
     distance: jax.Array  # () to the light; inf: a background
-    primitive: jax.Array  # () int32 primitive of the light, which does not shadow itself; -1: a background
-    Le: jax.Array  # (3,) radiance towards the shaded point, W m^-2 sr^-1
-    pdf: jax.Array  # () 1/sr, the choice of the light included; 0: no sample
+    primitive: jax.Array  # () int32 primitive of the light, which does not shadow itself; -1: it has none
+    Le: jax.Array  # (3,) radiance towards the shaded point, W m^-2 sr^-1; of a Dirac light: irradiance across d
+    pdf: jax.Array  # () 1/sr, the choice of the light included; of a Dirac light: that alone; 0: no sample
+    delta: jax.Array | None  # () bool, a Dirac light, which nothing else finds; None: the scene has none
+
+    @property
+    def density(self):
+        """() 1/sr, for multiple importance sampling; inf of a Dirac light."""
+        return self.pdf if self.delta is None else jnp.where(self.delta, jnp.inf, self.pdf)

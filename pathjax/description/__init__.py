@@ -8,8 +8,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-import numpy as np
-
 from pathjax.kinds import Instance
 
 
@@ -18,8 +16,7 @@ class Shape:
     name: str
     geometry: object  # a `shapes.Shape`
     bsdf: Instance
-    radiance: np.ndarray | None  # (3,) of its area emitter; None: it has none
-    emitter_name: str  # "" where it has no emitter
+    emitter: Instance | None  # that shines from it
     flip_normals: bool
 
 
@@ -39,6 +36,5 @@ class Description:
     spp: int
     sampler: str  # the type that the file names; pathjax uses its own
     shapes: tuple[Shape, ...]
-    background: np.ndarray | None  # (3,) radiance of the constant emitter
-    background_name: str = ""
+    emitters: tuple[Instance, ...] = ()  # those that stand outside of shapes
     notes: tuple[str, ...] = field(default=())  # what `info` should tell: dropped triangles, replaced samplers

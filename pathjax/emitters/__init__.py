@@ -1,143 +1,184 @@
-"""Where light comes from: a file a kind, and the choice among the lights of a scene."""
+"""Where light comes from: a file a kind, the table of kinds, and the dispatch over those that a scene holds.
+
+An emitter is a subclass of `SurfaceEmitter`, `Background` or `DiracEmitter`, which say what it must offer. Lights are
+numbered through all tables: first those of surfaces, to which `Geometry.light` refers, then near and then distant ones.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from functools import reduce
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from pathjax.core.math import at, luminance
+from pathjax.core.math import at, dot, larger
 from pathjax.core.types import EmitterSample, Hit, Ray, Surface
-from pathjax.emitters import area, constant
-from pathjax.emitters.area import AreaLights
+from pathjax.emitters.area import Area
 from pathjax.emitters.constant import Constant
-from pathjax.kinds import Parameter
-from pathjax.shapes import Geometry, Lamp, lamp_table
+from pathjax.emitters.emitter import Background, DiracEmitter, Emitter, SurfaceEmitter
+from pathjax.emitters.selection import Choice, Lights, choice, choose
+from pathjax.errors import InputError
+from pathjax.kinds import Instance, Parameters, ordered
+from pathjax.kinds import register as register_kind
+from pathjax.shapes import Geometry, Lamp, geometry, lamp_table
+
+__all__ = [
+    "KINDS",
+    "Area",
+    "Background",
+    "Choice",
+    "Constant",
+    "DiracEmitter",
+    "Emitter",
+    "Lights",
+    "SurfaceEmitter",
+    "choice",
+    "register",
+]
+
+# By the name that scene files give them.
+KINDS: dict[str, type[Emitter]] = {"area": Area, "constant": Constant}
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class Emitters:
-    area: AreaLights | None
-    constant: Constant | None
+def register(name: str):
+    """A decorator that makes a subclass of `SurfaceEmitter`, `Background` or `DiracEmitter` a kind named `name`."""
+    return register_kind(KINDS, Emitter, name, "emitters")
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class Choice:
-    """Probability of each light, of the area lights first and of the background last; made once per render."""
-
-    pdf: jax.Array  # (R,)
-    cdf: jax.Array  # (R,) ends at 1
-
-
-def build(description, geometry: Geometry, lamps: list[Lamp], dtype, parameters) -> tuple[Emitters, Geometry]:
+def build(
+    emitters: list[Instance | None], lamps: list[Lamp], shapes: Geometry, dtype, path: tuple, parameters: Parameters
+) -> tuple[tuple[Lights, ...], Geometry]:
     """The lights of a scene, and its geometry with their numbers.
 
-    lamps: of `shapes.build`.
+    Args:
+        emitters: of each shape, None where it has none, and then those that stand outside of shapes.
+        lamps: of `shapes.build`.
+        path: where the lights will be in the scene; parameters: to enter theirs.
     """
-    shapes = description.shapes
-    emitting = list(dict.fromkeys(lamp.shape for lamp in lamps))
-    bounds = (0, np.inf)
-    for row, shape in enumerate(shapes[number] for number in emitting):
-        place = Parameter(("emitters", "area", "radiance"), (row,), (3,), bounds)
-        parameters[f"{shape.emitter_name}.radiance"] = place
-    area = constant = None
-    if lamps:
-        rows = [emitting.index(lamp.shape) for lamp in lamps]
-        radiance = np.asarray(np.stack([shapes[number].radiance for number in emitting]), dtype)
-        area = AreaLights(radiance, np.asarray(rows, np.int32), lamp_table(lamps, dtype))
-    if description.background is not None:
-        constant = Constant(np.asarray(description.background, dtype))
-        place = Parameter(("emitters", "constant", "radiance"), (), (3,), bounds)
-        parameters[f"{description.background_name}.radiance"] = place
-    light = np.full(len(geometry.shape), -1, np.int32)
-    for number, lamp in enumerate(lamps):
-        light[lamp.primitive : lamp.primitive + lamp.count] = number
-    return Emitters(area, constant), replace(geometry, light=light)
+    of_shapes = dict.fromkeys(emitters[lamp.shape] for lamp in lamps)
+    inside = ordered(of_shapes, KINDS)
+    outside = ordered([each for each in emitters if each is not None and each not in of_shapes], KINDS)
+    made, light, number = [], np.full(len(shapes.shape), -1, np.int32), 0
+    for kind, instances in (*inside.items(), *sorted(outside.items(), key=lambda item: item[0].distant)):
+        table = kind.build(instances, dtype, (*path, len(made), "table"), parameters, None)
+        shining = [lamp for lamp in lamps if emitters[lamp.shape].kind is kind]
+        for lamp in shining:
+            light[lamp.primitive : lamp.primitive + lamp.count] = number
+            number += 1
+        rows = np.asarray([instances.index(emitters[lamp.shape]) for lamp in shining], np.int32)
+        made.append(Lights(table, lamp_table(shining, dtype), rows) if shining else Lights(table, None, None))
+    return tuple(made), replace(shapes, light=light)
 
 
-def darkness(emitters: Emitters) -> str | None:
+def name(lights: Lights) -> str:
+    """What scene files call a kind."""
+    return next(name for name, kind in KINDS.items() if kind is lights.kind)
+
+
+def sampled(emitters: tuple[Lights, ...]) -> bool:
+    """Whether strategy "mis" samples lights."""
+    return any(not lights.kind.left_to_bsdfs for lights in emitters)
+
+
+def darkness(emitters: tuple[Lights, ...]) -> str | None:
     """Why every image is black, in words; None where light may come. Of known values, not of traced ones."""
-    radiances = [table.radiance for table in (emitters.area, emitters.constant) if table is not None]
-    if not radiances:
+    if not emitters:
         return "there is no light"
-    return None if any(np.asarray(radiance).any() for radiance in radiances) else "the radiance of every light is 0"
+    return "the radiance of every light is 0" if all(lights.dark() for lights in emitters) else None
 
 
-def choice(emitters: Emitters, strategy: str) -> Choice | None:
-    """Lights by power, pi * area * luminance; None where there is nothing to choose from.
+def even_lights(emitters: tuple[Lights, ...]) -> Lights | None:
+    """Those of surfaces that emit the same radiance in all directions; None: there is no light.
 
-    The background is sampled only for strategy "light", half of the time beside other lights: what a bsdf samples
-    finds a constant background at less variance.
+    Raises:
+        InputError: there are other lights.
     """
-    weights = []
-    if emitters.area is not None:
-        lights = emitters.area
-        weights.append(lights.lamps.area * luminance(lights.radiance)[lights.emitter])
-    if emitters.constant is not None and strategy == "light":
-        one = jnp.ones((1,), emitters.constant.radiance.dtype)
-        weights = [jnp.concatenate([weights[0] / jnp.sum(weights[0]), one]) if weights else one]
-    if not weights:
-        return None
-    # Lights of power 0 throughout: any choice will do, and 0 / 0 will not.
-    power = lax.stop_gradient(weights[0])
-    total = jnp.sum(power)
-    pdf = jnp.where(total > 0, power / jnp.where(total > 0, total, 1), 1 / len(power))
-    return Choice(pdf, jnp.cumsum(pdf))
+    for lights in emitters:
+        if lights.lamps is None or not lights.kind.even:
+            raise InputError(
+                f"the scene has a {name(lights)} emitter; patches hold the light of surfaces alone, the same in all "
+                "directions. Enclose it, or use pathjax.render"
+            )
+    if len(emitters) > 1:
+        raise InputError("the scene has several kinds of emitters on surfaces; patches hold the light of one kind")
+    return emitters[0] if emitters else None
 
 
-def sample(emitters: Emitters, shapes: Geometry, chosen: Choice, ref, u, u_triangle) -> EmitterSample:
-    """Choose a light and a direction towards it. u: (2,), its first number also chooses; u_triangle: ()."""
-    count = chosen.pdf.shape[0]
-    if count == 1:
-        row, pdf = jnp.int32(0), jnp.ones_like(u[0])
-    else:
-        row = jnp.searchsorted(chosen.cdf, u[0], side="right").astype(jnp.int32)
-        row = jnp.minimum(row, count - 1)
-        pdf = at(chosen.pdf, row)
-        below = at(chosen.cdf, row) - pdf
-        again = jnp.clip((u[0] - below) / jnp.where(pdf > 0, pdf, 1), 0, 1 - 2**-24)
-        u = jnp.stack([again, u[1]])
+def sample(emitters: tuple[Lights, ...], shapes: Geometry, chosen: Choice, ref, u, u_part) -> EmitterSample:
+    """Choose a light and a direction towards it.
 
-    def of_area():
-        return area.sample(emitters.area, shapes, row, ref, u, u_triangle)
+    Args:
+        ref: (3,) the shaded point.
+        u: (2,) uniform in [0, 1), whose first number also chooses the light; u_part: () chooses within it.
+    Returns:
+        EmitterSample; pdf and Le are 0 where nothing arrives from there.
+    """
+    number, probability, u = choose(chosen, u)
+    sampled = [(lights, first) for lights, first in zip(emitters, chosen.first, strict=True) if first is not None]
+    some_dirac = any(issubclass(lights.kind, DiracEmitter) for lights, _ in sampled)
 
-    def of_background():
-        return constant.sample(emitters.constant, u)
+    def of(lights: Lights, first):
+        def draw():
+            light = number - first if first else number
+            p = lights.parameters(light)
+            if issubclass(lights.kind, SurfaceEmitter):
+                d, distance, n, pdf, primitive = geometry.sample_lamp(shapes, lights.lamps, light, ref, u, u_part)
+                front = dot(n, d) < 0
+                Le = jnp.where(front, lights.kind.emitted(p, d), 0)
+                pdf = jnp.where(front, pdf, 0) * probability
+            elif issubclass(lights.kind, Background):
+                d = lights.kind.sample(p, u, u_part)
+                distance, primitive = jnp.full_like(d[0], jnp.inf), jnp.int32(-1)
+                Le, pdf = background(emitters, chosen, d)
+            else:
+                d, distance, Le = lights.kind.sample(p, ref)
+                primitive, pdf = jnp.int32(-1), probability
+            delta = jnp.bool_(issubclass(lights.kind, DiracEmitter)) if some_dirac else None
+            return EmitterSample(d, distance, primitive, Le, pdf, delta)
 
-    area_rows = 0 if emitters.area is None else emitters.area.emitter.shape[0]
-    if area_rows == count:
-        drawn = of_area()
-    elif area_rows == 0:
-        drawn = of_background()
-    else:
-        drawn = lax.cond(row < area_rows, of_area, of_background)
-    return drawn._replace(pdf=drawn.pdf * pdf)
+        return draw
+
+    return geometry.switch_by_range(number, [first for _, first in sampled], [of(*each) for each in sampled])
 
 
-def hit(emitters: Emitters, shapes: Geometry, chosen: Choice | None, ray: Ray, hit: Hit, surface: Surface):
+def hit(emitters: tuple[Lights, ...], shapes: Geometry, chosen: Choice | None, ray: Ray, hit: Hit, surface: Surface):
     """Radiance (3,) received from the surface that was hit and the density [1/sr] of `sample` for it; 0, 0 if dark."""
     zero = jnp.zeros_like(ray.o)
-    if emitters.area is None:
+    on_surfaces = [lights for lights in emitters if lights.lamps is not None]
+    if not on_surfaces:
         return zero, zero[0]
-    row = at(shapes.light, jnp.maximum(hit.primitive, 0))
+    number = at(shapes.light, jnp.maximum(hit.primitive, 0))
+    firsts = np.cumsum([0, *(lights.count for lights in on_surfaces)]).tolist()[:-1]
+
+    def of(lights: Lights, first):
+        def lit():
+            light = number - first if first else number
+            front = dot(surface.n, ray.d) < 0
+            Le = jnp.where(front, lights.kind.emitted(lights.parameters(light), ray.d), 0)
+            pdf = geometry.lamp_density(shapes, lights.lamps, light, ray, hit, surface)
+            return Le, larger(pdf, jnp.zeros_like(pdf)) * at(chosen.pdf, number)
+
+        return lit
 
     def lit():
-        Le, pdf = area.hit(emitters.area, shapes, row, ray, hit, surface)
-        return Le, pdf * at(chosen.pdf, row)
+        return geometry.switch_by_range(number, firsts, [of(*each) for each in zip(on_surfaces, firsts, strict=True)])
 
-    return lax.cond((row >= 0) & (hit.primitive >= 0), lit, lambda: (zero, zero[0]))
+    return lax.cond((number >= 0) & (hit.primitive >= 0), lit, lambda: (zero, zero[0]))
 
 
-def background(emitters: Emitters, chosen: Choice | None, d):
-    """Radiance (3,) from direction d (3,) where nothing is hit, and the density [1/sr] of `sample` for it."""
-    if emitters.constant is None:
-        return jnp.zeros_like(d), jnp.zeros_like(d[0])
-    area_rows = 0 if emitters.area is None else emitters.area.emitter.shape[0]
-    sampled = chosen is not None and chosen.pdf.shape[0] > area_rows
-    pdf = chosen.pdf[area_rows] * constant.SPHERE_PDF if sampled else 0
-    return emitters.constant.radiance, jnp.asarray(pdf, d.dtype)
+def background(emitters: tuple[Lights, ...], chosen: Choice | None, d):
+    """Radiance (3,) from direction d (3,) where nothing is hit, and the density [1/sr] of `sample` for it.
+
+    Of all backgrounds together: light may come from several of them, and any of them may have drawn d.
+    """
+    radiances, densities = [], []
+    for place, lights in enumerate(emitters):
+        for row in range(lights.count) if issubclass(lights.kind, Background) else ():
+            p = lights.parameters(row)
+            radiances.append(lights.kind.emitted(p, d))
+            if chosen is not None and chosen.first[place] is not None:
+                densities.append(chosen.pdf[chosen.first[place] + row] * lights.kind.density(p, d))
+    radiance = reduce(jnp.add, radiances) if radiances else jnp.zeros_like(d)
+    return radiance, reduce(jnp.add, densities) if densities else jnp.zeros_like(d[0])

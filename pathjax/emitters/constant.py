@@ -1,24 +1,33 @@
-"""Radiance from all directions that nothing else fills."""
+"""The same radiance from all directions that nothing else fills."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
 
-import jax
 import jax.numpy as jnp
 
-from pathjax.core.types import EmitterSample
+from pathjax.core.math import luminance
 from pathjax.core.warp import SPHERE_PDF, square_to_sphere
+from pathjax.emitters.emitter import Background
+from pathjax.kinds import Color
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class Constant:
-    radiance: jax.Array  # (3,)
+class Constant(Background):
+    radiance = Color(1.0, bounds=(0, math.inf), textured=False, radiance=True)
+    left_to_bsdfs = True
 
+    @staticmethod
+    def power(p):
+        return luminance(p.radiance)
 
-def sample(table: Constant, u) -> EmitterSample:
-    """Uniform over the sphere. u: (2,)."""
-    d = square_to_sphere(u)
-    far, pdf = jnp.full_like(d[0], jnp.inf), jnp.full_like(d[0], SPHERE_PDF)
-    return EmitterSample(d, far, jnp.int32(-1), table.radiance, pdf)
+    @staticmethod
+    def sample(p, u, u_part):
+        return square_to_sphere(u)
+
+    @staticmethod
+    def emitted(p, d):
+        return p.radiance
+
+    @staticmethod
+    def density(p, d):
+        return jnp.full_like(d[0], SPHERE_PDF)

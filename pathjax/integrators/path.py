@@ -189,7 +189,7 @@ def extend(
                 drawn = lax.optimization_barrier(drawn)
                 wo = to_local(frame, drawn.d)
                 f, pdf_bsdf = bsdfs.evaluate(materials, kind, row, surface, wi, wo)
-                share = mis_weight(drawn.pdf, pdf_bsdf) if strategy == "mis" else 1
+                share = mis_weight(drawn.density, pdf_bsdf) if strategy == "mis" else 1
                 possible = (drawn.pdf > 0) & (pdf_bsdf > 0)
                 scale = lax.optimization_barrier(share / jnp.where(possible, drawn.pdf, 1))
                 contribution = f * drawn.Le * scale

@@ -34,7 +34,8 @@ def build(description: desc.Description, dtype=jnp.float32, split_rule: str = "s
     parameters = Parameters()
     materials = bsdfs.build([shape.bsdf for shape in description.shapes], dtype, ("materials",), parameters)
     geometry, lamps, trees = shapes.build(description.shapes, dtype, split_rule)
-    lights, geometry = emitters.build(description, geometry, lamps, dtype, parameters.known)
+    given = [*(shape.emitter for shape in description.shapes), *description.emitters]
+    lights, geometry = emitters.build(given, lamps, geometry, dtype, ("emitters",), parameters)
     integrator = description.integrator
     max_depth = UNBOUNDED if integrator.max_depth < 0 else integrator.max_depth
     scene = Scene(

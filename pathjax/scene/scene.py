@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import jax
 
 from pathjax.bsdfs import Materials
-from pathjax.emitters import Emitters
+from pathjax.emitters import Lights
 from pathjax.scene.metadata import About
 from pathjax.sensors import Camera
 from pathjax.sensors.film import Film
@@ -26,7 +26,7 @@ class Scene:
     film: Film
     geometry: Geometry
     materials: Materials
-    emitters: Emitters
+    emitters: tuple[Lights, ...]  # one for each kind present
     max_depth: jax.Array  # () int32 vertices of the longest path; 1: emission only
     rr_depth: jax.Array  # () int32 vertices before roulette begins
     hide_emitters: bool = field(metadata={"static": True})  # from the camera

@@ -77,7 +77,7 @@ def build(shapes, dtype, rule: str) -> tuple[Geometry, list[Lamp], dict[str, Tre
     for number in numbers:
         shape = shapes[number]
         primitives = shape.geometry.primitives(shape.flip_normals)
-        part = _Part(number, primitives, shape.bsdf.kind.sided, shape.radiance is not None)
+        part = _Part(number, primitives, shape.bsdf.kind.sided, shape.emitter is not None)
         by_table[shape.geometry.table].append(part)
     by_table = {table: parts for table, parts in by_table.items() if parts}
 

@@ -23,7 +23,7 @@ import lineax as lx
 import numpy as np
 from jax import lax
 
-from pathjax import bsdfs
+from pathjax import bsdfs, emitters
 from pathjax.compile.runtime import usual_promotion
 from pathjax.core.math import safe_divide
 from pathjax.errors import InputError
@@ -300,10 +300,10 @@ def _albedos_and_lights(scene: Scene, patches: Patches):
         return jnp.concatenate([table, jnp.zeros_like(table[:1])])[rows]
 
     _, column = bsdfs.reflectances(scene.materials) or (None, None)
-    lights = scene.emitters.area
+    lights = emitters.even_lights(scene.emitters)
     black = jnp.zeros((patches.count, 3), patches.area.dtype)
     albedo = black if column is None else of(column.values, patches.row)
-    return albedo, black if lights is None else of(lights.radiance, patches.emitter)
+    return albedo, black if lights is None else of(lights.table.column("radiance").values, patches.emitter)
 
 
 def _check_depth(depth):

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pathjax import bsdfs
+from pathjax import bsdfs, emitters
 from pathjax.core.math import at
 from pathjax.core.warp import square_to_triangle
 from pathjax.errors import InputError
@@ -75,8 +75,8 @@ def cut(scene: Scene, count: int, faceted: bool = False) -> Patches:
 
     row = rows[shape[primitive]].T  # (2, C)
     emitter = np.full_like(row, -1)
-    if scene.emitters.area is not None:
-        emitter[0] = np.where(light >= 0, np.asarray(scene.emitters.area.emitter)[light], -1)[primitive]
+    if lights := emitters.even_lights(scene.emitters):
+        emitter[0] = np.where(light >= 0, np.asarray(lights.row)[light], -1)[primitive]
     back, cell = np.nonzero((row >= 0) | (emitter >= 0))
     if not len(cell):
         raise InputError("everything in this scene is black: there is no light to transport")
@@ -114,8 +114,6 @@ def _diffuse_rows(scene: Scene, faceted) -> np.ndarray:
                 f"{_name(scene, shape)} has a texture; a patch has one reflectance. Give it a constant one"
             )
         rows[shape, side] = row
-    if scene.emitters.constant is not None:
-        raise InputError("the scene has a constant emitter; patches hold the light of surfaces alone. Enclose it")
     if not faceted and scene.about is not None:
         for number, shape in enumerate(scene.about.description.shapes):
             if getattr(shape.geometry, "normals", None) is not None:

@@ -13,6 +13,7 @@ from pathjax import description as desc
 from pathjax import emitters
 from pathjax.bsdfs import Diffuse
 from pathjax.core.types import Ray
+from pathjax.emitters import Area, Constant
 from pathjax.scene import build
 from pathjax.scene.parameters import with_parameters
 from pathjax.sensors import Perspective
@@ -50,12 +51,13 @@ def convex_mesh(scale=0.5, subdivisions=1):
 
 
 def shape(geo, radiance=RADIANCE, flip=False, name="light"):
-    return desc.Shape(name, geo, GREY, radiance, f"{name}.emitter", flip)
+    return desc.Shape(name, geo, GREY, Area.instance(f"{name}.emitter", radiance=radiance), flip)
 
 
 def scene_of(*shapes, background=None, dtype=jnp.float32):
     camera, film = Perspective(np.eye(4), 45.0), HDRFilm(2, 2)
-    about = desc.Description("test", camera, film, desc.Integrator(), 1, "independent", shapes, background, "sky")
+    skies = () if background is None else (Constant.instance("sky", radiance=background),)
+    about = desc.Description("test", camera, film, desc.Integrator(), 1, "independent", shapes, skies)
     return build(about, dtype)
 
 
@@ -115,10 +117,10 @@ def uniform(n, seed):
 
 
 @jax.jit
-def _sample_and_trace(scene, choice, refs, u, u_triangle):
-    def one(ref, u, u_triangle):
+def _sample_and_trace(scene, choice, refs, u, u_part):
+    def one(ref, u, u_part):
         shapes, lights = scene.geometry, scene.emitters
-        drawn = emitters.sample(lights, shapes, choice, ref, u, u_triangle)
+        drawn = emitters.sample(lights, shapes, choice, ref, u, u_part)
         ray = Ray(ref, drawn.d, jnp.full_like(ref[0], jnp.inf), jnp.int32(-1))
         if not shapes.tables:
             return drawn, None, *emitters.background(lights, choice, drawn.d)
@@ -126,15 +128,15 @@ def _sample_and_trace(scene, choice, refs, u, u_triangle):
         surface = geometry.surface(shapes, ray, hit)
         return drawn, (hit, surface), *emitters.hit(lights, shapes, choice, ray, hit, surface)
 
-    return jax.vmap(one)(refs, u, u_triangle)
+    return jax.vmap(one)(refs, u, u_part)
 
 
 @jax.jit
-def _sample(scene, choice, refs, u, u_triangle):
-    def one(ref, u, u_triangle):
-        return emitters.sample(scene.emitters, scene.geometry, choice, ref, u, u_triangle)
+def _sample(scene, choice, refs, u, u_part):
+    def one(ref, u, u_part):
+        return emitters.sample(scene.emitters, scene.geometry, choice, ref, u, u_part)
 
-    return jax.vmap(one)(refs, u, u_triangle)
+    return jax.vmap(one)(refs, u, u_part)
 
 
 def sampled_primitives(scene, ref, strategy="mis"):
@@ -286,7 +288,8 @@ def test_lights_are_chosen_by_power(strategy):
     areas = [4 * 0.15, np.pi, trimesh.Trimesh(*mesh_arrays(shapes[2].geometry)).area]
     sheared = np.cross(*SHEARED[:3, :2].T)
     areas.append(np.pi * np.linalg.norm(sheared))
-    power = np.array([a * s.radiance @ [0.2126, 0.7152, 0.0722] for a, s in zip(areas, shapes, strict=True)])
+    radiances = [s.emitter.values["radiance"] for s in shapes]
+    power = np.array([a * radiance @ [0.2126, 0.7152, 0.0722] for a, radiance in zip(areas, radiances, strict=True)])
     probability = power / power.sum()
     if strategy == "light":
         probability = np.append(probability, 1) / 2

@@ -188,9 +188,9 @@ def test_a_slab_that_is_a_mesh_has_both_its_faces_at_a_millionth_of_its_size(mak
 
 def tables_of(*geometries, dtype=np.float32):
     grey = Diffuse.instance("grey")
-    shapes = tuple(desc.Shape(f"s{i}", g, grey, None, "", False) for i, g in enumerate(geometries))
+    shapes = tuple(desc.Shape(f"s{i}", g, grey, None, False) for i, g in enumerate(geometries))
     camera, film = Perspective(np.eye(4), 45.0), HDRFilm(2, 2)
-    description = desc.Description("test", camera, film, desc.Integrator(), 1, "independent", shapes, None)
+    description = desc.Description("test", camera, film, desc.Integrator(), 1, "independent", shapes)
     return build(description, dtype).geometry.tables
 
 

@@ -11,9 +11,7 @@ from collections.abc import Iterator
 from itertools import count
 from pathlib import Path
 
-import numpy as np
-
-from pathjax import bsdfs, sensors, textures
+from pathjax import bsdfs, emitters, sensors, textures
 from pathjax import description as d
 from pathjax.description.elements import Document, Element, nearest
 from pathjax.description.fields import Fields
@@ -54,7 +52,7 @@ class _Loader:
                 use = f"use one of {', '.join(scene)}{nearest(element.tag, scene)}"
                 raise element.error(f"{element} is not supported directly in <scene>; {use}")
             scene[element.tag].append(element)
-        for tag in ("integrator", "sensor", "emitter"):
+        for tag in ("integrator", "sensor"):
             for element in scene[tag][1:]:
                 first = f"{scene[tag][0].file}:{scene[tag][0].line}"
                 raise element.error(f"{element}: one <{tag}> is supported here; the first is at {first}")
@@ -67,9 +65,7 @@ class _Loader:
         else:
             integrator = d.Integrator()
             self.notes.append('no <integrator> is given; <integrator type="path"> is used')
-        background, background_name = None, ""
-        for element in scene["emitter"]:
-            background, background_name = self.make(element, BACKGROUNDS), element.id or self.unique("background")
+        lights = tuple(self.emitter(element, element.id or self.unique("background")) for element in scene["emitter"])
         shapes = [
             self.make(element, dict.fromkeys(SHAPES, _shape), element.id or self.numbered("shape"))
             for element in scene["shape"]
@@ -79,9 +75,7 @@ class _Loader:
             if element not in self.made:
                 self.notes.append(f"{element.file}:{element.line}: {element} is used by nothing")
                 self.shared(element, element.id or element.tag)
-        return d.Description(
-            file, camera, film, integrator, spp, sampler, shapes, background, background_name, tuple(self.notes)
-        )
+        return d.Description(file, camera, film, integrator, spp, sampler, shapes, lights, tuple(self.notes))
 
     def make(self, element: Element, table: dict, *context: object):
         """What the handler for the element's type makes of it; its parameters must all have been asked for."""
@@ -107,6 +101,11 @@ class _Loader:
         return self.made[element]
 
     bsdf = shared
+
+    def emitter(self, element: Element, name: str, inside: bool = False) -> Instance:
+        """Of those that stand inside shapes, or outside."""
+        kinds = {key: kind for key, kind in emitters.KINDS.items() if kind.on_surfaces == inside}
+        return self.make(element, kinds, name)
 
     def texture(self, fields: Fields, parameter: str, owner: str) -> Instance | None:
         """The texture that sets a parameter; None where it is something else. `owner` names one without an id."""
@@ -139,31 +138,24 @@ def _shape(loader: _Loader, fields: Fields, name: str) -> d.Shape | None:
     """None where nothing of a mesh is left, as all its triangles are degenerate: no ray meets it, nor does it emit."""
     geometry = SHAPES[fields.type].read(loader, fields)
     flip_normals = fields.boolean("flip_normals", False) != geometry.mirrored
-    radiance, emitter_name = None, ""
-    for emitter in fields.objects("emitter"):
-        if emitter not in fields.element.children:
-            raise emitter.error(f"{emitter} must stand inside its shape; it cannot be referred to")
-        radiance, emitter_name = loader.make(emitter, AREA_LIGHTS), emitter.id or name
+    emitter = None
+    for element in fields.objects("emitter"):
+        if element not in fields.element.children:
+            raise element.error(f"{element} must stand inside its shape; it cannot be referred to")
+        emitter = loader.emitter(element, element.id or name, inside=True)
     inherited = fields.element.id or None
     nested = fields.objects("bsdf")
     if nested:
         bsdf = loader.bsdf(nested[0], nested[0].id or inherited or loader.numbered("bsdf"))
     else:
         # Mitsuba: a light that is given no bsdf reflects nothing
-        grey = 0.5 if radiance is None else 0.0
+        grey = 0.5 if emitter is None else 0.0
         bsdf = bsdfs.Diffuse.instance(inherited or loader.numbered("bsdf"), reflectance=grey)
     if geometry.empty:
-        place, light = f"{fields.element.file}:{fields.element.line}", "" if radiance is None else ", and its light too"
+        place, light = f"{fields.element.file}:{fields.element.line}", "" if emitter is None else ", and its light too"
         loader.notes.append(f"{place}: {fields.element} is left out, as no triangle has an area{light}")
         return None
-    return d.Shape(name, geometry, bsdf, radiance, emitter_name, flip_normals)
-
-
-# Emitters: (loader, fields) -> (3,) radiance.
-
-
-def _emitter(loader: _Loader, fields: Fields) -> np.ndarray:
-    return fields.color("radiance", np.ones(3), radiance=True)
+    return d.Shape(name, geometry, bsdf, emitter, flip_normals)
 
 
 # Integrators: (loader, fields) -> Integrator.
@@ -205,8 +197,6 @@ def _sampler(loader: _Loader, fields: Fields) -> int:
 
 
 TOP_LEVEL = ("integrator", "sensor", "emitter", "bsdf", "texture", "shape")
-AREA_LIGHTS = {"area": _emitter}
-BACKGROUNDS = {"constant": _emitter}
 INTEGRATORS = {"path": _path, "direct": _direct}
 SENSORS = dict.fromkeys(sensors.KINDS, _sensor)
 SAMPLERS = dict.fromkeys(("independent", "stratified", "multijitter", "orthogonal", "ldsampler"), _sampler)

@@ -1,0 +1,78 @@
+"""What an emitter is: three kinds of kinds, by where their light is met."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from typing import ClassVar
+
+from pathjax.kinds import Kind, Row
+
+
+class Emitter(Kind):
+    """A kind of light: `SurfaceEmitter`, `Background` or `DiracEmitter`.
+
+    A class declares its parameters. Colours that are 0 where it is dark are declared with `radiance=True`. Directions
+    are unit and in world space; everything may be differentiated in the parameters, and what is drawn is detached by
+    the caller.
+    """
+
+    on_surfaces: ClassVar[bool] = False  # stands inside a shape
+    distant: ClassVar[bool] = False  # infinitely far
+    left_to_bsdfs: ClassVar[bool] = False  # bsdf sampling finds it with less noise: sampled by strategy "light" alone
+
+    @staticmethod
+    @abstractmethod
+    def power(p):
+        """How bright lights are, by which one of them is chosen: (R,), relative to others that are distant or not.
+
+        Of a surface its power for each area, of other lights their power, of distant ones the irradiance; each over pi.
+
+        p: the parameters of all R rows, (R, *shape).
+        """
+
+
+class SurfaceEmitter(Emitter):
+    """What stands inside a shape and shines from its front. Points on it are drawn by the shape."""
+
+    on_surfaces = True
+    even: ClassVar[bool] = False  # its parameter `radiance` is all that it emits, in all directions
+
+    @staticmethod
+    @abstractmethod
+    def emitted(p: Row, d):
+        """Radiance (3,) that leaves the front of the surface in the direction -d; d: (3,)."""
+
+
+class Background(Emitter):
+    """Radiance from all directions in which nothing is hit. Several of them add up, and are sampled as one mixture."""
+
+    distant = True
+
+    @staticmethod
+    @abstractmethod
+    def sample(p: Row, u, u_part):
+        """Draw a direction (3,) by its `density`. u: (2,) uniform in [0, 1); u_part: () another number."""
+
+    @staticmethod
+    @abstractmethod
+    def emitted(p: Row, d):
+        """Radiance (3,) that comes from the direction d (3,)."""
+
+    @staticmethod
+    @abstractmethod
+    def density(p: Row, d):
+        """() [1/sr] with which `sample` draws d."""
+
+
+class DiracEmitter(Emitter):
+    """What shines from one direction at each point: no ray hits it, and no bsdf finds it."""
+
+    @staticmethod
+    @abstractmethod
+    def sample(p: Row, ref):
+        """What arrives at the point ref (3,).
+
+        Returns:
+            direction (3,) towards the light, distance (), inf if it is distant, and irradiance (3,) of a surface that
+            faces it.
+        """

@@ -1,0 +1,109 @@
+"""The lights of a scene, and the choice among them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from pathjax.core.math import at
+from pathjax.emitters.emitter import Emitter
+from pathjax.kinds import Color, Row, Table
+from pathjax.shapes import Lamps
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Lights:
+    """All lights of one kind."""
+
+    table: Table  # a row for each emitter of the file
+    lamps: Lamps | None  # what shines, of kinds that stand inside shapes; None: each row is one light
+    row: jax.Array | None  # (R,) int32 row of the table, of each lamp
+
+    @property
+    def kind(self) -> type[Emitter]:
+        return self.table.kind
+
+    @property
+    def count(self) -> int:
+        if self.lamps is not None:
+            return self.lamps.area.shape[0]
+        return next(column.values.shape[0] for column in self.table.columns if column is not None)
+
+    def parameters(self, light) -> Row:
+        """Of the light () int32 of this kind."""
+        return Row(self.table, light if self.row is None else at(self.row, light))
+
+    def power(self):
+        """(R,) of `Emitter.power`, of surfaces times their area."""
+        power = self.kind.power(_AllRows(self.table))
+        return power if self.lamps is None else self.lamps.area * power[self.row]
+
+    def dark(self) -> bool:
+        """Whether they emit nothing; of known values, not of traced ones."""
+        colors = [key for key, d in self.kind.declared.items() if isinstance(d, Color) and d.radiance]
+        return bool(colors) and not any(np.asarray(self.table.column(key).values).any() for key in colors)
+
+
+class _AllRows:
+    """Parameters of all rows, as attributes (R, *shape)."""
+
+    def __init__(self, table: Table):
+        self._table = table
+
+    def __getattr__(self, name: str):
+        return self._table.column(name).values
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Choice:
+    """Probability of each light, numbered through the tables that are sampled; made once per render."""
+
+    pdf: jax.Array  # (R,)
+    cdf: jax.Array  # (R,) ends at 1
+    first: tuple[int | None, ...] = field(metadata={"static": True})  # by table, its first number; None: not sampled
+
+
+def choice(emitters: tuple[Lights, ...], strategy: str) -> Choice | None:
+    """Lights by power, near ones and distant ones half of the time each; None where there is nothing to choose from."""
+    first: list[int | None] = []
+    powers: dict[bool, list] = {False: [], True: []}  # by whether they are distant, as tables are ordered
+    count = 0
+    for lights in emitters:
+        sampled = strategy == "light" or not lights.kind.left_to_bsdfs
+        first.append(count if sampled else None)
+        if sampled:
+            powers[lights.kind.distant].append(lights.power())
+            count += lights.count
+    groups = [lax.stop_gradient(jnp.concatenate(group)) for group in powers.values() if group]
+    if not groups:
+        return None
+    power = groups[0]
+    if len(groups) > 1:
+        power = jnp.concatenate([_over(group, jnp.sum(group), 0) for group in groups])
+    # Lights of power 0 throughout: any choice will do, and 0 / 0 will not.
+    pdf = _over(power, jnp.sum(power), 1 / len(power))
+    return Choice(pdf, jnp.cumsum(pdf), tuple(first))
+
+
+def _over(power, total, otherwise):
+    """power / total, or `otherwise` where the total is 0."""
+    return jnp.where(total > 0, power / jnp.where(total > 0, total, 1), otherwise)
+
+
+def choose(chosen: Choice, u):
+    """Choose a light: its number () int32, the probability (), and u (2,), of which the first number is used anew."""
+    count = chosen.pdf.shape[0]
+    if count == 1:
+        return jnp.int32(0), jnp.ones_like(u[0]), u
+    number = jnp.searchsorted(chosen.cdf, u[0], side="right").astype(jnp.int32)
+    number = jnp.minimum(number, count - 1)
+    pdf = at(chosen.pdf, number)
+    below = at(chosen.cdf, number) - pdf
+    again = jnp.clip((u[0] - below) / jnp.where(pdf > 0, pdf, 1), 0, 1 - 2**-24)
+    return number, pdf, jnp.stack([again, u[1]])
