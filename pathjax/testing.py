@@ -2,6 +2,8 @@
 
     from pathjax import testing
     testing.check_bsdf(OrenNayar, sigma=0.3)
+    testing.check_texture(Stripes, color0=0.1)
+    testing.check_emitter(Sunset, radiance=3.0)
 
 A check that fails raises AssertionError, which says what was found and what should have been. Those that are
 statistical fail for a right bsdf with the probability `false_alarm` each; seeds are fixed.
@@ -10,15 +12,19 @@ statistical fail for a right bsdf with the probability `false_alarm` each; seeds
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pathjax import bsdfs
+from pathjax import bsdfs, textures
 from pathjax.bsdfs import BSDF, Materials
-from pathjax.kinds import Parameters
+from pathjax.emitters import Background, DiracEmitter, Emitter
+from pathjax.emitters.selection import AllRows
+from pathjax.kinds import Parameters, Row, Table
+from pathjax.textures import Texture, Textures
 
 # Directions that see grazing and steep light, and an azimuth that no symmetry favours.
 COSINES = (1.0, 0.7, 0.2)
@@ -28,6 +34,9 @@ CELLS, POINTS = (20, 24), 12
 LEAST_EXPECTED = 10
 # Of differences: float32 keeps five digits of them, and what they err by is of second order.
 STEP = 0.01
+
+
+# ---- bsdfs ----------------------------------------------------------------------------------------------------------
 
 
 def check_bsdf(kind: type[BSDF], samples: int = 200_000, false_alarm: float = 1e-4, reciprocal: bool = True, **values):
@@ -104,7 +113,7 @@ def check_range(materials: Materials, wi):
         for what, x in {"weight": drawn.weight, "pdf": drawn.pdf, "value": f, "density": pdf}.items():
             assert np.isfinite(x).all() and (np.asarray(x) >= 0).all(), f"a {what} of wi = {each} is {np.min(x)}"
         assert np.isfinite(drawn.wo).all(), f"a direction of wi = {each} is not finite"
-        for name, tangent in _tangents(materials).items():
+        for name, tangent in _material_tangents(materials).items():
             moved = sample_tangent(materials, tangent, each, u).weight
             assert np.isfinite(moved).all(), f"the derivative of a weight in {name} is not finite at wi = {each}"
 
@@ -124,16 +133,21 @@ def check_weights(materials: Materials, wi):
 
 
 def check_chi_square(materials: Materials, wi, samples: int, false_alarm: float, seed: int = 2):
-    """Directions are drawn with the density that `evaluate` states (chi-square over cells of the sphere)."""
-    from scipy import stats
-
+    """Directions are drawn with the density that `evaluate` states."""
     drawn = sample(materials, wi, random_numbers(materials, samples, seed))
     kept = ~np.asarray(drawn.delta) & (np.asarray(drawn.pdf) > 0)
-    wo = np.asarray(drawn.wo, np.float64)[kept]
-    azimuth = np.arctan2(wo[:, 1], wo[:, 0]) / (2 * np.pi) % 1
-    seen = np.histogram2d(wo[:, 2], azimuth, CELLS, [[-1, 1], [0, 1]])[0].ravel()
     _, pdf = _on_sphere(materials, wi)
-    expected = samples * pdf.reshape(CELLS[0], POINTS, CELLS[1], POINTS).sum((1, 3)).ravel()
+    _chi_square(np.asarray(drawn.wo)[kept], samples, pdf, false_alarm, f"wi = {wi}")
+
+
+def _chi_square(directions, samples: int, shares, false_alarm: float, where: str):
+    """Whether directions (N, 3), the others of `samples` left out, fall into cells by their shares at the midpoints."""
+    from scipy import stats
+
+    directions = np.asarray(directions, np.float64)
+    azimuth = np.arctan2(directions[:, 1], directions[:, 0]) / (2 * np.pi) % 1
+    seen = np.histogram2d(directions[:, 2], azimuth, CELLS, [[-1, 1], [0, 1]])[0].ravel()
+    expected = samples * shares.reshape(CELLS[0], POINTS, CELLS[1], POINTS).sum((1, 3)).ravel()
     # What is not drawn from the density (Dirac lobes, no sample) is a cell of its own.
     seen, expected = np.append(seen, samples - seen.sum()), np.append(expected, samples - expected.sum())
     few = expected < LEAST_EXPECTED
@@ -142,7 +156,7 @@ def check_chi_square(materials: Materials, wi, samples: int, false_alarm: float,
     used = expected > LEAST_EXPECTED
     statistic = ((seen - expected)[used] ** 2 / expected[used]).sum()
     chance = stats.chi2.sf(statistic, used.sum() - 1)
-    assert chance > false_alarm, f"samples do not follow the stated density at wi = {wi}: p = {chance:.2g}"
+    assert chance > false_alarm, f"samples do not follow the stated density at {where}: p = {chance:.2g}"
     assert seen[~used].sum() <= 5 * LEAST_EXPECTED, f"{seen[~used].sum():.0f} samples lie where the density is 0"
 
 
@@ -181,7 +195,7 @@ def check_reciprocity(materials: Materials, seed: int = 4):
 def check_detached(materials: Materials, wi):
     """Directions and densities carry no derivative in parameters: the weights do, for samples drawn at their values."""
     u = random_numbers(materials, 64, 5)
-    for name, tangent in _tangents(materials, but_moving=True).items():
+    for name, tangent in _material_tangents(materials, but_moving=True).items():
         drawn = sample_tangent(materials, tangent, wi, u)
         for what in ("wo", "pdf"):
             assert not np.asarray(getattr(drawn, what)).any(), (
@@ -192,12 +206,12 @@ def check_detached(materials: Materials, wi):
 def check_derivatives(materials: Materials, wi, samples: int, false_alarm: float, seed: int = 6):
     """The mean derivative of the weights is that of the scattered light, by differences of `evaluate`."""
     u = random_numbers(materials, samples, seed)
-    for name, tangent in _tangents(materials, but_moving=True).items():
+    for name, tangent in _material_tangents(materials, but_moving=True).items():
         moved = sample_tangent(materials, tangent, wi, u).weight
         moved = np.asarray(moved, np.float64)
 
         def at(change, tangent=tangent):
-            return _on_sphere(jax.tree.map(lambda x, t: _plus(x, change, t), materials, tangent), wi)[0].sum(0)
+            return _on_sphere(_plus(materials, change, tangent), wi)[0].sum(0)
 
         ahead, behind = at(STEP), at(-STEP)
         expected = (ahead - behind) / (2 * STEP)
@@ -208,30 +222,121 @@ def check_derivatives(materials: Materials, wi, samples: int, false_alarm: float
         )
 
 
-def _on_sphere(materials, wi):
-    """Values (N, 3) and densities (N,) times solid angle, at the midpoints of the cells' parts."""
+def _material_tangents(materials: Materials, but_moving: bool = False) -> dict[str, Materials]:
+    rest = jax.tree.map(_zero, materials)
+    return {name: replace(rest, tables=(table,)) for name, table in _tangents(materials.tables[0], but_moving).items()}
+
+
+# ---- textures -------------------------------------------------------------------------------------------------------
+
+
+def check_texture(kind: type[Texture], **values):
+    """Colours and their derivatives, in parameters and in uv, are finite; those in parameters are right; and the stated
+    span holds.
+
+    Args:
+        values: of its parameters, the others have their defaults.
+    Raises:
+        AssertionError: a check failed.
+    """
+    instance = kind.instance("it", **values)
+    made, _ = textures.build([instance], np.float32, (), Parameters())
+    made, code = jax.device_put(made), jnp.zeros(2, jnp.int32)
+    uv = jnp.asarray(np.random.default_rng(0).uniform(-3, 3, (2000, 2)), jnp.float32)
+
+    def look_up(textures, uv):
+        return jax.vmap(lambda uv: textures.look_up(code, SimpleNamespace(uv=uv)))(uv)
+
+    colors = np.asarray(jax.jit(look_up)(made, uv))
+    low, high = kind.span(instance)
+    assert np.isfinite(colors).all(), "a colour is not finite"
+    rounding = 1e-5 * max(abs(low), abs(high))
+    assert (low - rounding <= colors).all() and (colors <= high + rounding).all(), (
+        f"colours lie in [{colors.min()}, {colors.max()}], where `span` says [{low}, {high}]"
+    )
+    slopes = jax.jit(jax.vmap(jax.jacfwd(lambda uv: made.look_up(code, SimpleNamespace(uv=uv)))))(uv)
+    assert np.isfinite(slopes).all(), "a derivative in uv is not finite"
+    for name, tangent in _tangents(made.tables[0]).items():
+        tangent = Textures((tangent,))
+        moved = np.asarray(jax.jvp(lambda made: look_up(made, uv), (made,), (tangent,))[1])
+        ahead, behind = (
+            np.asarray(look_up(_plus(made, change, tangent), uv), np.float64) for change in (STEP, -STEP)
+        )
+        expected = (ahead - behind) / (2 * STEP)
+        wrong = ~np.isclose(moved, expected, rtol=1e-2, atol=1e-3)
+        assert not wrong.any(), f"the derivative in {name} is {moved[wrong][0]}, by differences {expected[wrong][0]}"
+
+
+# ---- emitters -------------------------------------------------------------------------------------------------------
+
+
+def check_emitter(kind: type[Emitter], samples: int = 200_000, false_alarm: float = 1e-4, **values):
+    """What a kind of emitter draws has the density that it states, and what it emits is finite and not negative.
+
+    Args:
+        samples: of the chi-square test of a background.
+        values: of its parameters, the others have their defaults.
+    Raises:
+        AssertionError: a check failed.
+    """
+    table = jax.device_put(kind.build([kind.instance("it", **values)], np.float32, (), Parameters(), None))
+    power = np.asarray(kind.power(AllRows(table)))
+    assert power.shape == (1,) and np.isfinite(power).all() and (power >= 0).all(), f"the power is {power}, not (1,)"
+    p, rng = Row(table, 0), np.random.default_rng(1)
+    if issubclass(kind, DiracEmitter):
+        refs = jnp.asarray(rng.normal(size=(200, 3)), jnp.float32)
+        d, distance, arriving = jax.vmap(lambda ref: kind.sample(p, ref))(refs)
+        _check_light(arriving, np.zeros(len(refs)))
+        assert (np.asarray(distance) > 0).all() and np.isfinite(distance).any() != kind.distant, (
+            "distances are positive, inf of what is `distant` and of nothing else"
+        )
+    elif issubclass(kind, Background):
+        u = jnp.asarray(rng.integers(0, 1 << 24, (samples, 3)) * 2.0**-24, jnp.float32)
+        d = jax.jit(jax.vmap(lambda u: kind.sample(p, u[:2], u[2])))(u)
+        middles, share = _midpoints()
+        _check_light(*jax.vmap(lambda d: (kind.emitted(p, d), kind.density(p, d)))(d))
+        density = np.asarray(jax.vmap(lambda d: kind.density(p, d))(middles), np.float64)
+        _chi_square(d, samples, density * share, false_alarm, f"{kind.__name__}")
+        unsampled = np.asarray(jax.vmap(lambda d: kind.emitted(p, d))(middles)).any(1) & (density == 0)
+        assert not unsampled.any(), f"light from {np.asarray(middles)[unsampled][0]} is never drawn"
+    else:
+        d = jnp.asarray(rng.normal(size=(200, 3)), jnp.float32)
+        d = d / jnp.linalg.norm(d, axis=1, keepdims=True)
+        _check_light(jax.vmap(lambda d: kind.emitted(p, d))(d), np.zeros(len(d)))
+    assert np.allclose(np.linalg.norm(d, axis=1), 1, atol=1e-5), "a direction is not of unit length"
+
+
+def _check_light(light, density):
+    for what, x in (("emitted", light), ("density", density)):
+        assert np.isfinite(x).all() and (np.asarray(x) >= 0).all(), f"`{what}` is {np.min(x)} somewhere"
+
+
+# ---- what they share ------------------------------------------------------------------------------------------------
+
+
+def _midpoints():
+    """Directions (N, 3) at the midpoints of the cells' parts, and the solid angle of each."""
     rows, columns = (cells * POINTS for cells in CELLS)
     z, phi = -1 + (np.arange(rows) + 0.5) * 2 / rows, (np.arange(columns) + 0.5) * 2 * np.pi / columns
     z, phi = (x.ravel() for x in np.meshgrid(z, phi, indexing="ij"))
     r = np.sqrt(1 - z * z)
-    wo = jnp.asarray(np.stack([r * np.cos(phi), r * np.sin(phi), z], -1), jnp.float32)
+    return jnp.asarray(np.stack([r * np.cos(phi), r * np.sin(phi), z], -1), jnp.float32), 4 * np.pi / z.size
+
+
+def _on_sphere(materials, wi):
+    """Values (N, 3) and densities (N,) times solid angle, at the midpoints."""
+    wo, share = _midpoints()
     f, pdf = evaluate(materials, wi, wo)
-    return np.asarray(f, np.float64) * (4 * np.pi / z.size), np.asarray(pdf, np.float64) * (4 * np.pi / z.size)
+    return np.asarray(f, np.float64) * share, np.asarray(pdf, np.float64) * share
 
 
-def _tangents(materials, but_moving=False) -> dict:
-    """By name, a unit change of each parameter: a pytree like the materials."""
-    zero = jax.tree.map(_zero, materials)
-    table = materials.tables[0]
-    found = {}
-    for place, (name, declared) in enumerate(table.kind.declared.items()):
-        column = table.columns[place]
-        if column is None or not declared.listed or (but_moving and declared.moves_paths):
-            continue
-        columns = list(zero.tables[0].columns)
-        columns[place] = type(column)(jnp.ones_like(column.values), _zero_or_none(column.texture))
-        table_tangent = type(table)(tuple(columns), table.kind, table.choices)
-        found[name] = Materials((table_tangent, *zero.tables[1:]), zero.sides, zero.textures)
+def _tangents(table: Table, but_moving: bool = False) -> dict[str, Table]:
+    """By name, a unit change of each parameter."""
+    zero, found = jax.tree.map(_zero, table), {}
+    for name, declared in table.kind.declared.items():
+        column = table.column(name)
+        if column is not None and declared.listed and not (but_moving and declared.moves_paths):
+            found[name] = zero.with_column(name, jnp.ones_like(column.values))
     return found
 
 
@@ -240,12 +345,8 @@ def _zero(x):
     return jnp.zeros_like(x) if real else np.zeros(x.shape, jax.dtypes.float0)
 
 
-def _zero_or_none(x):
-    return None if x is None else _zero(x)
-
-
-def _plus(x, share, tangent):
-    return x if tangent.dtype == jax.dtypes.float0 else x + share * tangent
+def _plus(tree, share, tangent):
+    return jax.tree.map(lambda x, t: x if t.dtype == jax.dtypes.float0 else x + share * t, tree, tangent)
 
 
 def _sigmas(false_alarm: float) -> float:

@@ -40,7 +40,7 @@ class Lights:
 
     def power(self):
         """(R,) of `Emitter.power`, of surfaces times their area."""
-        power = self.kind.power(_AllRows(self.table))
+        power = self.kind.power(AllRows(self.table))
         return power if self.lamps is None else self.lamps.area * power[self.row]
 
     def dark(self) -> bool:
@@ -49,7 +49,7 @@ class Lights:
         return bool(colors) and not any(np.asarray(self.table.column(key).values).any() for key in colors)
 
 
-class _AllRows:
+class AllRows:
     """Parameters of all rows, as attributes (R, *shape)."""
 
     def __init__(self, table: Table):
