@@ -112,8 +112,9 @@ def fit(
     if not isinstance(solver, optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser):
         raise InputError(f"{type(solver).__name__} is no least-squares solver or minimiser of optimistix")
     tell = _print_step if progress is True else progress or None
-    state = State(problem.build(scene, target, names, start or {}), spp, seed, solver, tell)
+    views = problem.build(scene, target, names, start or {})
     with Interrupts() as interrupts:
+        state = State(views, spp, seed, solver, tell, interrupts)
         try:
             with interrupts.raised():
                 converged, message = _stages(state, scan)

@@ -23,7 +23,7 @@ def residuals(x, arguments, vector):
 
 
 def loss(x, arguments, vector):
-    """The latter, twice: what a minimiser minimises, and what it tells."""
+    """Half the sum of squares, twice: what a minimiser minimises, and what it reports."""
     _, half_squares = residuals(x, arguments, vector)
     return half_squares, half_squares
 

@@ -9,25 +9,17 @@ import numpy as np
 from pathjax.images.picture import GAP, side_by_side, signed_colors
 from pathjax.inverse.fitting import Fit
 
+_FACTS = (
+    *("converged", "message", "values", "standard_errors", "components", "covariance", "undetermined", "at_bound"),
+    *("compile_seconds", "run_seconds", "history"),
+)
 # Residuals of this many standard deviations are shown in full colour.
 _FULL_SCALE = 3
 
 
 def facts(fit: Fit) -> dict:
     """What `json_text` writes of a fit."""
-    return {
-        "converged": fit.converged,
-        "message": fit.message,
-        "values": fit.values,
-        "standard_errors": fit.standard_errors,
-        "components": fit.components,
-        "covariance": fit.covariance,
-        "undetermined": fit.undetermined,
-        "at_bound": fit.at_bound,
-        "compile_seconds": fit.compile_seconds,
-        "run_seconds": fit.run_seconds,
-        "history": fit.history,
-    }
+    return {name: getattr(fit, name) for name in _FACTS}
 
 
 def text(fit: Fit) -> str:

@@ -15,6 +15,7 @@ from pathjax.inverse import losses, uncertainty, weights
 from pathjax.inverse.compiled_cache import Stepper, compiled, identity
 from pathjax.inverse.problem import Problem
 from pathjax.inverse.uncertainty import Evidence, Solution
+from pathjax.system.interrupts import Interrupts
 
 # Only its steps are taken; when to end, `refine` decides.
 _NEWTON = optx.Newton(rtol=1e-6, atol=1e-6)
@@ -23,9 +24,12 @@ _NEWTON = optx.Newton(rtol=1e-6, atol=1e-6)
 class State:
     """Values, and what the last renders at them or near them said."""
 
-    def __init__(self, problem: Problem, spp: int, seed: int, solver, progress: Callable | None):
+    def __init__(
+        self, problem: Problem, spp: int, seed: int, solver, progress: Callable | None, interrupts: Interrupts
+    ):
         self.problem, self.vector, self.groups = problem, problem.vector, problem.groups
-        self.spp, self.seed, self.solver, self.progress = spp, jnp.uint32(seed), solver, progress
+        self.spp, self.seed, self.solver = spp, jnp.uint32(seed), solver
+        self.progress, self.interrupts = progress, interrupts
         self.dtype = self.groups[0].targets.dtype
         self.values = problem.start.astype(float)  # (n,)
         self.scale = self.vector.scale(self.values)  # (n,) units of `solution`
@@ -98,3 +102,5 @@ class State:
         self.history.append({"stage": stage, "spp": spp, "values": values, "loss": loss, "seconds": seconds})
         if self.progress:
             self.progress(self.history[-1])
+        if self.interrupts.heard:  # its exception may have been lost, while Python collected garbage
+            raise KeyboardInterrupt

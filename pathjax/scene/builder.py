@@ -28,7 +28,7 @@ def build(description: desc.Description, dtype=jnp.float32, split_rule: str = "s
         InputError: float64 without `jax_enable_x64`; an unknown split_rule.
     """
     if split_rule not in RULES:
-        raise InputError(f"split_rule = {split_rule!r} is unknown; use one of {', '.join(RULES)}")
+        raise InputError(f"split_rule {split_rule!r} is unknown; use one of {', '.join(RULES)}")
     if jax.dtypes.canonicalize_dtype(dtype) != np.dtype(dtype):
         raise InputError('dtype = float64, which is off in JAX; call jax.config.update("jax_enable_x64", True) first')
     parameters = Parameters()

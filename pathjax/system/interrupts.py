@@ -36,7 +36,7 @@ class Interrupts:
             for number in SIGNALS:
                 if signal.getsignal(number) != signal.SIG_IGN:
                     self._earlier[number] = signal.signal(number, self._note)
-        owners = {getattr(handler, "__self__", None) for handler in self._earlier.values()}
+        owners = [getattr(handler, "__self__", None) for handler in self._earlier.values()]
         self._around = [owner for owner in owners if isinstance(owner, Interrupts)]
         self.heard = any(around.heard for around in self._around)
         return self

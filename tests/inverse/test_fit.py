@@ -1,6 +1,8 @@
 """Parameters from images: recovery, bounds, what is not determined, views, solvers, interruptions, bad input."""
 
+import contextlib
 import functools
+import signal
 
 import jax
 import jax.numpy as jnp
@@ -236,6 +238,16 @@ def test_an_interrupted_fit_returns_what_it_has(room, target):
     # It was near already.
     assert all(np.abs(fit.values[n] - pj.parameters(room)[n]).max() < 0.05 for n in NAMES)
     report.text(fit), json_text(report.facts(fit))
+
+
+def test_a_signal_whose_exception_is_lost_ends_a_fit_after_its_step(room, target):
+    def lose(entry):
+        with contextlib.suppress(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+
+    fit = pj.fit(room, target, NAMES, start=START, spp=32, progress=lose)
+    assert fit.message == "interrupted" and len(fit.history) == 1
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
 @pytest.mark.parametrize("start", [0.0, 7.0])

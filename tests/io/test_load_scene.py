@@ -29,7 +29,7 @@ def test_split_rule_reaches_the_hierarchy(root):
         for rule in ("sah", "equal")
     }
     assert cost["sah"] < cost["equal"]
-    with pytest.raises(pj.InputError, match="split_rule = 'luck' is unknown; use one of sah"):
+    with pytest.raises(pj.InputError, match="split_rule 'luck' is unknown; use one of sah"):
         pj.load_scene(root / "scenes" / "mesh.xml", split_rule="luck")
 
 
