@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+from collections.abc import Callable
 
 
 def parser() -> argparse.ArgumentParser:
@@ -21,8 +22,8 @@ def parser() -> argparse.ArgumentParser:
     render.add_argument("--time", type=_real, metavar="SECONDS", help="stop after so much rendering")
     checkpoint = "save the state there, and go on from it when called again"
     render.add_argument("--checkpoint", metavar="FILE.npz", help=checkpoint)
-    aov = "further channels of an EXR file, separated by commas"
-    render.add_argument("--aov", type=_names, default=[], metavar="{error,depth,normal,albedo,bounces}", help=aov)
+    kinds, aov = "{error,depth,normal,albedo,bounces}", "further channels of an EXR file, separated by commas"
+    render.add_argument("--aov", type=_comma_separated(str), default=[], metavar=kinds, help=aov)
     render.add_argument("--seed", type=_seed, default=0, metavar="K")
     render.add_argument("--strategy", default="mis", metavar="{mis,light,bsdf}", help="how light is sampled")
     render.add_argument("--json", action="store_true", help="print one JSON object on stdout")
@@ -47,7 +48,7 @@ def parser() -> argparse.ArgumentParser:
     bench.add_argument("scenes", nargs="+", metavar="SCENE.xml")
     bench.add_argument("-D", dest="defines", action="append", default=[], type=_pair, metavar="name=value")
     bench.add_argument("--against", choices=("mitsuba",), help="measure this peer in the same run")
-    bench.add_argument("--spp", type=_spp_list, default=[16, 64, 256], metavar="16,64,256")
+    bench.add_argument("--spp", type=_comma_separated(_positive), default=[16, 64, 256], metavar="16,64,256")
     bench.add_argument("--reference-spp", type=_positive, default=16384, metavar="N", help="of the converged reference")
     bench.add_argument("--repeat", type=_positive, default=5, metavar="N", help="timed runs of each; medians are shown")
     bench.add_argument("-o", "--output", metavar="DIR", help="also write bench.md, bench.json and plots there")
@@ -100,48 +101,32 @@ def _pair(text: str) -> tuple[str, str]:
     return name, value
 
 
-def _positive(text: str) -> int:
-    if not text.isdecimal() or not 0 < int(text) < 2**31:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a positive integer below 2^31")
+def _whole(text: str) -> int:
+    if not text.isdecimal():
+        raise ValueError
     return int(text)
 
 
-def _real(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not (value > 0 and math.isfinite(value)):
-        raise argparse.ArgumentTypeError(f"{text!r} is not a positive number")
-    return value
+def _number(read: Callable, accepts: Callable, what: str) -> Callable:
+    """A type of argparse's: `read` of the text, if `accepts` says so."""
+
+    def parse(text: str):
+        try:
+            if accepts(value := read(text)):
+                return value
+        except ValueError:
+            pass
+        raise argparse.ArgumentTypeError(f"{text!r} is not {what}")
+
+    return parse
 
 
-def _names(text: str) -> list[str]:
-    return text.split(",")
+_positive = _number(_whole, lambda n: 0 < n < 2**31, "a positive integer below 2^31")
+_seed = _number(_whole, lambda n: n < 2**31, "an integer in [0, 2^31)")
+_real = _number(float, lambda x: 0 < x < math.inf, "a positive number")
+_limit = _number(float, lambda x: x >= 0, "a number that is not negative")
+_chance = _number(float, lambda x: 0 <= x <= 1, "a number in [0, 1]")
 
 
-def _seed(text: str) -> int:
-    if not text.isdecimal() or int(text) >= 2**31:
-        raise argparse.ArgumentTypeError(f"{text!r} is not an integer in [0, 2^31)")
-    return int(text)
-
-
-def _limit(text: str) -> float:
-    return _between(text, math.inf, "a number that is not negative")
-
-
-def _chance(text: str) -> float:
-    return _between(text, 1, "a number in [0, 1]")
-
-
-def _between(text: str, most: float, what: str) -> float:
-    try:
-        if 0 <= float(text) <= most:
-            return float(text)
-    except ValueError:
-        pass
-    raise argparse.ArgumentTypeError(f"{text!r} is not {what}")
-
-
-def _spp_list(text: str) -> list[int]:
-    return [_positive(part) for part in text.split(",")]
+def _comma_separated(read: Callable) -> Callable:
+    return lambda text: [read(part) for part in text.split(",")]
