@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import pathjax as pj
-from pathjax.bench import mitsuba_peer
+from pathjax.bench import peers
 from pathjax.sensors.filters import Box
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -46,13 +46,14 @@ def mitsuba(estimate_type):
     pytest.importorskip("mitsuba")
 
     def render(path, variant="llvm_ad_rgb"):
-        run = {"sampler": "independent", "spp": SPP, "seeds": list(range(SEEDS)), "statistics": True}
+        run = {"sampler": "independent", "spp": SPP, "seeds": list(range(SEEDS))}
         request = {"scene": str(path), "parameters": {"res": 32}, "variant": variant, "runs": [run]}
         try:
-            _, arrays = mitsuba_peer.call(request, timeout=300)
-        except mitsuba_peer.PeerMissing as error:
+            _, arrays = peers.call("mitsuba3", request, timeout=300)
+        except peers.PeerMissing as error:
             pytest.skip(str(error))
-        return estimate_type(arrays["mean_0"], arrays["variance_of_mean_0"], SEEDS)
+        images = arrays["images_0"].astype(float)
+        return estimate_type(images.mean(0), images.var(0, ddof=1) / SEEDS, SEEDS)
 
     return render
 

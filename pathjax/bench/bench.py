@@ -11,7 +11,7 @@ from pathlib import Path
 import jax
 
 import pathjax
-from pathjax.bench import mitsuba_peer, plot
+from pathjax.bench import peers, plot
 from pathjax.bench.measure import Plan, measure
 from pathjax.bench.report import markdown
 from pathjax.errors import InputError
@@ -85,10 +85,10 @@ def _find_mitsuba(scene: str, defines: dict) -> None:
     """Refuse before all measurements if Mitsuba is missing."""
     run = {"sampler": "independent", "spp": 1, "seeds": [1]}
     try:
-        mitsuba_peer.call({"scene": scene, "parameters": defines, "runs": [run]})
-    except mitsuba_peer.PeerMissing as error:
+        peers.call("mitsuba3", {"scene": scene, "parameters": defines, "runs": [run]})
+    except peers.PeerMissing as error:
         raise InputError(f"--against mitsuba: {error}") from None
-    except (mitsuba_peer.RequestError, mitsuba_peer.PeerFailed):
+    except (peers.RequestError, peers.PeerFailed):
         pass  # of this scene; the report tells
 
 

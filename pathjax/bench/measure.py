@@ -14,8 +14,9 @@ import jax
 import numpy as np
 
 import pathjax
-from pathjax.bench import alone, figures, mitsuba_peer, rays
+from pathjax.bench import figures, peers, rays
 from pathjax.bench.figures import Reference
+from pathjax.bench.peers.mitsuba3 import SAMPLERS
 from pathjax.integrators.path import STRATEGIES
 from pathjax.scene.scene import Scene
 from pathjax.sensors import film
@@ -66,7 +67,7 @@ def measure(file: str, defines: dict[str, str], plan: Plan) -> dict:
     before = _timed(scene, kinds, range(plan.repeat // 2))
     peers = []
     if plan.against == "mitsuba":
-        for sampler in mitsuba_peer.SAMPLERS:
+        for sampler in SAMPLERS:
             say(f"{file}: Mitsuba, {sampler}")
             peers += _mitsuba(subject, sampler, plan, failures)
     after = _timed(scene, kinds, range(plan.repeat // 2, plan.repeat))
@@ -155,8 +156,8 @@ def _mitsuba(subject: Subject, sampler: str, plan: Plan, failures) -> list[dict]
     seeds = list(range(1, plan.repeat + 1))
     runs = [{"sampler": sampler, "spp": spp, "seeds": seeds} for spp in plan.spps]
     try:
-        report, arrays = mitsuba_peer.call({"scene": subject.file, "parameters": subject.defines, "runs": runs})
-    except (mitsuba_peer.PeerMissing, mitsuba_peer.RequestError, mitsuba_peer.PeerFailed) as error:
+        report, arrays = peers.call("mitsuba3", {"scene": subject.file, "parameters": subject.defines, "runs": runs})
+    except (peers.PeerMissing, peers.RequestError, peers.PeerFailed) as error:
         failures.append(f"Mitsuba, {sampler}: {error}")
         return []
     rows = []
@@ -214,8 +215,9 @@ def _precision(subject: Subject, plan: Plan, failures) -> tuple[dict | None, int
     done = {}
     for dtype in ("float32", "float64"):
         try:
-            done[dtype] = alone.call({**request, "dtype": dtype})
-        except alone.Failed as error:
+            report, arrays = peers.call("pathjax_alone", {**request, "dtype": dtype})
+            done[dtype] = report, arrays["images"]
+        except peers.PeerFailed as error:
             failures.append(f"{dtype}: {error}")
     memory = done["float32"][0]["peak_memory_bytes"] if "float32" in done else None
     if len(done) < 2:

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import os
 import statistics
+import tempfile
 import time
 from dataclasses import replace
 
 import jax
 import numpy as np
 
-from pathjax.bench import embree_peer
+from pathjax.bench import peers
 from pathjax.core.warp import square_to_sphere
 from pathjax.rendering.query import _closest_hit
 
@@ -60,7 +62,11 @@ def _rate(geometry, o, d, repeat: int) -> float:
 
 
 def _embree(vertices, faces, o, d, repeat: int) -> float | None:
-    try:
-        return embree_peer.call(vertices, faces, o, d, repeat)[0]["mrays_per_second"]
-    except RuntimeError:  # missing, or failed
-        return None
+    with tempfile.TemporaryDirectory() as folder:
+        file = os.path.join(folder, "rays.npz")
+        np.savez(file, vertices=vertices, faces=faces, origins=o, directions=d)
+        try:
+            report, _ = peers.call("embree", {"rays": file, "runs": repeat})
+        except (peers.PeerMissing, peers.PeerFailed):
+            return None
+    return report["mrays_per_second"]

@@ -11,7 +11,8 @@ import pytest
 from PIL import Image
 
 import pathjax
-from pathjax.bench import alone, bench, mitsuba_peer
+from pathjax.bench import bench, peers
+from pathjax.bench.peers import mitsuba3
 from pathjax.cli import main
 from pathjax.images import rel_mse
 
@@ -109,13 +110,14 @@ def test_plot(folder, scene):
 
 def test_float64_has_a_process_of_its_own():
     request = {"scene": FURNACE, "parameters": {"res": "4"}, "spp": 2, "seeds": [0, 1]}
-    report, images = alone.call({**request, "dtype": "float64"})
+    report, arrays = peers.call("pathjax_alone", {**request, "dtype": "float64"})
+    images = arrays["images"]
     assert images.shape == (2, 4, 4, 3) and images.dtype == np.float64
     assert len(report["seconds"]) == 2
     assert not np.array_equal(images, images.astype(np.float32))
     assert pathjax.render(pathjax.load_scene(FURNACE, res=4), 1).dtype == np.float32
-    with pytest.raises(alone.Failed, match="nowhere.xml"):
-        alone.call({**request, "scene": "nowhere.xml", "dtype": "float32"})
+    with pytest.raises(peers.PeerFailed, match="nowhere.xml"):
+        peers.call("pathjax_alone", {**request, "scene": "nowhere.xml", "dtype": "float32"})
 
 
 def test_several_scenes_without_matplotlib(tmp_path, capsys, monkeypatch):
@@ -225,10 +227,10 @@ def test_a_folder_without_parent_is_refused(tmp_path, capsys):
 
 
 def test_a_missing_peer_is_told_before_anything_is_measured(capsys, monkeypatch):
-    def call(request):
-        raise mitsuba_peer.PeerMissing("pip install mitsuba")
+    def call(peer, request):
+        raise peers.PeerMissing("pip install mitsuba")
 
-    monkeypatch.setattr(mitsuba_peer, "call", call)
+    monkeypatch.setattr(peers, "call", call)
     run(FURNACE, *SMALL, "--against", "mitsuba", status=2)
     told = capsys.readouterr().err.splitlines()
     assert told == ["pathjax: --against mitsuba: pip install mitsuba"]
@@ -238,26 +240,26 @@ def test_the_best_sampler_is_named_and_one_that_fails_is_told(tmp_path, capsys, 
     """A peer that renders as pathjax does, with one sampler in no time and another not at all."""
     scene = pathjax.load_scene(FURNACE, res=8)
 
-    def call(request):
+    def call(peer, request):
         runs, images = [], {}
         for k, wanted in enumerate(request["runs"]):
             if wanted["sampler"] == "stratified":
-                raise mitsuba_peer.PeerFailed("no strata")
+                raise peers.PeerFailed("no strata")
             images[f"images_{k}"] = np.stack([pathjax.render(scene, wanted["spp"], 50 + s) for s in wanted["seeds"]])
             second = 1e-6 if wanted["sampler"] == "multijitter" else 1.0
             runs.append({"spp": wanted["spp"], "seconds": [second] * len(wanted["seeds"])})
         return {"program": "Mitsuba 0", "runs": runs}, images
 
-    monkeypatch.setattr(mitsuba_peer, "call", call)
+    monkeypatch.setattr(peers, "call", call)
     run(FURNACE, *SMALL, "--quick", "--against", "mitsuba", "-o", str(tmp_path / "report"), status=1)
     told = capsys.readouterr()
     assert "Mitsuba, stratified: no strata" in told.err and "Mitsuba, stratified: no strata" in told.out
     (facts,) = json.loads((tmp_path / "report" / "bench.json").read_text())["scenes"]
     for row in facts["pathjax"]:
-        peers = [peer for peer in facts["mitsuba"] if peer["asked_spp"] == row["spp"]]
-        assert len(peers) == 4
+        rows = [peer for peer in facts["mitsuba"] if peer["asked_spp"] == row["spp"]]
+        assert len(rows) == 4
         assert row["best_peer"] == "multijitter" and row["best_peer_spp"] == row["spp"]
-        best = next(peer for peer in peers if peer["sampler"] == "multijitter")
+        best = next(peer for peer in rows if peer["sampler"] == "multijitter")
         assert row["efficiency_over_best_peer"] == pytest.approx(row["efficiency"] / best["efficiency"])
     assert facts["slopes"]["mitsuba"].keys() == {"independent", "multijitter", "orthogonal", "ldsampler"}
     assert " x multijitter |" in told.out
@@ -269,7 +271,7 @@ def test_mitsubas_independent_sampler_has_the_error_of_independent_numbers(capsy
     small = ["-D", "res=16", "--spp", "16", "--reference-spp", "4096", "--repeat", "8", "--json"]
     run(CORNELL, *small, "--against", "mitsuba")
     (scene,) = json.loads(capsys.readouterr().out)["scenes"]
-    assert {row["sampler"] for row in scene["mitsuba"]} == set(mitsuba_peer.SAMPLERS)
+    assert {row["sampler"] for row in scene["mitsuba"]} == set(mitsuba3.SAMPLERS)
     row = next(row for row in scene["mitsuba"] if row["sampler"] == "independent")
     assert abs(row["bias"]["rel_mse"]) < 4 * row["bias"]["standard_error"]
     assert row["rel_mse"] == pytest.approx(scene["sampler"]["rows"][0]["independent_rel_mse"], rel=0.2)

@@ -1,38 +1,30 @@
-"""Render a scene in Mitsuba 3, the peer, in a process of its own: times and images, or means and variances.
+"""Render a scene in Mitsuba 3: times and images.
 
-    python mitsuba_peer.py REQUEST.json
-
-needs NumPy and `pip install mitsuba` (3.7 or newer), and never imports jax: two thread pools in one process would
-measure each other. From Python, `call(request)` starts that process and reads what it wrote. A request, with defaults:
+Needs NumPy and `pip install mitsuba` (3.7 or newer), and never imports jax: two thread pools in one process would
+measure each other. A request, with defaults:
 
     {
       "scene": "scenes/cornell_box.xml",
       "parameters": {},                     # the file's $parameters, {"res": 128}
       "variant": "llvm_ad_rgb",             # or "scalar_rgb", which needs no LLVM
       "threads": null,                      # null: one per core
-      "runs": [{"sampler": "independent", "spp": 64, "seeds": [1, 2, 3], "statistics": false}],
-      "reference": null,                    # or a run; it is taken with statistics
+      "runs": [{"sampler": "independent", "spp": 64, "seeds": [1, 2, 3]}],
       "output": "peer.npz"
     }
 
-OUTPUT.npz then holds, for run k, `images_k` (seeds, H, W, 3) float32, or with statistics `mean_k` and
-`variance_of_mean_k`, (H, W, 3) float64 over the seeds (2 at least); `reference` and `reference_variance_of_mean`; and
-`report`, the JSON text that also goes to stdout:
+OUTPUT.npz then holds, for run k, `images_k` (seeds, H, W, 3) float32. The report is
 
     {
       "program": "Mitsuba 3.9.1", "variant": "llvm_ad_rgb", "threads": 2, "width": 256, "height": 256,
       "load_seconds": 0.1,
-      "runs": [{"sampler": "independent", "requested_spp": 64, "spp": 64, "seeds": [1, 2, 3], "statistics": false,
+      "runs": [{"sampler": "independent", "requested_spp": 64, "spp": 64, "seeds": [1, 2, 3],
                 "warm_up_seconds": 3.1, "seconds": [2.6, 2.6, 2.7], "median_seconds": 2.6, "mpaths_per_second": 1.6,
-                "nonfinite": 0}],
-      "reference": null                     # or one such entry
+                "nonfinite": 0}]
     }
 
 `spp` is what the sampler really took: all but independent may round up (stratified to a square, say). The warm-up
 compiles (Dr.Jit keeps kernels on disk, so a second process warms up faster) and renders once; it is no part of
-`seconds`, each of which runs from the call to the image in NumPy. A statistic over seeds supposes `independent`.
-
-Exit status: 0 done, 1 the render failed, 2 the request is wrong, 3 Mitsuba or a suitable LLVM is missing.
+`seconds`, each of which runs from the call to the image in NumPy.
 """
 
 from __future__ import annotations
@@ -43,7 +35,6 @@ import re
 import statistics
 import subprocess
 import sys
-import tempfile
 import time
 from pathlib import Path
 
@@ -62,38 +53,6 @@ class RequestError(ValueError):
     """The request asks for something that does not exist."""
 
 
-class PeerFailed(RuntimeError):
-    """The peer's process ended without an answer."""
-
-
-# ---- for the program that asks ---------------------------------------------------------------------------------------
-def call(request: dict, timeout: float | None = None) -> tuple[dict, dict[str, np.ndarray]]:
-    """Run a request in a process of its own.
-
-    Args:
-        request: as at the top of this file; without "output" its images go through a temporary file.
-        timeout: seconds, after which the process is ended.
-    Returns:
-        (report, arrays): the report at the top of this file, and the arrays of the npz by name.
-    Raises:
-        PeerMissing, RequestError, PeerFailed; subprocess.TimeoutExpired.
-    """
-    with tempfile.TemporaryDirectory() as folder:
-        request = {"output": str(Path(folder, "peer.npz")), **request}
-        file = Path(folder, "request.json")
-        file.write_text(json.dumps(request))
-        # -P: the modules beside this file must not shadow the standard library's
-        command = [sys.executable, "-P", str(Path(__file__).resolve()), str(file)]
-        done = subprocess.run(command, capture_output=True, text=True, errors="replace", timeout=timeout)
-        if done.returncode:
-            message = done.stderr.strip().splitlines()[-1:] or [f"it ended with status {done.returncode}"]
-            raise {2: RequestError, 3: PeerMissing}.get(done.returncode, PeerFailed)(message[0])
-        with np.load(request["output"]) as arrays:
-            arrays = {name: arrays[name] for name in arrays.files}
-    return json.loads(str(arrays.pop("report"))), arrays
-
-
-# ---- in the peer's process -------------------------------------------------------------------------------------------
 def llvm_version(library: str) -> int:
     """Major version that the path of an LLVM library tells, 0 if none: libLLVM.so.19.1, libLLVM-17.so, llvm-18/..."""
     name = os.path.basename(library)
@@ -174,73 +133,53 @@ def load(mi, file: str, parameters: dict, sampler: str, spp: int):
     return scene[0] if isinstance(scene, list) else scene
 
 
-def render_run(mi, scene, run: dict) -> tuple[dict, dict[str, np.ndarray]]:
-    """Warm up, then render once for each seed.
-
-    Returns:
-        (entry of the report, {"images": ...} or {"mean": ..., "variance_of_mean": ...}).
-    """
+def render_run(mi, scene, run: dict) -> tuple[dict, np.ndarray]:
+    """Warm up, then render once for each seed: an entry of the report, and the images."""
 
     def timed(seed):
         start = time.perf_counter()
         image = np.array(mi.render(scene, seed=seed), dtype=np.float32)
         return image, time.perf_counter() - start
 
-    seeds, wants_statistics = run["seeds"], run.get("statistics", False)
     _, warm_up = timed(WARM_UP_SEED)
-    seconds, images, nonfinite = [], [], 0
-    mean = squares = 0.0
-    for count, seed in enumerate(seeds, 1):
-        image, elapsed = timed(seed)
-        seconds.append(elapsed)
-        nonfinite += int(np.sum(~np.isfinite(image)))
-        if wants_statistics:  # Welford's, so that memory does not grow with the seeds
-            delta = image.astype(np.float64) - mean
-            mean = mean + delta / count
-            squares = squares + delta * (image - mean)
-        else:
-            images.append(image)
-    height, width = image.shape[:2]
+    images, seconds = zip(*map(timed, run["seeds"]), strict=True)
+    images = np.stack(images)
+    _, height, width, _ = images.shape
     spp = scene.sensors()[0].sampler().sample_count()
     entry = {
         "sampler": run["sampler"],
         "requested_spp": run["spp"],
         "spp": spp,
-        "seeds": list(seeds),
-        "statistics": wants_statistics,
+        "seeds": run["seeds"],
         "warm_up_seconds": warm_up,
         "seconds": seconds,
         "median_seconds": statistics.median(seconds),
         "mpaths_per_second": width * height * spp / statistics.median(seconds) / 1e6,
-        "nonfinite": nonfinite,
+        "nonfinite": int((~np.isfinite(images)).sum()),
     }
-    if wants_statistics:
-        return entry, {"mean": mean, "variance_of_mean": squares / (len(seeds) - 1) / len(seeds)}
-    return entry, {"images": np.stack(images)}
+    return entry, images
 
 
 def check(request: dict) -> None:
     """Refuse a request that lacks something, before anything is started."""
     if not isinstance(request, dict):
         raise RequestError("the request is no JSON object")
-    if unknown := set(request) - {"scene", "parameters", "variant", "threads", "runs", "reference", "output"}:
+    if unknown := set(request) - {"scene", "parameters", "variant", "threads", "runs", "output"}:
         raise RequestError(f"the request has unknown keys: {', '.join(sorted(unknown))}")
     for key in ("scene", "output"):
         if not isinstance(request.get(key), str):
             raise RequestError(f"the request lacks {key!r}, a path")
-    runs = [*request.get("runs", []), *([request["reference"]] if request.get("reference") else [])]
-    if not runs:
-        raise RequestError("the request names no run and no reference")
-    for run in runs:
-        if unknown := set(run) - {"sampler", "spp", "seeds", "statistics"}:
+    if not request.get("runs"):
+        raise RequestError("the request names no run")
+    for run in request["runs"]:
+        if unknown := set(run) - {"sampler", "spp", "seeds"}:
             raise RequestError(f"a run has unknown keys: {', '.join(sorted(unknown))}")
         if run.get("sampler") not in SAMPLERS:
             raise RequestError(f"sampler {run.get('sampler')!r} is unknown; use one of {', '.join(SAMPLERS)}")
         if not isinstance(run.get("spp"), int) or run["spp"] < 1:
             raise RequestError("a run needs spp, a whole number of at least 1")
-        fewest = 2 if run.get("statistics") or run is request.get("reference") else 1
-        if len(run.get("seeds", ())) < fewest:
-            raise RequestError(f"a run needs a list of seeds, {fewest} at least here")
+        if not run.get("seeds"):
+            raise RequestError("a run needs a list of seeds")
 
 
 def render(request: dict) -> tuple[dict, dict[str, np.ndarray]]:
@@ -250,32 +189,22 @@ def render(request: dict) -> tuple[dict, dict[str, np.ndarray]]:
     mi = import_mitsuba(variant, request.get("threads"))
     import drjit
 
-    report = {"program": f"Mitsuba {mi.__version__}", "variant": variant, "threads": drjit.thread_count()}
+    report = {"program": f"Mitsuba {mi.__version__}", "variant": variant, "threads": drjit.thread_count(), "runs": []}
     arrays: dict[str, np.ndarray] = {}
-
-    def one(run):
+    for k, run in enumerate(request["runs"]):
         start = time.perf_counter()
         scene = load(mi, request["scene"], request.get("parameters") or {}, run["sampler"], run["spp"])
         report.setdefault("load_seconds", time.perf_counter() - start)
         width, height = scene.sensors()[0].film().crop_size()
         report.update(width=int(width), height=int(height))
-        return render_run(mi, scene, run)
-
-    report["runs"] = []
-    for k, run in enumerate(request.get("runs", [])):
-        entry, images = one(run)
+        entry, arrays[f"images_{k}"] = render_run(mi, scene, run)
         report["runs"].append(entry)
-        arrays |= {f"{name}_{k}": value for name, value in images.items()}
-    report["reference"] = None
-    if request.get("reference"):
-        report["reference"], images = one({**request["reference"], "statistics": True})
-        arrays |= {"reference": images["mean"], "reference_variance_of_mean": images["variance_of_mean"]}
     return report, arrays
 
 
 def main(arguments: list[str]) -> int:
     if len(arguments) != 1:
-        print("usage: python mitsuba_peer.py REQUEST.json", file=sys.stderr)
+        print("usage: python mitsuba3.py REQUEST.json", file=sys.stderr)
         return 2
     try:
         try:
@@ -285,16 +214,16 @@ def main(arguments: list[str]) -> int:
         report, arrays = render(request)
         beside = request["output"] + ".part"
         with open(beside, "wb") as file:
-            np.savez(file, report=json.dumps(report), **arrays)
+            np.savez(file, **arrays)
         os.replace(beside, request["output"])
     except RequestError as error:
-        print(f"mitsuba_peer: {error}", file=sys.stderr)
+        print(error, file=sys.stderr)
         return 2
     except PeerMissing as error:
-        print(f"mitsuba_peer: {error}", file=sys.stderr)
+        print(error, file=sys.stderr)
         return 3
     except (RuntimeError, OSError) as error:
-        print("mitsuba_peer:", " ".join(str(error).split()), file=sys.stderr)
+        print(" ".join(str(error).split()), file=sys.stderr)
         return 1
     print(json.dumps(report))
     return 0

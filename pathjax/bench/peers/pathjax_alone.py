@@ -1,47 +1,22 @@
-"""Renders in a process of their own: peak memory that means something, and float64, which JAX has for a process.
+"""pathjax by itself: peak memory that means something, and float64, which JAX has for a whole process.
 
-    python alone.py REQUEST.json
-
-with REQUEST.json {"scene": FILE, "parameters": {}, "dtype": "float32", "spp": 16, "seeds": [0], "output": FILE.npz}.
-The npz then holds `images` (seeds, H, W, 3), and stdout gets
+A request is {"scene": FILE, "parameters": {}, "dtype": "float32", "spp": 16, "seeds": [0], "output": FILE.npz}. The npz
+then holds `images` (seeds, H, W, 3), and the report is
 
     {"seconds": [0.1, ...], "peak_memory_bytes": 200000000}
 
 the seconds without compilation; the memory resident at most, above that after `import jax`, compilation included, null
-where the system does not tell (all but Linux). Exit status: 0 done, 1 failed.
+where the system does not tell (all but Linux).
 """
 
 from __future__ import annotations
 
 import json
-import os
-import subprocess
 import sys
-import tempfile
 import time
 from pathlib import Path
 
 import numpy as np
-
-
-class Failed(RuntimeError):
-    """The process ended without an answer."""
-
-
-def call(request: dict) -> tuple[dict, np.ndarray]:
-    """Run a request, which needs no output: (what stdout got, images)."""
-    with tempfile.TemporaryDirectory() as folder:
-        output, file = Path(folder, "images.npz"), Path(folder, "request.json")
-        file.write_text(json.dumps({**request, "output": str(output)}))
-        # The child shall find this pathjax, wherever it was started, and no module beside this file.
-        places = [str(Path(__file__).resolve().parents[2]), os.environ.get("PYTHONPATH")]
-        environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, places))}
-        command = [sys.executable, "-P", str(Path(__file__).resolve()), str(file)]
-        done = subprocess.run(command, capture_output=True, text=True, errors="replace", env=environment)
-        if done.returncode:
-            raise Failed((done.stderr.strip().splitlines() or [f"it ended with status {done.returncode}"])[-1])
-        with np.load(output) as arrays:
-            return json.loads(done.stdout), arrays["images"]
 
 
 def resident(name: str) -> int | None:

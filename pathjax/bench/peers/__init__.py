@@ -1,0 +1,59 @@
+"""Programs that are measured in processes of their own.
+
+Each module but this one is a script, `python PEER.py REQUEST.json`. A request is a JSON object; its "output" names the
+.npz file for arrays, and stdout gets a report, a JSON object. Exit status: 0 done, 1 it failed, 2 the request is wrong,
+3 what is to be measured is missing; the last line on stderr then says why.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+
+class PeerMissing(RuntimeError):
+    """What is to be measured is not installed; the message says what to do."""
+
+
+class RequestError(ValueError):
+    """The request asks for something that does not exist."""
+
+
+class PeerFailed(RuntimeError):
+    """The process ended without an answer."""
+
+
+def call(peer: str, request: dict, timeout: float | None = None) -> tuple[dict, dict[str, np.ndarray]]:
+    """Run a script of this folder.
+
+    Args:
+        peer: its name.
+        request: as at the top of the script; without "output" the arrays go through a temporary file.
+        timeout: seconds, after which the process is ended.
+    Returns:
+        The report, and the arrays by name.
+    Raises:
+        PeerMissing, RequestError, PeerFailed; subprocess.TimeoutExpired.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        request = {"output": str(Path(folder, "output.npz")), **request}
+        file = Path(folder, "request.json")
+        file.write_text(json.dumps(request))
+        # The process shall find this pathjax, wherever it was started, and by -P no module beside the script.
+        places = [str(Path(__file__).resolve().parents[3]), os.environ.get("PYTHONPATH")]
+        environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, places))}
+        command = [sys.executable, "-P", str(Path(__file__).with_name(f"{peer}.py").resolve()), str(file)]
+        done = subprocess.run(
+            command, capture_output=True, text=True, errors="replace", timeout=timeout, env=environment
+        )
+        if done.returncode:
+            message = done.stderr.strip().splitlines()[-1:] or [f"it ended with status {done.returncode}"]
+            raise {2: RequestError, 3: PeerMissing}.get(done.returncode, PeerFailed)(message[0])
+        with np.load(request["output"]) as arrays:
+            return json.loads(done.stdout), dict(arrays)
