@@ -1,0 +1,117 @@
+"""`pathjax fit`: its table, its files, and what it refuses."""
+
+import io
+import json
+import sys
+
+import numpy as np
+import pytest
+
+import pathjax as pj
+from pathjax import inverse
+from pathjax.images import write_exr, write_png
+
+FURNACE = "scenes/furnace.xml"
+SMALL = ("-D", "res=8")
+# A byte that no UTF-8 holds, as Python has it in arguments and names of files.
+BYTE = "\udcff"
+
+
+def write_target(path, **changes):
+    """The furnace's image, of another albedo than its file's."""
+    scene = pj.with_parameters(pj.load_scene(FURNACE, res=8), {"wall.reflectance": [0.3, 0.5, 0.7], **changes})
+    image = np.asarray(pj.render(scene, 256, seed=1))
+    if path.suffix == ".exr":
+        write_exr(path, {c: image[..., i] for i, c in enumerate("RGB")}, {})
+    else:
+        write_png(path, image)
+    return path
+
+
+@pytest.fixture
+def target(tmp_path):
+    return write_target(tmp_path / "target.exr")
+
+
+@pytest.mark.parametrize("kind", ["exr", "png"])
+def test_fit_prints_a_table_and_writes_its_files(run, tmp_path, kind):
+    target = write_target(tmp_path / f"target.{kind}", **{"glow.radiance": [0.2, 0.2, 0.2]})
+    start = "--set", "glow.radiance=0.2", "--param", "wall.reflectance=0.6"
+    status, out, err = run("fit", FURNACE, target, *SMALL, *start, "-o", tmp_path / "f")
+    assert status == 0
+    assert all(f"wall.reflectance.{c}" in out and "+-" in out for c in "rgb")
+    facts = json.loads((tmp_path / "f.json").read_text())
+    assert facts["converged"] and facts["values"].keys() == {"wall.reflectance"}
+    z = (np.array(facts["values"]["wall.reflectance"]) - [0.3, 0.5, 0.7]) / facts["standard_errors"]["wall.reflectance"]
+    assert np.abs(z).max() < 4.5
+    assert (tmp_path / "f.png").stat().st_size > 0
+
+
+def test_a_fit_keeps_its_values_whatever_happens_to_its_files(run, root, target, tmp_path, monkeypatch):
+    """The names hold what markup, terminals and UTF-8 do not take; the folder is gone when the fit ends."""
+    scene, there = tmp_path / f"{BYTE}.xml", tmp_path / "there"
+    scene.write_text((root / FURNACE).read_text().replace('"wall"', '"weiß[/b]"'), encoding="utf-8")
+    there.mkdir()
+    monkeypatch.chdir(tmp_path)
+
+    def fit(*arguments, plain=inverse.fit, **keywords):
+        found = plain(*arguments, **keywords)
+        there.rmdir()
+        return found
+
+    monkeypatch.setattr(inverse, "fit", fit)
+    shown = io.BytesIO()
+    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(shown, "ascii"))
+    param = ("--param", "weiß[/b].reflectance=0.6")
+    status, _, err = run("fit", scene, target, *SMALL, *param, "-o", there / f"f{BYTE}")
+    assert status == 1
+    assert rb"wei\xdf[/b].reflectance.r" in shown.getvalue()
+    for name in (f"f{BYTE}.json", f"f{BYTE}.png"):
+        assert rf"{tmp_path}/{name}".replace(BYTE, r"\udcff") + " was written instead" in err
+    facts = json.loads((tmp_path / f"f{BYTE}.json").read_text())
+    assert facts["converged"] and facts["values"].keys() == {"weiß[/b].reflectance"}
+
+
+def test_a_command_does_not_overwrite_what_it_reads(refused, target, tmp_path):
+    picture = tmp_path / "target.png"
+    write_png(picture, np.full((8, 8, 3), 0.5))
+    says = [f"{picture}: is read by the same command"]
+    refused("fit", FURNACE, picture, *SMALL, "--param", "wall.reflectance", "-o", tmp_path / "target", says=says)
+    refused("compare", picture, target, "-o", picture, says=says)
+    both = tmp_path / "a.exr"
+    refused("render", FURNACE, *SMALL, "-o", both, "--checkpoint", both, says=[f"{both}: is read by the same command"])
+
+
+def test_fit_as_json(run, target, tmp_path):
+    status, out, _ = run(
+        "fit", FURNACE, target, *SMALL, "--param", "wall.reflectance", "--spp", "16", "-o", tmp_path / "f", "--json"
+    )
+    assert status == 0
+    assert json.loads(out) == json.loads((tmp_path / "f.json").read_text())
+
+
+@pytest.mark.parametrize(
+    "arguments, says",
+    [
+        (["--param", "wal.reflectance"], ["wal.reflectance", "did you mean wall.reflectance"]),
+        (["--param", "wall.reflectance=2"], ["wall.reflectance", "outside its bounds"]),
+        (["--param", "wall.reflectance=red"], ["--param", "a value is a number"]),
+        (["--param", "wall.reflectance", "-D", "res=9"], ["(8, 8, 3)", "(9, 9, 3)"]),
+        ([], ["--param"]),
+    ],
+)
+def test_fits_that_cannot_be(refused, target, tmp_path, arguments, says):
+    refused("fit", FURNACE, target, *SMALL, *arguments, "-o", tmp_path / "f", says=says)
+
+
+def test_a_png_that_is_clipped_everywhere_is_refused(refused, tmp_path):
+    target = write_target(tmp_path / "target.png")
+    param = "--param", "wall.reflectance"
+    refused("fit", FURNACE, target, *SMALL, *param, "-o", tmp_path / "f", says=["every pixel", "clipped"])
+
+
+def test_fit_without_a_target_or_a_folder(refused, target, tmp_path):
+    param = ["--param", "wall.reflectance"]
+    absent = tmp_path / "none.exr"
+    refused("fit", FURNACE, absent, *SMALL, *param, "-o", tmp_path / "f", says=["none.exr", "no such file"])
+    refused("fit", FURNACE, target, *SMALL, *param, "-o", tmp_path / "none" / "f", says=["there is no folder"])

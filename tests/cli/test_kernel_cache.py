@@ -1,0 +1,114 @@
+"""Compiled kernels on disk: the command line keeps them, and works where it cannot."""
+
+import subprocess
+import sys
+
+import pytest
+
+from pathjax.images import read_exr
+
+FURNACE = "scenes/furnace.xml"
+SMALL = ("-D", "res=8")
+PIPES = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+# A byte that no UTF-8 holds, as Python has it in arguments and names of files.
+BYTE = "\udcff"
+
+
+# The same command line; then says how many programs were wanted of the cache, and how many it held.
+COUNTED = """
+import sys
+from pathjax import cli
+import jax
+
+events = []
+jax.monitoring.register_event_listener(lambda event, **_: events.append(event.rpartition("/")[2]))
+status = cli.main(sys.argv[1:])
+print(events.count("compile_requests_use_cache"), events.count("cache_hits"))
+sys.exit(status)
+"""
+
+
+@pytest.fixture
+def counted(root, environment, tmp_path):
+    """(**environment) -> a process that renders the furnace to a file of its own, and that file."""
+    numbers = iter(range(100))
+
+    def start(**variables):
+        output = tmp_path / f"{next(numbers)}.exr"
+        arguments = ("render", FURNACE, *SMALL, "-o", output, "--spp", 4)
+        command = [sys.executable, "-c", COUNTED, *map(str, arguments)]
+        plain = {name: value for name, value in environment.items() if not name.startswith(("JAX_", "PATHJAX_"))}
+        variables = {name: str(value) for name, value in variables.items()}
+        return subprocess.Popen(command, cwd=root, env=plain | variables, **PIPES), output
+
+    return start
+
+
+def end(started):
+    """Programs wanted of the cache, those found, and the image's bytes; nothing may be said on stderr."""
+    process, output = started
+    out, err = process.communicate(timeout=120)
+    assert process.returncode == 0, err
+    assert err.strip() == ""
+    return *map(int, out.split()), read_exr(output)[0]["R"].tobytes()
+
+
+def entries(folder):
+    return sorted(path.name for path in folder.rglob("*-cache"))
+
+
+linux = pytest.mark.skipif(sys.platform != "linux", reason="kernels are kept on Linux only")
+
+
+@linux
+def test_the_second_run_compiles_nothing_and_gives_the_same_image(counted, tmp_path):
+    cache = tmp_path / "cache"
+    both = [counted(XDG_CACHE_HOME=cache) for _ in range(2)]  # at once, on an empty cache
+    first, other = map(end, both)
+    kept = entries(cache)
+    assert any(name.startswith("jit__replicate_means") for name in kept)
+    assert all(path.relative_to(cache).parts[0] == "pathjax" for path in cache.rglob("*-cache"))
+    wanted, found, image = end(counted(XDG_CACHE_HOME=cache))
+    assert wanted == found > 0
+    assert entries(cache) == kept
+    without = end(counted(PATHJAX_CACHE=0, XDG_CACHE_HOME=tmp_path / "none"))
+    assert image == first[2] == other[2] == without[2]
+    assert without[1] == 0 and not (tmp_path / "none").exists()
+
+
+@linux
+def test_a_cache_of_the_users_choice_is_used_instead(counted, tmp_path):
+    variables = {
+        "JAX_COMPILATION_CACHE_DIR": tmp_path / "mine",
+        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": 0,
+        "XDG_CACHE_HOME": tmp_path / "cache",
+    }
+    end(counted(**variables))
+    assert entries(tmp_path / "mine")
+    assert not (tmp_path / "cache").exists()
+
+
+@linux
+@pytest.mark.parametrize("name", ["file", BYTE])
+def test_a_cache_that_cannot_be_written_stops_no_render(counted, tmp_path, name):
+    (tmp_path / "file").write_text("")
+    assert end(counted(XDG_CACHE_HOME=tmp_path / name))[1] == 0
+
+
+@linux
+def test_a_full_cache_disk_stops_no_render_and_keeps_no_halves(counted, tmp_path):
+    import resource
+
+    cache, limits = tmp_path / "cache", resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 15, limits[1]))  # of the child; its kernel is larger
+    try:
+        started = counted(XDG_CACHE_HOME=cache)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    _, found, image = end(started)
+    assert found == 0
+    assert any(path.stat().st_size == 1 << 15 for path in cache.rglob("*-cache"))
+    end(counted(XDG_CACHE_HOME=cache))
+    wanted, found, again = end(counted(XDG_CACHE_HOME=cache))
+    assert wanted == found > 0
+    assert again == image
