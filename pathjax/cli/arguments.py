@@ -81,6 +81,9 @@ def parser() -> argparse.ArgumentParser:
     picture = "a picture: A, B, their difference (red: A is brighter) and, with --errors, its z-scores"
     compare.add_argument("-o", "--output", metavar="DIFF.png", help=picture)
     compare.add_argument("--json", action="store_true", help="print one JSON object on stdout")
+
+    pages = subparsers.add_parser("help", help="show a page of the manual, or list the pages")
+    pages.add_argument("topic", nargs="?", metavar="TOPIC")
     return program
 
 
