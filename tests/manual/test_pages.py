@@ -1,0 +1,146 @@
+"""The pages are short, link to each other, and describe everything that a user can name."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+
+import pathjax as pj
+from pathjax.cli import main
+from pathjax.errors import InputError
+
+MOST_LINES = 150
+LINK = re.compile(r"\[[^]]*\]\(([^)]+)\)")
+CODE = re.compile(r"```.*?```|`[^`\n]+`", re.DOTALL)
+
+
+def table(root, name):
+    """The first two cells of each row of the tables of a page."""
+    text = (root / "pathjax" / "manual" / f"{name}.md").read_text(encoding="utf-8")
+    return re.findall(r"^\| (`.*?) \| (.*?) \|", text, re.MULTILINE)
+
+
+@pytest.fixture
+def usage(capsys):
+    """(command) -> what its `--help` prints."""
+
+    def usage(*command):
+        with pytest.raises(SystemExit):
+            main([*command, "--help"])
+        return capsys.readouterr().out
+
+    return usage
+
+
+def test_a_page_is_short(page):
+    assert len(page.read_text(encoding="utf-8").splitlines()) <= MOST_LINES
+
+
+def test_links_lead_somewhere(page):
+    links = LINK.findall(page.read_text(encoding="utf-8"))
+    assert links or page.stem not in ("README", "lanes")
+    assert not [link for link in links if not (page.parent / link).is_file()]
+
+
+def test_a_page_can_be_reached_from_the_readme(page, root):
+    text = (root / "README.md").read_text(encoding="utf-8")
+    assert page.stem == "README" or f"(pathjax/manual/{page.name})" in text
+
+
+def test_public_names_are_described(all_text):
+    code = " ".join(CODE.findall(all_text))
+    assert not [name for name in pj.__all__ if not re.search(rf"\bpj\.{name}\b", code)]
+
+
+def test_commands_and_options_are_described(root, usage):
+    """By the page of commands, which says of which command an option is."""
+    described = table(root, "commands")
+    commands = re.findall(r"^    (\w+) ", usage(), re.MULTILINE)
+    assert "render" in commands
+    for command in commands:
+        assert any(row.startswith(f"`pathjax {command} ") for row, _ in described)
+        options = set(re.findall(r"(?<=^  )-[\w-]+|(?<=, )--[\w-]+", usage(command), re.MULTILINE)) - {"-h", "--help"}
+        listed = [row for commands, row in described if f"`{command}`" in commands]
+        assert options == set(re.findall(r"(?<=`)--?[A-Za-z][\w-]*", " ".join(listed))), command
+
+
+# ---- the page of scenes, held against what the loader says -------------------------------------------------------
+
+# Where a kind stands, with what it needs beside it: {} is the element itself.
+PLACES = {
+    "integrator": '{}<sensor type="perspective"/>',
+    "sensor": "{}",
+    "film": '<sensor type="perspective">{}</sensor>',
+    "rfilter": '<sensor type="perspective"><film type="hdrfilm">{}</film></sensor>',
+    "sampler": '<sensor type="perspective">{}</sensor>',
+    "shape": '<sensor type="perspective"/>{}',
+    "bsdf": '<sensor type="perspective"/><shape type="cube">{}</shape>',
+    "texture": '<sensor type="perspective"/><shape type="cube"><bsdf type="diffuse">{}</bsdf></shape>',
+    "emitter": '<sensor type="perspective"/>{}',
+    "area light": '<sensor type="perspective"/><shape type="cube">{}</shape>',
+}
+# What an element must have to be read at all; the second of a pair, where one excludes the other.
+NEEDS = {
+    "perspective": ["", '<float name="fov" value="40"/>'],
+    "thinlens": [f'<float name="aperture_radius" value="1"/>{fov}' for fov in ("", '<float name="fov" value="40"/>')],
+    "twosided": ['<bsdf type="diffuse"/>'],
+    "bitmap": ['<string name="filename" value="marks.png"/>'],
+} | {kind: [f'<string name="filename" value="mesh.{kind}"/>'] for kind in ("obj", "ply", "stl", "glb", "gltf")}
+
+
+@pytest.fixture(scope="module")
+def refusal(root, tmp_path_factory):
+    """(place, type, what is inside) -> the message that refuses a scene with such an element."""
+    import trimesh
+
+    folder = tmp_path_factory.mktemp("kinds")
+    (folder / "marks.png").write_bytes((root / "tests" / "scenes" / "textures" / "marks.png").read_bytes())
+    for kind in ("obj", "ply", "stl", "glb", "gltf"):
+        mesh = trimesh.creation.box()
+        if kind == "gltf":
+            for name, data in mesh.export(file_type="gltf").items():
+                (folder / ("mesh.gltf" if name.endswith(".gltf") else name)).write_bytes(data)
+        else:
+            mesh.export(folder / f"mesh.{kind}")
+
+    def refusal(place, kind, inside=""):
+        tag = "emitter" if place == "area light" else place
+        name = ' name="reflectance"' if tag == "texture" else ""
+        element = f'<{tag} type="{kind}"{name}>{inside}</{tag}>'
+        file = folder / "scene.xml"
+        file.write_text(f'<scene version="3.0.0">{PLACES[place].format(element)}</scene>')
+        with pytest.raises(InputError) as error:
+            pj.load_scene(file)
+        return str(error.value)
+
+    return refusal
+
+
+@pytest.fixture(scope="module")
+def described(root):
+    """Kind -> names of its parameters, by the page; "the same" are those of the row above."""
+    kinds, names = {}, set()
+    for which, parameters in table(root, "scenes"):
+        names = set(re.findall(r"`(\w+)`", parameters)) | (names if "the same" in parameters else set())
+        kinds |= dict.fromkeys(re.findall(r"`(\w+)`", which), names)
+    return kinds
+
+
+@pytest.mark.parametrize("place", PLACES)
+def test_kinds_and_parameters_of_scene_files_are_described(place, described, refusal):
+    kinds = re.search(r"use one of ([\w, ]+)", refusal(place, "none"))[1].split(", ")
+    for kind in kinds:
+        names = set()
+        for needs in NEEDS.get(kind, [""]):
+            message = refusal(place, kind, needs + '<float name="unknown" value="1"/>')
+            names |= set(re.search(r"it has: ([\w, ]+)", message)[1].split(", "))
+        assert described[kind] == names - {"none", "flip_normals"}, kind
+
+
+@pytest.mark.parametrize("scene", ["glass_and_mirror", "cornell_box"])
+def test_parameters_are_described(scene, root):
+    described = {name for _, names in table(root, "parameters") for name in re.findall(r"`(\w+)`", names)}
+    assert {
+        name.rpartition(".")[2] for name in pj.parameters(pj.load_scene(root / "scenes" / f"{scene}.xml"))
+    } <= described
