@@ -1,12 +1,12 @@
-"""Mistakes that the user can mend: those that end the work, and those with which it goes on."""
+"""Mistakes that the user can correct: an error ends the work, and after a warning it goes on."""
 
 
 class InputError(ValueError):
-    """A file, a name or an argument is wrong; the message says where, what, and what to do about it.
+    """A file, a name or an argument is wrong. The message says where, what is wrong and what to do about it.
 
     The command line prints the message alone and exits with status 2.
     """
 
 
 class InputWarning(UserWarning):
-    """What is surely not meant, or could not be done beside the work; the command line prints the message alone."""
+    """A setting is surely not meant, or something beside the work failed. The command line prints the message alone."""

@@ -15,14 +15,14 @@ def parser() -> argparse.ArgumentParser:
     render = subparsers.add_parser("render", help="render a scene to an image")
     _add_scene(render)
     render.add_argument("-o", "--output", required=True, metavar="OUT.{exr,png}")
-    spp = "most samples per pixel; default: the file's, where neither --error nor --time is given"
+    spp = "most samples per pixel; default: the file's, if neither --error nor --time is given"
     render.add_argument("--spp", type=_positive, metavar="N", help=spp)
-    error = "stop when the error relative to the image's own level is as low: 0.02 is 2 %%"
+    error = "stop when the error, relative to the image's own level, is this low: 0.02 is 2 %%"
     render.add_argument("--error", type=_real, metavar="E", help=error)
-    render.add_argument("--time", type=_real, metavar="SECONDS", help="stop after so much rendering")
-    checkpoint = "save the state there, and go on from it when called again"
+    render.add_argument("--time", type=_real, metavar="SECONDS", help="stop after this many seconds of rendering")
+    checkpoint = "save the state in this file, and go on from it when called again"
     render.add_argument("--checkpoint", metavar="FILE.npz", help=checkpoint)
-    kinds, aov = "{error,depth,normal,albedo,bounces}", "further channels of an EXR file, separated by commas"
+    kinds, aov = "{error,depth,normal,albedo,bounces}", "more channels of the EXR file, separated by commas"
     render.add_argument("--aov", type=_comma_separated(str), default=[], metavar=kinds, help=aov)
     render.add_argument("--seed", type=_seed, default=0, metavar="K")
     render.add_argument("--strategy", default="mis", metavar="{mis,light,bsdf}", help="how light is sampled")
@@ -33,7 +33,7 @@ def parser() -> argparse.ArgumentParser:
     fit.add_argument("target", metavar="TARGET.{exr,png}")
     param = "a parameter to recover; may be repeated"
     fit.add_argument("--param", dest="params", action="append", required=True, metavar="NAME[=START]", help=param)
-    fit.add_argument("--spp", type=_positive, default=128, metavar="N", help="of each of the two last renders")
+    fit.add_argument("--spp", type=_positive, default=128, metavar="N", help="of each of the last two renders")
     fit.add_argument("--seed", type=_seed, default=0, metavar="K")
     fit.add_argument("-o", "--output", default="fit", metavar="PREFIX", help="writes PREFIX.json and PREFIX.png")
     fit.add_argument("--json", action="store_true", help="print one JSON object on stdout")
@@ -51,7 +51,7 @@ def parser() -> argparse.ArgumentParser:
     bench.add_argument("--spp", type=_comma_separated(_positive), default=[16, 64, 256], metavar="16,64,256")
     bench.add_argument("--reference-spp", type=_positive, default=16384, metavar="N", help="of the converged reference")
     bench.add_argument("--repeat", type=_positive, default=5, metavar="N", help="timed runs of each; medians are shown")
-    bench.add_argument("-o", "--output", metavar="DIR", help="also write bench.md, bench.json and plots there")
+    bench.add_argument("-o", "--output", metavar="DIR", help="also write bench.md, bench.json and plots to this folder")
     bench.add_argument("--quick", action="store_true", help="speed against error alone")
     bench.add_argument("--json", action="store_true", help="print one JSON object on stdout")
 
@@ -93,7 +93,7 @@ def _add_scene(parser: argparse.ArgumentParser) -> None:
         "-D", dest="defines", action="append", default=[], type=_pair, metavar="name=value", help="a $name of the file"
     )
     parser.add_argument(
-        "--set", dest="settings", action="append", default=[], type=_pair, metavar="NAME=VALUE", help="a parameter"
+        "--set", dest="settings", action="append", default=[], type=_pair, metavar="NAME=VALUE", help="set a parameter"
     )
 
 

@@ -47,9 +47,9 @@ MOST_GLASS = 7
 class Jacobian(Mapping):
     """Derivatives of an image by the names of parameters: `J[name]` is (H, W, 3, *shape of the parameter).
 
-    bias: of those that are differences, an estimate of derivative minus truth (H, W, 3) from a second step; noisy in a
-        single pixel, meant for averages.
-    step: of those, the change of the relative IOR to either side.
+    bias: for derivatives that are differences, an estimate (H, W, 3) of derivative minus truth from a second step. It
+        is noisy in a single pixel, and meant for averages.
+    step: for the same, the change of the relative IOR to either side.
     """
 
     derivatives: dict[str, jax.Array]
@@ -76,21 +76,23 @@ class Wanted:
 
 @usual_promotion
 def jacobian(scene: Scene, names, spp: int = 64, seed: int = 0, *, strategy="mis", method="difference", step=None):
-    """Image and its derivative with respect to named parameters, from the same paths, in one kernel.
+    """Render an image and its derivatives in named parameters, from the same paths, in one kernel.
 
-    Pure; may be called inside `jax.jit`, and under `jax.vmap` over scenes that differ in parameters or cameras.
+    Pure. It may be called inside `jax.jit`, and under `jax.vmap` over scenes that differ in parameters or cameras.
 
     Args:
         names: of parameters, as `parameters` lists them.
-        spp, seed, strategy: of `render`; the image is that of `render`, to rounding.
+        spp: samples per pixel.
+        seed: of `render`, whose image is the same, to rounding.
+        strategy: of `render`.
         method: how the IOR of smooth glass is differentiated: "difference" (central, common random numbers), or
-            "attached", which follows points that move and is right only where no edge is seen through glass. An
-            attached image chooses its branches otherwise than `render`, without bias.
-        step: of differences, in relative IOR; None: what moves the image by about a third of a pixel.
+            "attached", which follows points that move and is right only where no edge is seen through glass. With
+            "attached" the image chooses its branches in another way than `render`, without bias.
+        step: of differences, in relative IOR; None: one that moves the image by about a third of a pixel.
     Returns:
-        image (H, W, 3), and a Jacobian.
+        The image (H, W, 3), and a Jacobian.
     Raises:
-        InputError: unknown name, method or strategy; spp, seed or step out of range.
+        InputError: a name, the method or the strategy is unknown; spp, seed or step is out of range.
     """
     if isinstance(names, str):
         raise InputError(f"names is a list of names; write [{names!r}]")

@@ -40,7 +40,7 @@ class Fields:
                 raise child.error(f"{child} is not supported inside {element}; use one of: {', '.join(VALUES)}, ref")
             target = document.resolve(child)
             if target is not child and target.tag not in OBJECTS:
-                raise child.error(f"{child} refers to {target}, which is no object")
+                raise child.error(f"{child} refers to {target}, which is not an object")
             if target.tag in OBJECTS and target.tag != "texture":
                 self._objects.append(child)
                 continue
@@ -278,7 +278,7 @@ def _matrix(step: Element) -> np.ndarray:
     side = 3 if len(values) == 9 else 4
     matrix[:side, :side] = np.reshape(values, (side, side))
     if not np.array_equal(matrix[3], [0, 0, 0, 1]):
-        raise step.error(f"{step}: the last row must be 0 0 0 1, as the transform is to be affine")
+        raise step.error(f"{step}: the last row must be 0 0 0 1, since transforms are affine")
     return matrix
 
 

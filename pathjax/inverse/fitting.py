@@ -85,10 +85,11 @@ def fit(
     Args:
         scene: a scene, or a list of views; views share parameters by name.
         target: linear RGB (H, W, 3) or a `Target`, as `read_target` returns it; or a list of them, one for each view.
-            Its noise must be independent from pixel to pixel; how large it is, the fit finds out.
-        names: parameters to recover, of `parameters`.
-        start: values to begin with; default: the scene's.
+            Its noise must be independent from pixel to pixel; the fit finds out how large it is.
+        names: of parameters to recover, as `parameters` lists them.
+        start: values to begin with, by name; default: the scene's.
         spp: samples per pixel of each of the two independent renders of the last stage.
+        seed: of the first render; all others follow from it.
         solver: an optimistix least-squares solver or minimiser for the approach; default: LevenbergMarquardt.
         scan: try indices of refraction over their whole range first, since a local method finds the nearest minimum.
         progress: True for a line on stderr at each step, or a function that is called with each entry of the history.
@@ -110,7 +111,7 @@ def fit(
         raise InputError(f"seed = {seed}; it must be an integer in [0, 2^31)")
     solver = solver or optx.LevenbergMarquardt(rtol=1e-4, atol=1e-4)
     if not isinstance(solver, optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser):
-        raise InputError(f"{type(solver).__name__} is no least-squares solver or minimiser of optimistix")
+        raise InputError(f"solver is a {type(solver).__name__}; use a least-squares solver or minimiser of optimistix")
     tell = _print_step if progress is True else progress or None
     views = problem.build(scene, target, names, start or {})
     with Interrupts() as interrupts:

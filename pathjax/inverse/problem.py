@@ -110,7 +110,7 @@ def build(scene, target, names, start) -> Problem:
     if not pixels:
         raise InputError("every pixel of the target is clipped or left out; give one that is exposed for the scene")
     if pixels < unknowns:
-        raise InputError(f"{pixels} pixels cannot tell {unknowns} numbers; give larger targets or more views")
+        raise InputError(f"{pixels} pixels cannot determine {unknowns} numbers; give larger targets or more views")
     level = np.concatenate([target.image[target.usable] for target in targets]).mean()
     exposure = float(np.exp2(-np.floor(np.log2(level)))) if level > 0 else 1.0
     targets = [
@@ -137,7 +137,7 @@ def _target(scene, target, number, count) -> Target:
     lost = measured & ~np.isfinite(image)
     if lost.any():
         raise InputError(
-            f"{which} holds {int(lost.sum())} values that are not finite; mend it, or leave them out by "
+            f"{which} holds {int(lost.sum())} values that are not finite; correct it, or leave them out by "
             "Target(image, measured=...)"
         )
     negative = int((image[measured] < 0).sum())

@@ -16,12 +16,12 @@ _LOSSY = ("B44", "B44A", "DWAA", "DWAB")
 
 @dataclass(frozen=True)
 class Target:
-    """An image to fit to. Where a file rounds and clips, `read_target` knows how; arrays of your own may say it here.
+    """An image to fit to, and how it was rounded and clipped: `read_target` finds that out, for arrays say it here.
 
     Args:
         image: (H, W, 3) linear RGB.
-        step: how far apart stored values lie, (H, W, 3) or one for all, in the units of the image; 0: not rounded.
-        ceiling: values at or above it are clipped, and say no more than that.
+        step: distance between stored values, (H, W, 3) or one for all, in the units of the image; 0: not rounded.
+        ceiling: values at or above it are clipped: the truth may be any higher value.
         measured: (H, W, 3) or (H, W, 1) bool; the others are left out, whatever they hold, nan included.
     """
 

@@ -24,14 +24,20 @@ CHUNK_PIXELS = 1 << 14
 
 @usual_promotion
 def render_aovs(scene: Scene, names: Sequence[str], spp: int = MAX_SPP, seed: int = 0) -> dict[str, np.ndarray]:
-    """Name -> (H, W, channels) float32, as Mitsuba's `aov` integrator has it; 0 where nothing is seen.
+    """Return images of what the camera sees first, as Mitsuba's `aov` integrator does.
 
-    "depth" (1 channel) is the distance along the ray from the near clip plane, "normal" (3) the shading normal in world
-    space, "albedo" (3) the share of light that a reflector sends back, textures and Fresnel's terms included, and 1 for
-    glass. Means over the film positions of the first min(spp, 16) samples that `render_until` takes for this seed.
+    Each is the mean over the film positions of the first min(spp, 16) samples that `render_until` takes for this seed.
 
+    Args:
+        names: "depth" (1 channel), the distance along the ray from the near clip plane; "normal" (3), the shading
+            normal in world space; "albedo" (3), the share of light that a reflector sends back, textures and Fresnel's
+            terms included, and 1 for glass.
+        spp: samples per pixel, of which at most 16 are used.
+        seed: of `render_until`.
+    Returns:
+        name -> (H, W, channels) float32; 0 where nothing is seen.
     Raises:
-        InputError: unknown or repeated name, spp or seed out of range.
+        InputError: a name is unknown or repeated; spp or seed is out of range.
     """
     check_names(names, NAMES)
     path.check_sampling("mis", spp, seed)

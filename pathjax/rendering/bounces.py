@@ -34,14 +34,11 @@ PILOT_TERMS, PILOT_PIXELS, PILOT_SPP = 12, 1 << 12, 64
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True, eq=False)
 class Bounces:
-    """Terms of the series: `terms[k]` is T^k Le, light that was reflected or refracted k times.
-
-    The number of samples stands by for the standard error.
-    """
+    """Terms of the series: `terms[k]` is T^k Le, light that was reflected or refracted k times."""
 
     terms: jax.Array  # (depth, H, W, 3) linear RGB
-    deviation: jax.Array  # (depth, H, W, 3) root of `variance`, whose range is that of radiance
-    samples: jax.Array  # (H, W) int32 of each pixel
+    deviation: jax.Array  # (depth, H, W, 3) root of `variance`; float32 may not hold the variance itself
+    samples: jax.Array  # (H, W) int32 of each pixel, from which the standard error is made
 
     @property
     def variance(self) -> jax.Array:
@@ -74,21 +71,22 @@ class Bounces:
 def render_bounces(
     scene: Scene, depth: int, spp=64, seed: int = 0, strategy: str = "mis", *, errors: bool = True
 ) -> Bounces:
-    """An image of each of the first `depth` terms of L = Le + T Le + T^2 Le + ..., from the same paths.
+    """Render an image of each of the first `depth` terms of L = Le + T Le + T^2 Le + ..., from the same paths.
 
     Their sum is, to rounding, the image with max_depth = depth that `render_until(scene, spp=spp, seed=seed)` gives:
     the mean of four replicates, whose spread tells the standard errors. With `errors=False` there is one sequence and
     no standard error, and the sum is that of `render(scene, spp, seed)`. Either costs about as much as `render`. The
-    scene's own max_depth does not count.
+    scene's own max_depth is disregarded.
 
-    Pure; may be called inside `jax.jit`, under `jax.vmap`, and `terms` be differentiated in named reflectances,
-    radiances and other colours, as `render`, forwards or backwards. `deviation` and `variance` have no derivative.
+    Pure. It may be called inside `jax.jit` and under `jax.vmap`, and `terms` may be differentiated in named
+    reflectances, radiances and other colours, forwards or backwards. `deviation` and `variance` have no derivative.
 
     Args:
         depth: how many terms, 1 to 64; 1 is emission alone. Static.
         spp: samples per pixel; or (H, W) int32, `samples` of a `RenderResult`, whose image is then the sum.
-        seed, strategy: of `render`.
-        errors: estimate the variance.
+        seed: of `render`.
+        strategy: of `render`.
+        errors: whether to estimate the variance.
     Raises:
         InputError: depth, spp or seed out of range, unknown strategy; differentiation in the IOR of glass or in
             anything but named parameters.

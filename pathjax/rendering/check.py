@@ -42,18 +42,20 @@ class GradientCheck:
 def check_gradient(scene: Scene, name: str, spp: int = 64, seed: int = 0, *, seeds: int = 16, block: int = 8):
     """Compare `jacobian` with differences of `render` at other values of one parameter, with common random numbers.
 
-    The values are spread over the neighbourhood of the present one, within the bounds: five for what images depend on
-    smoothly, two for the IOR of smooth glass, at the step that `jacobian` chose, whose bias both then share.
+    The values lie around the present one, within the bounds: five of them for what images depend on smoothly. For the
+    IOR of smooth glass they are two, at the step that `jacobian` chose, so that both have the same bias.
 
     Args:
-        spp, seed: of each image, and of the first of the `seeds` independent comparisons.
-        seeds: at least 3.
+        name: of a parameter, as `parameters` lists them.
+        spp: samples per pixel of each image.
+        seed: of the first comparison.
+        seeds: number of independent comparisons, at least 3.
         block: side of the blocks of pixels over which derivatives are averaged.
     Returns:
         GradientCheck.
     """
     if seeds < 3:
-        raise InputError(f"seeds = {seeds}; it takes at least 3 to know a scatter")
+        raise InputError(f"seeds = {seeds}; at least 3 are needed to estimate their scatter")
     parameter = named.find(scene, name)
     present = np.asarray(named.parameters(scene)[name])
     derivatives, differences = [], []

@@ -16,13 +16,15 @@ from pathjax.shapes import geometry
 
 @usual_promotion
 def closest_hit(scene: Scene, origins, directions) -> Hit:
-    """First primitive that each ray meets.
+    """Return the first primitive that each ray meets.
 
     Args:
-        origins, directions: (N, 3); directions of any positive length.
+        origins: (N, 3).
+        directions: (N, 3), of any positive length.
     Returns:
-        Hit of arrays (N,): t is a distance, inf where missed; primitive and shape are -1 there. `shape` counts the
-        shapes of the file; `primitive` counts spheres, rectangles, disks and triangles, in this order.
+        Hit of arrays (N,). `t` is the distance, inf where the ray meets nothing; `primitive` and `shape` are then -1.
+        `shape` counts the shapes of the file; `primitive` counts spheres, rectangles (six of each cube), disks and
+        triangles, in this order.
     """
     dtype = scene.camera.origin.dtype
     return _closest_hit(scene.geometry, jnp.asarray(origins, dtype), jnp.asarray(directions, dtype))

@@ -32,30 +32,30 @@ def render(
     sampler: str = "lattice",
     control=None,
 ):
-    """Image of a scene: (H, W, 3), linear RGB, unbiased up to the scene's max_depth (but for `fresnel="schlick"`).
+    """Render a scene: (H, W, 3), linear RGB, unbiased up to the scene's max_depth (except with `fresnel="schlick"`).
 
-    Pure; may be called inside `jax.jit`, under `jax.vmap` over scenes that differ in parameters or cameras, and be
-    differentiated in what `parameters` lists, forwards or backwards: the derivative is that of `jacobian`, which says
-    how, and for the IOR of smooth glass how far, it may be trusted. The same scene structure, image size and
-    choices below compile once: other parameters, cameras, spp and seeds reuse the kernel.
+    Pure. It may be called inside `jax.jit`, under `jax.vmap` over scenes that differ in parameters or cameras, and be
+    differentiated in what `parameters` lists, forwards or backwards. The derivative is that of `jacobian`, which says
+    how far it may be trusted. A kernel is compiled once for each scene structure, image size and set of the choices
+    below; other parameters, cameras, spp and seeds reuse it. A sample that is not finite leaves its pixel not finite,
+    and the others untouched.
 
     Args:
         spp: samples per pixel, at least 1.
         seed: other seeds give independent images; the same seed gives the same image, bit for bit, on any number of
             CPU devices.
         strategy: "mis", or "light" or "bsdf" for experiments.
-    Further choices of classic path tracers, for experiments; the defaults compile nothing of them:
-        fresnel: of dielectrics, "exact", or "schlick", whose approximation biases the image.
-        split_depth: at the first so many dielectrics of a path both branches are followed, instead of one by chance;
-            0 to 8. A sample may then be 2^split_depth paths.
+        fresnel: reflectance of dielectrics, "exact", or "schlick", whose approximation biases the image. This and what
+            follows are for experiments; the defaults compile nothing of them.
+        split_depth: number of dielectrics, counted along a path, at which both branches are followed instead of one by
+            chance; 0 to 8. A sample may then be 2^split_depth paths.
         sampler: random numbers, "lattice", or "independent" of each other, or "subpixel": independent, but with a
             quarter of the samples in each of 2 x 2 strata of the pixel's filter; spp is then a multiple of 4.
-        control: a `transport.Control`, of `Operator.control`, into which paths end instead of into darkness. The mean
-            stays, whatever light it holds. It pays where paths are long, and seldom: see the README.
+        control: a `transport.Control`, made by `Operator.control`, into which paths end instead of into darkness. The
+            mean stays, whatever light it holds. It seldom pays: see `pathjax help transport`.
     Raises:
-        InputError: a choice is unknown or out of range, as spp or seed; differentiation in anything but named
-            parameters, or with another sampler, split_depth or control than the default.
-    A sample that is not finite leaves its pixel not finite, and the others untouched.
+        InputError: a choice is unknown, or spp, seed or split_depth is out of range; differentiation in anything but
+            named parameters, or with another sampler, split_depth or control than the default.
     """
     pixels = jnp.arange(film.pixel_count(scene.film), dtype=jnp.int32)
     choices = {"fresnel": fresnel, "split_depth": split_depth, "sampler": sampler, "control": control}

@@ -20,18 +20,18 @@ from pathjax.scene.scene import Scene
 
 @usual_promotion
 def parameters(scene: Scene) -> dict[str, jax.Array]:
-    """All parameters of the scene by name, `ID.field`."""
+    """Return all parameters of the scene by name, `ID.field`."""
     return {name: get(scene, p.path)[p.index] for name, p in about(scene).parameters.items()}
 
 
 @usual_promotion
 def with_parameters(scene: Scene, values: Mapping) -> Scene:
-    """The scene with other values for some of its parameters; nothing is compiled again.
+    """Return the scene with other values for some of its parameters; nothing is compiled again.
 
     Args:
-        values: name -> value of the parameter's shape (a number stands for all channels). May be traced.
+        values: name -> value of the parameter's shape; a number stands for all channels. Values may be traced.
     Raises:
-        InputError: unknown name, wrong shape, or a value outside the parameter's bounds.
+        InputError: a name is unknown, or a value has the wrong shape or lies outside the parameter's bounds.
     """
     known = about(scene)
     traced = dict(known.traced)

@@ -423,5 +423,5 @@ def test_bad_input_is_refused_before_anything_is_rendered(room, monkeypatch, cha
 
 def test_fewer_pixels_than_unknowns_are_refused(make_scene):
     scene = make_scene(ROOM, res=2, depth=2)
-    with pytest.raises(pj.InputError, match="4 pixels cannot tell 6 numbers"):
+    with pytest.raises(pj.InputError, match="4 pixels cannot determine 6 numbers"):
         pj.fit(scene, np.ones((2, 2, 3)), NAMES)

@@ -168,7 +168,7 @@ def test_a_reference_may_come_before_its_object_and_shares_it(read):
         (shape(attributes='id="a"') + "\n" + shape(attributes='id="a"'), 3, 'id "a" is taken already'),
         ('<bsdf type="twosided" id="a"><ref id="a"/></bsdf>', 2, "cannot stand inside"),
         (shape('<ref id="b"/>') + shape('<ref id="x"/>', attributes='id="b"'), 2, "has no place inside"),
-        (shape('<ref name="radius" id="r"/><float id="r" name="q" value="1"/>'), 2, "which is no object"),
+        (shape('<ref name="radius" id="r"/><float id="r" name="q" value="1"/>'), 2, "which is not an object"),
         ('<include filename="nowhere.xml"/>', 2, 'no file "nowhere.xml"'),
         ('<path value="nowhere"/>', 2, 'no folder "nowhere"'),
         ('<alias id="a" as="b"/>', 2, "<alias"),

@@ -181,4 +181,4 @@ def _refuse(path: Path, text: bytes) -> NoReturn:
                     raise ValueError(f"a face of {len(words)} vertices")
         except ValueError as error:
             raise InputError(f"{path}:{number}: {error}") from None
-    raise InputError(f"{path}: cannot be read as OBJ: a line holds something that is no number")
+    raise InputError(f"{path}: cannot be read as OBJ: a line holds something that is not a number")

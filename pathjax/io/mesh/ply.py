@@ -51,7 +51,7 @@ def read(path: Path) -> Raw:
         try:
             data, at = numbers(data[at:], np.float64).tobytes(), 0
         except ValueError:
-            raise InputError(f"{path}: behind the header there is something that is no number") from None
+            raise InputError(f"{path}: after the header there is something that is not a number") from None
     for element in elements.values():
         at = _read_rows(path, data, at, element)
     if data[at:].strip(b"" if text else b"\0 \t\r\n"):
@@ -197,7 +197,7 @@ def _faces(path: Path, elements: dict[str, _Element]) -> tuple[np.ndarray, np.nd
             continue
         index, size = element.columns[name], element.lengths[name]
         if index.dtype.kind == "f" and (index % 1 != 0).any():
-            raise InputError(f"{path}: {element.name}: the list {name} holds what is no whole number")
+            raise InputError(f"{path}: {element.name}: the list {name} holds something that is not a whole number")
         index = index.astype(np.int64)
         if element.name == "tristrips":  # -1 ends a strip within a row
             strip = (enumerated(size)[0] + np.cumsum(index == -1))[index != -1]

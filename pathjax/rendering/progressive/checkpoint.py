@@ -81,7 +81,7 @@ class Checkpoint:
                 identity, spp, seconds = facts["identity"], int(facts["spp"]), float(facts["seconds"])
                 arrays = {name: file[name] for name in ("means", *OF_PIXELS)} if file.files != ["facts"] else {}
         except Exception as error:  # zipfile, zlib, NumPy and json raise what they like, as the file's bytes have it
-            raise self._refusal(f"is no checkpoint, or a damaged one ({error})") from None
+            raise self._refusal(f"is not a checkpoint, or is damaged ({error})") from None
         for name, ours in self.identity.items():
             theirs = identity.get(name)
             if theirs != ours:

@@ -60,30 +60,34 @@ def render_until(
     """Render until the first of three limits is reached.
 
     The error is sqrt(mean((I - R)^2 / (R^2 + 0.01 L^2))) of the image I against the truth R, where L is the level of R:
-    the mean of what is lit, but for its brightest quarter, such as lamps in view (`images.level`). So 0.02 is 2 % in
-    any unit of radiance. It is estimated as long as float32 holds the radiances, some 1e-31 to 1e36. A target is never
-    claimed of an image that is black, darker than that or not finite: a render that nothing else would end then ends
-    with the reason "no estimate", after the pilot or when the finite pixels are on target.
+    the mean of its lit pixels without the brightest quarter, such as lamps in view (`images.level`). So 0.02 is 2 % in
+    any unit of radiance. It is estimated as long as float32 holds the radiances, some 1e-31 to 1e36. Of an image that
+    is black, darker than that or not finite, no target is claimed. A render that nothing else would end then ends with
+    the reason "no estimate", after the pilot or when the finite pixels are on target.
 
-    The image is the mean of independent replicates, so not that of `render` for the same seed. With `spp` alone all
-    pixels get as many samples; else, after a pilot, noisy neighbourhoods get more: see `error_estimate.sample_weights`.
-    Either way the image is unbiased up to the scene's max_depth. The same arguments give the same image, bit for bit,
-    unless a time limit or an interrupt ended it.
+    The image is the mean of independent replicates, so it is not that of `render` for the same seed. If only `spp` is
+    given, all pixels get equally many samples. Otherwise, after a pilot, noisy neighbourhoods get more: see
+    `error_estimate.sample_weights`. Either way the image is unbiased up to the scene's max_depth. The same arguments
+    give the same image, bit for bit, unless a time limit or an interrupt ended it.
 
     Args:
-        target_error: reached when the upper bound of the estimate is no higher.
-        time_limit: seconds of rendering; compilation, which nothing can cut short, comes on top.
+        target_error: the error to reach; it counts as reached when the upper bound of the estimate is no higher.
+        time_limit: seconds of rendering. Compilation, which nothing can cut short, is not counted.
         spp: most samples per pixel, on average.
-        checkpoint: a .npz file to save the state in, at intervals, when interrupted and at the end. Where it exists
-            the render goes on from there; killed at any moment and called again, it gives the image of an undisturbed
-            run.
+        seed: other seeds give independent images.
+        strategy: of `render`.
+        checkpoint: a .npz file in which the state is saved, at intervals, when interrupted and at the end. If it
+            exists, the render goes on from there. Killed at any moment and called again, it gives the image of an
+            undisturbed run.
         progress: show a bar on stderr.
     Raises:
-        InputError: an argument is out of range, or nothing to stop at is given; a checkpoint of another render, a
-            damaged one, or one that cannot be written. Once rendering has begun that is an InputWarning: the image is
-            returned, and the last checkpoint that was written is intact.
-        KeyboardInterrupt: by Ctrl-C while the kernel compiles. Later, Ctrl-C, SIGTERM and SIGHUP end the render, which
-            returns what is done (in the main thread, where alone Python hears them).
+        InputError: an argument is out of range, or no limit is given; the checkpoint is of another render, is damaged
+            or cannot be written.
+        KeyboardInterrupt: Ctrl-C while the kernel compiles. Later, Ctrl-C, SIGTERM and SIGHUP end the render, which
+            returns what is done (in the main thread only, since Python handles signals nowhere else).
+    Warns:
+        InputWarning: the checkpoint cannot be written after rendering has begun. The image is returned, and the last
+            checkpoint that was written is intact.
     """
     render = Render(scene, target_error, time_limit, spp, seed, strategy, checkpoint)
     render.compile()

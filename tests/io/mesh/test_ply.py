@@ -151,4 +151,4 @@ def test_faces_of_two_vertices_and_fractions_of_vertices_are_refused(refused):
     for form in ORDERS:
         assert "face 1 (counting from 0) has 2 vertices" in refused("ply", mesh(form, [[0, 1, 2], [0, 1]]))
         message = refused("ply", mesh(form, [[0, 1, 2.5]], index="float"))
-        assert "the list vertex_indices holds what is no whole number" in message
+        assert "the list vertex_indices holds something that is not a whole number" in message

@@ -193,7 +193,7 @@ def test_fingerprints_are_of_values_not_of_names(shipped):
 def test_truncated_files(cornell, made, share):
     whole = made.read_bytes()
     made.write_bytes(whole[: int(share * len(whole))])
-    with pytest.raises(pj.InputError, match="run.npz is no checkpoint, or a damaged one"):
+    with pytest.raises(pj.InputError, match="run.npz is not a checkpoint, or is damaged"):
         pj.render_until(cornell, spp=4, seed=3, checkpoint=made)
 
 
