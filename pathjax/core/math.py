@@ -3,35 +3,40 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jaxtyping import Array, Float, Int, Integer, Real, Shaped
 
 from pathjax.core.types import Frame, Ray, Surface
 
+# x, y and z, each of one number or of some, as the leaves of hierarchies have them.
+Components = Float[Array, "3 *#lanes"] | Sequence[Float[Array, "*#lanes"]]
 
-def dot(a, b):
-    """Sum of products over a first axis of length 3; further axes are lanes."""
+
+def dot(a: Components, b: Components) -> Float[Array, "*#lanes"]:
+    """Scalar product."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-def cross(a, b):
-    """(3, ...) x (3, ...) -> (3, ...)."""
+def cross(a: Components, b: Components) -> Float[Array, "3 *#lanes"]:
+    """Vector product."""
     return jnp.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
 
 
-def smaller(a, b):
+def smaller(a: Real[Array, "*#shape"], b: Real[Array, "*#shape"] | float) -> Real[Array, "*#shape"]:
     """One `vmin`; `b` where either is NaN. (`jnp.minimum` spends four instructions on passing NaN on.)"""
     return jnp.where(a < b, a, b)
 
 
-def larger(a, b):
+def larger(a: Real[Array, "*#shape"], b: Real[Array, "*#shape"] | float) -> Real[Array, "*#shape"]:
     """One `vmax`; `b` where either is NaN."""
     return jnp.where(a > b, a, b)
 
 
-def at(table, *index):
+def at(table: Shaped[Array, "..."], *index: Integer[Array, ""] | int) -> Shaped[Array, "..."]:
     """`table[index]` for integers known to lie inside: one contiguous load. (Plain indexing, which counts negative
     indices from the end, and gathers cost a dozen instructions each in the kernel. Unsigned ones are clamped in two.)
     """
@@ -43,31 +48,31 @@ def at(table, *index):
     return block.reshape(rest)
 
 
-def integer_like(dtype):
+def integer_like(dtype: np.dtype) -> type[np.signedinteger]:
     """The integers as wide as a float type."""
     return np.int64 if dtype == np.float64 else np.int32
 
 
-def safe_sqrt(x):
+def safe_sqrt(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
     """sqrt(max(x, 0)), with derivative 0 where x <= 0."""
     positive = x > 0
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1)), 0)
 
 
-def safe_divide(a, b):
+def safe_divide(a: Float[Array, "*#shape"] | float, b: Float[Array, "*#shape"]) -> Float[Array, "*#shape"]:
     """a / b, and 0 with derivative 0 where b is 0."""
     nonzero = b != 0
     return jnp.where(nonzero, a / jnp.where(nonzero, b, 1), 0)
 
 
-def normalize(v):
+def normalize(v: Float[Array, "3"]) -> Float[Array, "3"]:
     """v / |v|; the zero vector stays zero."""
     squared = dot(v, v)
     positive = squared > 0
     return jnp.where(positive, v * lax.rsqrt(jnp.where(positive, squared, 1)), 0)
 
 
-def rescale(v):
+def rescale(v: Float[Array, "3"]) -> Float[Array, "3"]:
     """v over its largest component: neither squares nor products of the result overflow or underflow."""
     largest = jnp.max(jnp.abs(v))
     return v / lax.stop_gradient(jnp.where(largest > 0, largest, 1))
@@ -76,7 +81,7 @@ def rescale(v):
 # Taylor's series on short ranges, to rounding: a few multiply-adds where the general functions are calls to a library.
 
 
-def _series(x, coefficients):
+def _series(x: Float[Array, ""], coefficients: Sequence[float]) -> Float[Array, ""]:
     """sum(coefficients[k] x^k), k ascending."""
     total = jnp.zeros_like(x)
     for c in reversed(coefficients):
@@ -84,7 +89,7 @@ def _series(x, coefficients):
     return total
 
 
-def cos_sin_octant(x):
+def cos_sin_octant(x: Float[Array, ""]) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Cosine and sine for |x| <= pi/4."""
     terms = range(5 if x.dtype == jnp.float32 else 9)
     squared = x * x
@@ -92,7 +97,7 @@ def cos_sin_octant(x):
     return lax.optimization_barrier((_series(squared, cos), x * _series(squared, sin)))
 
 
-def cos_sin_turns(u):
+def cos_sin_turns(u: Float[Array, ""]) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Cosine and sine of 2 pi u for 0 <= u <= 1."""
     quarter = jnp.floor(4 * u + jnp.asarray(0.5, u.dtype))
     cos, sin = cos_sin_octant((u - quarter / 4) * (2 * math.pi))
@@ -102,7 +107,7 @@ def cos_sin_turns(u):
     return sign * cos, sign * sin
 
 
-def safe_atan2(y, x):
+def safe_atan2(y: Float[Array, ""], x: Float[Array, ""]) -> Float[Array, ""]:
     """atan2 with value and derivatives 0 at the origin."""
     origin = (x == 0) & (y == 0)
     steep = jnp.abs(y) > jnp.abs(x)
@@ -119,18 +124,18 @@ def safe_atan2(y, x):
     return jnp.where(origin, 0, jnp.where(y < 0, -angle, angle))
 
 
-def turns(y, x):
+def turns(y: Float[Array, ""], x: Float[Array, ""]) -> Float[Array, ""]:
     """Angle of the point x, y from the x axis, in turns: 0 to 1; 0, with derivatives 0, at the origin."""
     angle = safe_atan2(y, x) / (2 * math.pi)
     return jnp.where(angle < 0, angle + 1, angle)
 
 
-def luminance(rgb):
-    """Rec. 709 luminance of linear RGB (..., 3) -> (...)."""
+def luminance(rgb: Float[Array, "*shape 3"]) -> Float[Array, "*shape"]:
+    """Rec. 709 luminance of linear RGB."""
     return rgb[..., 0] * 0.2126 + rgb[..., 1] * 0.7152 + rgb[..., 2] * 0.0722
 
 
-def frame_from_normal(n) -> Frame:
+def frame_from_normal(n: Float[Array, "3"]) -> Frame:
     """Orthonormal frame around a unit normal (Duff et al. 2017, JCGT 6(1))."""
     sign = jnp.copysign(jnp.ones_like(n[2]), n[2])
     a = -1 / (sign + n[2])
@@ -140,15 +145,15 @@ def frame_from_normal(n) -> Frame:
     return Frame(s, t, n)
 
 
-def to_local(frame: Frame, v):
+def to_local(frame: Frame, v: Float[Array, "3"]) -> Float[Array, "3"]:
     return jnp.stack([dot(frame.s, v), dot(frame.t, v), dot(frame.n, v)])
 
 
-def to_world(frame: Frame, v):
+def to_world(frame: Frame, v: Float[Array, "3"]) -> Float[Array, "3"]:
     return frame.s * v[0] + frame.t * v[1] + frame.n * v[2]
 
 
-def offset_point(surface: Surface, d):
+def offset_point(surface: Surface, d: Float[Array, "3"]) -> Float[Array, "3"]:
     """Point of the surface moved to that side of it that `d` points to, clear of its rounding error.
 
     The bound is relative to the coordinates that made the point (PBRT, "Managing rounding error"), so a scene may have
@@ -157,6 +162,6 @@ def offset_point(surface: Surface, d):
     return surface.p + surface.n * jnp.copysign(surface.margin, dot(surface.n, d))
 
 
-def spawn_ray(surface: Surface, d, primitive) -> Ray:
+def spawn_ray(surface: Surface, d: Float[Array, "3"], primitive: Int[Array, ""]) -> Ray:
     """Ray leaving `primitive` at `surface` in the unit direction d."""
     return Ray(offset_point(surface, d), d, jnp.full_like(surface.margin, jnp.inf), primitive)

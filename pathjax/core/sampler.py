@@ -11,8 +11,10 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float, Integer, UInt
 
 from pathjax.core.math import at
+from pathjax.core.types import Number
 
 # Generating vector of an extensible lattice sequence for a path tracer, up to 2^20 points. Rows are the four dimensions
 # of a vertex: film and lens, then light sample and bsdf sample. The light sample of a vertex is never multiplied with
@@ -35,54 +37,58 @@ _GENERATORS = np.array(
 )  # fmt: skip
 DIMENSIONS = 4
 
+Word = UInt[Array, ""]
 
-def _u32(x):
+
+def _u32(x: Integer[Array, "*shape"] | int) -> UInt[Array, "*shape"]:
     return jnp.asarray(x).astype(jnp.uint32)
 
 
-def hash_u32(x):
+def hash_u32(x: Integer[Array, "*shape"] | int) -> UInt[Array, "*shape"]:
     """Avalanche of 32 bits (Wellons' lowbias32)."""
-    x = _u32(x)
-    x = (x ^ (x >> 16)) * jnp.uint32(0x21F0AAAD)
-    x = (x ^ (x >> 15)) * jnp.uint32(0xD35A2D97)
-    return x ^ (x >> 15)
+    bits = _u32(x)
+    bits = (bits ^ (bits >> 16)) * jnp.uint32(0x21F0AAAD)
+    bits = (bits ^ (bits >> 15)) * jnp.uint32(0xD35A2D97)
+    return bits ^ (bits >> 15)
 
 
-def combine(a, b):
+def combine(
+    a: Integer[Array, "*#shape"] | int, b: Integer[Array, "*#shape"] | int
+) -> UInt[Array, "*#shape"]:
     """Hash of an ordered pair of 32-bit numbers."""
     return hash_u32(_u32(a) * jnp.uint32(0x9E3779B9) ^ hash_u32(_u32(b) + jnp.uint32(0x85EBCA6B)))
 
 
-def to_unit(x):
-    """uint32 -> float32: the odd multiple of 2^-24 in the middle of one of 2^23 equal intervals, so never 0 or 1."""
+def to_unit(x: UInt[Array, "*shape"]) -> Float[Array, "*shape"]:
+    """float32: the odd multiple of 2^-24 in the middle of one of 2^23 equal intervals, so never 0 or 1."""
     return (x >> 9).astype(jnp.float32) * jnp.float32(2**-23) + jnp.float32(2**-24)
 
 
-def reverse_bits(x):
+def reverse_bits(x: Word) -> Word:
     for shift, mask in ((1, 0x55555555), (2, 0x33333333), (4, 0x0F0F0F0F), (8, 0x00FF00FF)):
         x = ((x >> shift) & jnp.uint32(mask)) | ((x & jnp.uint32(mask)) << shift)
     return (x >> 16) | (x << 16)
 
 
-def lattice_point(stream, sample, vertex):
-    """(4,) float32, dimensions of one vertex of one path.
+def lattice_point(stream: Word, sample: Word, vertex: Number) -> Float[Array, "4"]:
+    """Dimensions of one vertex of one path, float32.
 
     Args:
-        stream: () uint32, of `pixel_stream`.
-        sample: () uint32 number of the sample.
-        vertex: () integer; which four dimensions.
+        stream: of `pixel_stream`.
+        sample: number of the sample.
+        vertex: which four dimensions.
     """
     vertex = _u32(vertex)
     generators = at(jnp.asarray(_GENERATORS), vertex % len(_GENERATORS))
     return to_unit(reverse_bits(_u32(sample)) * generators + _hashes(stream, vertex * DIMENSIONS, DIMENSIONS))
 
 
-def independent_point(stream, sample, vertex):
-    """(4,) float32 of `lattice_point`, none of which knows of another."""
+def independent_point(stream: Word, sample: Word, vertex: Number) -> Float[Array, "4"]:
+    """Numbers as of `lattice_point`, none of which knows of another."""
     return to_unit(_point_hashes(stream, sample, vertex))
 
 
-def subpixel_point(stream, sample, vertex):
+def subpixel_point(stream: Word, sample: Word, vertex: Number) -> Float[Array, "4"]:
     """The same, but of four samples in a row each has the film position, the first pair of vertex 0, in its own quarter
     of the unit square, as in smallpt (Beason 2008)."""
     bits, sample = _point_hashes(stream, sample, vertex), _u32(sample)
@@ -91,7 +97,7 @@ def subpixel_point(stream, sample, vertex):
     return to_unit(jnp.concatenate([first, bits[2:]]))
 
 
-def _point_hashes(stream, sample, vertex):
+def _point_hashes(stream: Word, sample: Word, vertex: Number) -> UInt[Array, "4"]:
     return _hashes(path_key(~stream, sample), _u32(vertex) * DIMENSIONS, DIMENSIONS)
 
 
@@ -99,20 +105,20 @@ POINTS = {"lattice": lattice_point, "independent": independent_point, "subpixel"
 SUBPIXELS = 4
 
 
-def pixel_stream(seed, pixel):
-    """() uint32: the stream of one pixel; different for every seed and pixel."""
+def pixel_stream(seed: Number, pixel: Number) -> Word:
+    """The stream of one pixel; different for every seed and pixel."""
     return combine(pixel, hash_u32(_u32(seed)))
 
 
-def path_key(stream, sample):
-    """() uint32: what `hashed` hashes for one sample."""
+def path_key(stream: Word, sample: Word) -> Word:
+    """What `hashed` hashes for one sample."""
     return combine(stream ^ jnp.uint32(0x5BF03635), _u32(sample))
 
 
-def hashed(key, dimension, count: int):
-    """(count,) float32 independent numbers for dimensions dimension, ..., dimension + count - 1 of a path."""
+def hashed(key: Word, dimension: Number, count: int) -> Float[Array, " {count}"]:
+    """Independent numbers for dimensions dimension, ..., dimension + count - 1 of a path."""
     return to_unit(_hashes(key, dimension, count))
 
 
-def _hashes(key, dimension, count):
+def _hashes(key: Word, dimension: Number, count: int) -> UInt[Array, " {count}"]:
     return hash_u32(key + (_u32(dimension) + jnp.arange(count, dtype=jnp.uint32)) * jnp.uint32(0x9E3779B9))

@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 from pathjax.core.math import cos_sin_octant, cos_sin_turns, safe_sqrt
 
 
-def square_to_disk(u):
-    """Concentric map of [0, 1)^2 to the unit disk (Shirley and Chiu 1997): (2,) -> (2,), density 1/pi."""
+def square_to_disk(u: Float[Array, "2"]) -> Float[Array, "2"]:
+    """Concentric map of [0, 1)^2 to the unit disk (Shirley and Chiu 1997), density 1/pi."""
     x, y = 2 * u[0] - 1, 2 * u[1] - 1
     flat = jnp.abs(x) > jnp.abs(y)
     r = jnp.where(flat, x, y)
@@ -19,19 +20,19 @@ def square_to_disk(u):
     return r * jnp.stack([jnp.where(flat, cos, sin), jnp.where(flat, sin, cos)])
 
 
-def square_to_cosine_hemisphere(u):
-    """(2,) -> (3,) unit, z >= 0."""
+def square_to_cosine_hemisphere(u: Float[Array, "2"]) -> Float[Array, "3"]:
+    """Unit directions, z >= 0."""
     p = square_to_disk(u)
     return jnp.stack([p[0], p[1], safe_sqrt(1 - p[0] * p[0] - p[1] * p[1])])
 
 
-def square_to_cosine_hemisphere_pdf(w):
+def square_to_cosine_hemisphere_pdf(w: Float[Array, "3"]) -> Float[Array, ""]:
     """1/sr."""
     return jnp.maximum(w[2], 0) / math.pi
 
 
-def square_to_sphere(u):
-    """(2,) -> (3,) unit."""
+def square_to_sphere(u: Float[Array, "2"]) -> Float[Array, "3"]:
+    """Unit directions, density SPHERE_PDF in 1/sr."""
     z = 1 - 2 * u[1]
     r = safe_sqrt(1 - z * z)
     cos, sin = cos_sin_turns(u[0])
@@ -41,8 +42,8 @@ def square_to_sphere(u):
 SPHERE_PDF = 1 / (4 * math.pi)
 
 
-def square_to_cone(u, one_minus_cos):
-    """Uniform directions around +z up to the angle whose 1 - cos is given: (2,) -> (3,) unit.
+def square_to_cone(u: Float[Array, "2"], one_minus_cos: Float[Array, ""]) -> Float[Array, "3"]:
+    """Uniform unit directions around +z up to the angle whose 1 - cos is given.
 
     1 - cos instead of cos, so that a small distant light keeps its digits.
     """
@@ -52,13 +53,13 @@ def square_to_cone(u, one_minus_cos):
     return jnp.stack([r * cos, r * sin, 1 - h])
 
 
-def cone_pdf(one_minus_cos):
+def cone_pdf(one_minus_cos: Float[Array, ""]) -> Float[Array, ""]:
     """1/sr inside the cone."""
     return 1 / ((2 * math.pi) * one_minus_cos)
 
 
-def square_to_triangle(u):
-    """Barycentric (b1, b2) of a uniform point (Heitz 2019, "A low-distortion map"): (2,) -> (2,), density 1/area."""
+def square_to_triangle(u: Float[Array, "2"]) -> Float[Array, "2"]:
+    """Barycentric (b1, b2) of a uniform point (Heitz 2019, "A low-distortion map"), density 1/area."""
     x, y = u[0], u[1]
     above = y > x
     b1 = jnp.where(above, x / 2, x - y / 2)
@@ -66,11 +67,11 @@ def square_to_triangle(u):
     return jnp.stack([b1, b2])
 
 
-def tent(u):
+def tent(u: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
     """[0, 1) -> [-1, 1], density 1 - |x|."""
     low = u < 0.5
     return jnp.where(low, safe_sqrt(2 * u) - 1, 1 - safe_sqrt(2 - 2 * u))
 
 
-def tent_pdf(x):
+def tent_pdf(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
     return jnp.maximum(1 - jnp.abs(x), 0)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from jax import Array
 
 from pathjax.errors import InputError
 from pathjax.images import exr, file_format, linear_to_srgb, png, read_rgb, srgb_to_linear
@@ -25,7 +26,7 @@ class Target:
         measured: (H, W, 3) or (H, W, 1) bool; the others are left out, whatever they hold, nan included.
     """
 
-    image: np.ndarray
+    image: Array | np.ndarray
     step: np.ndarray | float = 0.0
     ceiling: float = np.inf
     measured: np.ndarray | bool = True

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
 
 from pathjax.description.fields import Fields
 from pathjax.sensors import filters
@@ -68,14 +69,15 @@ class HDRFilm:
 KINDS = {"hdrfilm": HDRFilm}
 
 
-def sample_position(film: Film, pixel, u):
+def sample_position(
+    film: Film, pixel: Int[Array, ""], u: Float[Array, "2"]
+) -> tuple[Float[Array, "2"], Float[Array, ""]]:
     """Where a sample of a pixel looks.
 
     Args:
-        pixel: () int32, row by row over the crop window.
-        u: (2,).
+        pixel: row by row over the crop window.
     Returns:
-        position (2,) in [0, 1]^2 over the whole film (a wide filter reaches beyond), weight () of mean 1.
+        position in [0, 1]^2 over the whole film (a wide filter reaches beyond), and weight, of mean 1.
     """
     x0, y0, width, _ = film.crop
     center = jnp.stack([pixel % width + x0, pixel // width + y0]).astype(u.dtype) + jnp.asarray(0.5, u.dtype)

@@ -25,7 +25,7 @@ def seeds(seed) -> np.ndarray | jax.Array:
     return seeds if isinstance(seeds, jax.core.Tracer) else np.asarray(seeds)
 
 
-def shares(count: np.ndarray) -> np.ndarray:
+def shares(count: np.ndarray | jax.Array) -> np.ndarray | jax.Array:
     """(COUNT, N) int32: samples of each replicate among the first `count`."""
     first_come = COUNT - 1 - np.arange(COUNT, dtype=np.int32)
     return (count + first_come[:, None]) // COUNT
