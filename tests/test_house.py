@@ -100,5 +100,102 @@ def test_no_module_imports_itself_by_way_of_others():
         visit(name)
 
 
+# ---- kinds --------------------------------------------------------------------------------------------------------
+
+ROOMS_OF_KINDS = ("textures", "shapes", "bsdfs", "emitters", "sensors")
+# What still asks which kind something is, to be mended; modules may leave this list and none may join it.
+ASKING = {
+    "pathjax.bench.rays",
+    "pathjax.cli.report",
+    "pathjax.derivatives.gradient",
+    "pathjax.derivatives.ior_step",
+    "pathjax.io.mitsuba.loader",
+    "pathjax.scene.parameters",
+    "pathjax.transport.factors",
+    "pathjax.transport.operators",
+    "pathjax.transport.patches",
+}
+
+
+def classes_of(*rooms: str) -> set[str]:
+    trees = (tree for name, tree in MODULES.items() if room(name) in rooms)
+    return {node.name for tree in trees for node in ast.walk(tree) if isinstance(node, ast.ClassDef)}
+
+
+# Records of a scene file are of kinds as their tables are. These are of no kind: there is one of each.
+KINDS = classes_of(*ROOMS_OF_KINDS, "description") - {"Element", "Document", "Fields", "Parameter", "Description"}
+
+# Fields by which a parameter is named, and would be known for what it is.
+FIELDS = {
+    node.target.id
+    for name, tree in MODULES.items()
+    if room(name) in ("bsdfs", "emitters")
+    for node in ast.walk(tree)
+    if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name)
+} - {"texture"}  # also an element of scene files
+
+
+def names_in(node: ast.AST) -> set[str]:
+    """Of `Kind`, `room.Kind`, `A | B` and `(A, B)`."""
+    names = (n for n in ast.walk(node) if isinstance(n, ast.Name | ast.Attribute))
+    return {n.id if isinstance(n, ast.Name) else n.attr for n in names}
+
+
+def is_call(node: ast.AST, *functions: str) -> bool:
+    return isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in functions
+
+
+def questions(tree: ast.AST, kinds: set[str], fields: set[str]):
+    """What asks whether something is of one of the kinds, or a string whether it names one of the fields."""
+    for node in ast.walk(tree):
+        asked, texts = set(), []
+        if is_call(node, "isinstance", "issubclass"):
+            asked = names_in(node.args[1])
+        elif isinstance(node, ast.MatchClass):
+            asked = names_in(node.cls)
+        elif is_call(node, "hasattr"):
+            texts = node.args[1:]
+        elif isinstance(node, ast.Compare):
+            sides = [node.left, *node.comparators]
+            if any(is_call(n, "type") for side in sides for n in ast.walk(side)):
+                asked = set().union(*map(names_in, sides))
+            texts = [n for side in sides for n in getattr(side, "elts", [side])]
+        elif isinstance(node, ast.MatchValue):
+            texts = [node.value]
+        named = {n.value for n in texts if isinstance(n, ast.Constant) and isinstance(n.value, str)}
+        if asked & kinds or named & fields:
+            yield ast.unparse(node)
+
+
+def test_nobody_outside_a_room_asks_which_kind_something_is():
+    outside = {name: tree for name, tree in MODULES.items() if room(name) not in ROOMS_OF_KINDS}
+    asking = {name for name, tree in outside.items() if list(questions(tree, KINDS, FIELDS))}
+    assert asking == ASKING
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        "isinstance(x, Sphere)",
+        "isinstance(x, rooms.Mesh | int)",
+        "isinstance(x, (int, Sphere))",
+        "type(x) is Sphere",
+        "type(x) in (Sphere, Mesh)",
+        "match x:\n  case rooms.Sphere(): pass",
+        "name == 'int_ior'",
+        "name in ('int_ior', 'x')",
+        "hasattr(x, 'int_ior')",
+        "match name:\n  case 'int_ior': pass",
+    ],
+)
+def test_questions_are_noticed(code):
+    assert list(questions(ast.parse(code), {"Sphere", "Mesh"}, {"int_ior"}))
+
+
+@pytest.mark.parametrize("code", ["isinstance(x, int)", "x.smooth", "x['int_ior']", "Sphere(1)", "type(x) is int"])
+def test_what_asks_of_no_kind_is_none(code):
+    assert not list(questions(ast.parse(code), {"Sphere", "Mesh"}, {"int_ior"}))
+
+
 if __name__ == "__main__":
     pytest.main([__file__])
