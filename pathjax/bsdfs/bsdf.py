@@ -25,6 +25,7 @@ class BSDF(Kind):
     transmissive: ClassVar[bool] = False  # light may pass, and its radiance scale with the IOR
     sided: ClassVar[bool] = False  # lies between two media: one bsdf for both sides of a shape
     branches: ClassVar[bool] = False  # has just two lobes, of which `sample(..., other=True)` gives what is not drawn
+    anisotropic: ClassVar[bool] = False  # x of its frame is the way that u grows, else any
     lobes: ClassVar[bool] = False  # takes a third random number, to choose its lobe
 
     @staticmethod

@@ -145,6 +145,12 @@ def frame_from_normal(n: Float[Array, "3"]) -> Frame:
     return Frame(s, t, n)
 
 
+def shading_frame(surface: Surface) -> Frame:
+    """Frame around the shading normal, along the tangent where the surface has one."""
+    n, s = surface.shading_n, surface.tangent
+    return frame_from_normal(n) if s is None else Frame(s, cross(n, s), n)
+
+
 def to_local(frame: Frame, v: Float[Array, "3"]) -> Float[Array, "3"]:
     return jnp.stack([dot(frame.s, v), dot(frame.t, v), dot(frame.n, v)])
 

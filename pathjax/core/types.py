@@ -41,6 +41,7 @@ class Surface(NamedTuple):
     margin: Float[Array, ""]  # how far along n the rounding error of p may reach
     shading_n: Float[Array, "3"]  # unit shading normal
     uv: Float[Array, "2"]
+    tangent: Float[Array, "3"] | None = None  # unit, the way u grows, across shading_n; None: no bsdf of the scene asks
 
 
 class BSDFSample(NamedTuple):

@@ -11,7 +11,7 @@ from jax import lax
 
 from pathjax import bsdfs, emitters
 from pathjax.core import sampler
-from pathjax.core.math import dot, frame_from_normal, larger, safe_divide, smaller, spawn_ray, to_local, to_world
+from pathjax.core.math import dot, larger, safe_divide, shading_frame, smaller, spawn_ray, to_local, to_world
 from pathjax.core.types import Ray
 from pathjax.emitters import Choice
 from pathjax.errors import InputError
@@ -270,7 +270,7 @@ def shading(materials, ray: Ray, hit, surface):
         frame around the shading normal, wi (3,) in it, kind and row () int32 of the bsdf. Reflectors see either side as
         their front, so their frame is turned towards the ray; glass tells its sides apart.
     """
-    frame = frame_from_normal(surface.shading_n)
+    frame = shading_frame(surface)
     wi = to_local(frame, -ray.d)
     kind, row = bsdfs.select(materials, hit.shape, wi[2] > 0)
     side = jnp.where(bsdfs.has(materials, kind, "sided") | (wi[2] > 0), 1, -1).astype(wi.dtype)

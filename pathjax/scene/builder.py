@@ -33,7 +33,9 @@ def build(description: desc.Description, dtype=jnp.float32, split_rule: str = "s
         raise InputError('dtype = float64, which is off in JAX; call jax.config.update("jax_enable_x64", True) first')
     parameters = Parameters()
     materials = bsdfs.build([shape.bsdf for shape in description.shapes], dtype, ("materials",), parameters)
-    geometry, lamps, trees = shapes.build(description.shapes, dtype, split_rule)
+    geometry, lamps, trees = shapes.build(
+        description.shapes, dtype, split_rule, tangents=bsdfs.occurs(materials, "anisotropic")
+    )
     given = [*(shape.emitter for shape in description.shapes), *description.emitters]
     lights, geometry = emitters.build(given, lamps, geometry, dtype, ("emitters",), parameters)
     integrator = description.integrator

@@ -65,11 +65,11 @@ class _Part(NamedTuple):
     lamp: bool
 
 
-def build(shapes, dtype, rule: str) -> tuple[Geometry, list[Lamp], dict[str, Tree]]:
+def build(shapes, dtype, rule: str, tangents: bool = False) -> tuple[Geometry, list[Lamp], dict[str, Tree]]:
     """Tables of primitives, which lack the numbers of their lights; what emits; hierarchies by `kind`, for reports.
 
     Args:
-        shapes: of `description.Shape`; rule: of `accel.build`.
+        shapes: of `description.Shape`; rule: of `accel.build`; tangents: whether a bsdf asks for them.
     """
     order = dict.fromkeys(kind.table for kind in KINDS.values())
     by_table: dict[type[Table], list[_Part]] = {table: [] for table in order}
@@ -91,7 +91,7 @@ def build(shapes, dtype, rule: str) -> tuple[Geometry, list[Lamp], dict[str, Tre
         tables.append(made)
         trees |= built
     lamps.sort(key=lambda lamp: numbers.index(lamp.shape))
-    geometry = Geometry(tuple(tables), np.asarray(shape_of, np.int32), None)
+    geometry = Geometry(tuple(tables), np.asarray(shape_of, np.int32), None, tangents)
     return geometry, lamps, {kind: tree for kind, tree in trees.items() if tree is not None}
 
 

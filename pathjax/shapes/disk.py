@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pathjax.core.math import cos_sin_turns, safe_sqrt, turns
+from pathjax.core.math import at, cos_sin_turns, safe_sqrt, turns
 from pathjax.core.warp import square_to_disk
 from pathjax.shapes.planar import Planar, PlanarShape
 
@@ -31,6 +31,9 @@ class Disks(Planar):
     @staticmethod
     def uv(x, y):
         return jnp.stack([safe_sqrt(x * x + y * y), turns(y, x)])
+
+    def along_u(self, row, surface):
+        return surface.p - at(self.frames, row, 0)
 
     @staticmethod
     def square(x, y):

@@ -5,7 +5,7 @@ Hits are found on detached rays; `surface` then computes the point again from th
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 
 import jax
@@ -14,7 +14,7 @@ import numpy as np
 from jax import lax
 
 from pathjax.compile.lanes import one_by_one
-from pathjax.core.math import at, integer_like, smaller
+from pathjax.core.math import at, dot, frame_from_normal, integer_like, smaller
 from pathjax.core.types import Hit, Ray, Surface
 from pathjax.shapes.accel import traverse as bvh
 from pathjax.shapes.shape import Lamps, LampSample, Searched, Table
@@ -29,6 +29,7 @@ class Geometry:
     tables: tuple[Table, ...]  # one for each kind of primitive present, through which these are numbered in this order
     shape: jax.Array  # (P,) int32 of each primitive, its place in the scene file
     light: jax.Array | None  # (P,) int32 number of its light; -1: emits nothing. None: lights are not built yet
+    tangents: bool = field(default=False, metadata={"static": True})  # whether `surface` tells them
 
 
 def firsts(geometry: Geometry) -> list[int]:
@@ -90,9 +91,24 @@ def surface(geometry: Geometry, ray: Ray, hit: Hit) -> Surface:
     primitive = jnp.maximum(hit.primitive, 0)
 
     def of(table, start):
-        return lambda: table.surface(jnp.maximum(primitive - start, 0), ray.o, ray.d, hit.t)
+        def see():
+            row = jnp.maximum(primitive - start, 0)
+            seen = table.surface(row, ray.o, ray.d, hit.t)
+            if geometry.tangents:
+                seen = seen._replace(tangent=_tangent(table.along_u(row, seen), seen.shading_n))
+            return seen
+
+        return see
 
     return switch_by_range(primitive, first, [of(*pair) for pair in zip(geometry.tables, first, strict=True)])
+
+
+def _tangent(along_u, n):
+    """Unit vector across n; any, where u does not grow along the surface."""
+    across = along_u - dot(along_u, n) * n
+    squared = dot(across, across)
+    found = squared > 0
+    return jnp.where(found, across * lax.rsqrt(jnp.where(found, squared, 1)), frame_from_normal(n).s)
 
 
 def emits(geometry: Geometry, hit: Hit):

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pathjax.core.math import larger
+from pathjax.core.math import at, larger
 from pathjax.shapes.planar import Planar, PlanarShape
 
 
@@ -32,6 +32,9 @@ class Rectangles(Planar):
         return jnp.stack([(x + 1) / 2, (y + 1) / 2])
 
     square = uv
+
+    def along_u(self, row, surface):
+        return at(self.frames, row, 1)
 
     @staticmethod
     def from_unit_square(u):

@@ -154,6 +154,10 @@ class Table(Searched):
         Differentiable in the ray o, d; t tells apart points, and is not differentiated.
         """
 
+    @abstractmethod
+    def along_u(self, row, surface: Surface):
+        """The way (3,), of any length, in which u of `surface`, a point of this primitive, grows and v does not."""
+
     # ---- light
 
     def sample(self, row, u):

@@ -13,6 +13,7 @@ from jax import lax
 from pathjax.core.math import (
     at,
     cos_sin_turns,
+    cross,
     dot,
     frame_from_normal,
     larger,
@@ -115,6 +116,9 @@ class Spheres(Table):
         n = outward * at(self.sign, row)
         margin = jnp.zeros_like(radius) if self.margins is None else at(self.margins, row)
         return Surface(center + radius * outward, n, margin, n, uv)
+
+    def along_u(self, row, surface):
+        return cross(at(self.to_local, row)[2], surface.p - at(self.balls, row)[:3])
 
     def sample_lamp(self, lamps, lamp, ref, u, u_part):
         """Uniform over the cone that the sphere fills seen from `ref`, or over its area from inside."""

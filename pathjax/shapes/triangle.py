@@ -169,6 +169,15 @@ class Triangles(Table):
             margin = margin + at(self.margins, row)
         return Surface(interpolate(vertices), n, margin, shading_n, uv)
 
+    def along_u(self, row, surface):
+        """Nowhere, where the mesh has no uv or squeezes it to a line."""
+        if self.uv is None:
+            return jnp.zeros_like(surface.p)
+        a, b, c = at(self.vertices, row)
+        uv = at(self.uv, row)
+        (u1, v1), (u2, v2) = uv[1] - uv[0], uv[2] - uv[0]
+        return jnp.sign(u1 * v2 - u2 * v1) * (v2 * (b - a) - v1 * (c - a))
+
     def sample(self, row, u):
         return self.from_square(row, square_to_triangle(u))
 
