@@ -63,12 +63,13 @@ def build(
     made, light, number = [], np.full(len(shapes.shape), -1, np.int32), 0
     for kind, instances in (*inside.items(), *sorted(outside.items(), key=lambda item: item[0].distant)):
         table = kind.build(instances, dtype, (*path, len(made), "table"), parameters, None)
-        shining = [lamp for lamp in lamps if emitters[lamp.shape].kind is kind]
+        shining = [lamp for lamp in lamps if emitters[lamp.shape].kind is kind]  # of kinds outside of shapes: nothing
         for lamp in shining:
             light[lamp.primitive : lamp.primitive + lamp.count] = number
             number += 1
-        rows = np.asarray([instances.index(emitters[lamp.shape]) for lamp in shining], np.int32)
-        made.append(Lights(table, lamp_table(shining, dtype), rows) if shining else Lights(table, None, None))
+        rows = {instance: row for row, instance in enumerate(instances)}
+        row_of = np.asarray([rows[emitters[lamp.shape]] for lamp in shining], np.int32)
+        made.append(Lights(table, lamp_table(shining, dtype), row_of) if shining else Lights(table, None, None))
     return tuple(made), replace(shapes, light=light)
 
 
@@ -79,7 +80,7 @@ def name(lights: Lights) -> str:
 
 def sampled(emitters: tuple[Lights, ...]) -> bool:
     """Whether strategy "mis" samples lights."""
-    return any(not lights.kind.left_to_bsdfs for lights in emitters)
+    return any(not lights.left_to_bsdfs for lights in emitters)
 
 
 def darkness(emitters: tuple[Lights, ...]) -> str | None:

@@ -18,7 +18,6 @@ class Emitter(Kind):
 
     on_surfaces: ClassVar[bool] = False  # stands inside a shape
     distant: ClassVar[bool] = False  # infinitely far
-    left_to_bsdfs: ClassVar[bool] = False  # bsdf sampling finds it with less noise: sampled by strategy "light" alone
 
     @staticmethod
     @abstractmethod
@@ -47,6 +46,7 @@ class Background(Emitter):
     """Radiance from all directions in which nothing is hit. Several of them add up, and are sampled as one mixture."""
 
     distant = True
+    left_to_bsdfs: ClassVar[bool] = False  # which find it with less noise: it is sampled by strategy "light" alone
 
     @staticmethod
     @abstractmethod

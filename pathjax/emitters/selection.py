@@ -10,7 +10,7 @@ import numpy as np
 from jax import lax
 
 from pathjax.core.math import at
-from pathjax.emitters.emitter import Emitter
+from pathjax.emitters.emitter import Background, Emitter
 from pathjax.kinds import Color, Row, Table
 from pathjax.shapes import Lamps
 
@@ -33,6 +33,10 @@ class Lights:
         if self.lamps is not None:
             return self.lamps.area.shape[0]
         return next(column.values.shape[0] for column in self.table.columns if column is not None)
+
+    @property
+    def left_to_bsdfs(self) -> bool:
+        return issubclass(self.kind, Background) and self.kind.left_to_bsdfs
 
     def parameters(self, light) -> Row:
         """Of the light () int32 of this kind."""
@@ -75,7 +79,7 @@ def choice(emitters: tuple[Lights, ...], strategy: str) -> Choice | None:
     powers: dict[bool, list] = {False: [], True: []}  # by whether they are distant, as tables are ordered
     count = 0
     for lights in emitters:
-        sampled = strategy == "light" or not lights.kind.left_to_bsdfs
+        sampled = strategy == "light" or not lights.left_to_bsdfs
         first.append(count if sampled else None)
         if sampled:
             powers[lights.kind.distant].append(lights.power())

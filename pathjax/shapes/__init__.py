@@ -90,7 +90,7 @@ def build(shapes, dtype, rule: str, tangents: bool = False) -> tuple[Geometry, l
         made, built = table.build(primitives, lit, dtype, rule, margins.get(table))
         tables.append(made)
         trees |= built
-    lamps.sort(key=lambda lamp: numbers.index(lamp.shape))
+    lamps.sort(key=lambda lamp: (shapes[lamp.shape].geometry.comes_last, lamp.shape))
     geometry = Geometry(tuple(tables), np.asarray(shape_of, np.int32), None, tangents)
     return geometry, lamps, {kind: tree for kind, tree in trees.items() if tree is not None}
 

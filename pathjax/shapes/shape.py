@@ -42,6 +42,11 @@ class Shape(ABC):
         return False
 
     @property
+    def smooth(self) -> bool:
+        """Whether it is made of flat pieces that are shaded as if they were curved."""
+        return False
+
+    @property
     def empty(self) -> bool:
         """Whether there is nothing of it that a ray could meet."""
         return False

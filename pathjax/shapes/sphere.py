@@ -202,7 +202,7 @@ class Sphere(Shape):
 
     @property
     def mirrored(self):
-        return np.linalg.det(self.to_world[:3, :3]) < 0
+        return bool(np.linalg.det(self.to_world[:3, :3]) < 0)
 
     def primitives(self, flip):
         linear = self.to_world[:3, :3]

@@ -242,6 +242,10 @@ class Mesh(Shape):
         )
 
     @property
+    def smooth(self):
+        return self.normals is not None
+
+    @property
     def empty(self):
         return not len(self.faces)
 

@@ -116,7 +116,7 @@ def _diffuse_rows(scene: Scene, faceted) -> np.ndarray:
         rows[shape, side] = row
     if not faceted and scene.about is not None:
         for number, shape in enumerate(scene.about.description.shapes):
-            if getattr(shape.geometry, "normals", None) is not None:
+            if shape.geometry.smooth:
                 raise InputError(
                     f"{_name(scene, number)} has smooth normals, and patches are flat; load it with face_normals, or "
                     "pass faceted=True to take its triangles as they are"
