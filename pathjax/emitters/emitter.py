@@ -12,8 +12,8 @@ class Emitter(Kind):
     """A kind of light: `SurfaceEmitter`, `Background` or `DiracEmitter`.
 
     A class declares its parameters. Colours that are 0 where it is dark are declared with `radiance=True`. Directions
-    are unit and in world space; everything may be differentiated in the parameters, and what is drawn is detached by
-    the caller.
+    are unit and in world space. Nothing may be NaN; where no light arrives it is 0. All is differentiated as it is
+    written, so the derivative in a parameter that moves a light lacks the edges of shadows. The choice is detached.
     """
 
     on_surfaces: ClassVar[bool] = False  # stands inside a shape
