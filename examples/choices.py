@@ -21,7 +21,7 @@ import pathjax as pj
 from pathjax import transport
 from pathjax.bench import figures, plot
 from pathjax.bsdfs import FRESNEL
-from pathjax.integrators.path import SAMPLERS, STRATEGIES
+from pathjax.integrators.options import SAMPLERS, STRATEGIES
 from pathjax.scene import UNBOUNDED, Scene, build
 from pathjax.shapes.accel.build import RULES
 

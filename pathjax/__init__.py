@@ -1,7 +1,7 @@
 """pathjax: a differentiable Monte Carlo path tracer in pure JAX."""
 
 from pathjax.compile import runtime as _runtime  # noqa: F401  first: sets XLA up before a backend starts
-from pathjax.derivatives.gradient import Jacobian, jacobian
+from pathjax.derivatives.jacobian import Jacobian, jacobian
 from pathjax.errors import InputError, InputWarning
 from pathjax.io.load import load_scene
 from pathjax.rendering.aovs import render_aovs

@@ -15,8 +15,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pathjax.derivatives import gradient
+from pathjax.derivatives import jacobian, tangents
 from pathjax.integrators import pixel
+from pathjax.integrators.options import DEFAULTS
 from pathjax.io.mitsuba import loader as mitsuba_xml
 from pathjax.rendering.render import pixel_means
 from pathjax.scene import build
@@ -147,7 +148,7 @@ def kernel_of(shipped):
         scene = shipped(name, dtype, res=16)
         pixels = jnp.arange(pixel_count(scene.film), dtype=jnp.int32)
         numbers = pixel.numbers(pixels, 0, 1, 1)
-        lowered = pixel_means.lower(replace(scene, about=None), pixels, *numbers, strategy="mis")
+        lowered = pixel_means.lower(replace(scene, about=None), pixels, *numbers, options=DEFAULTS)
         return Kernel(scene, lowered.compile())
 
     return compile
@@ -177,14 +178,14 @@ def jacobian_kernel_of(shipped):
     def compile(name, which):
         scene = shipped(name, res=16)
         parameters = scene.about.parameters.values()
-        glass = sorted({p.index[0] for p in parameters if gradient.is_glass(p)}) if which != "colours" else ()
-        colors = [(p.path, p.index) for p in parameters if not gradient.is_glass(p)] if which != "glass" else ()
-        wanted = gradient.Wanted(tuple(colors), tuple(glass))
+        glass = sorted({p.index[0] for p in parameters if p.moves_paths}) if which != "colours" else ()
+        colors = [p for p in parameters if not p.moves_paths] if which != "glass" else ()
+        wanted = jacobian.Wanted(tangents.places(colors), tuple(glass))
         pixels = jnp.arange(pixel_count(scene.film), dtype=jnp.int32)
         numbers = pixel.numbers(pixels, 0, 1, 1)
         steps = jnp.full(len(glass), 0.02)
-        lowered = gradient._jacobians.lower(
-            replace(scene, about=None), pixels, *numbers, steps, wanted=wanted, strategy="mis"
+        lowered = jacobian._jacobians.lower(
+            replace(scene, about=None), pixels, *numbers, steps, wanted=wanted, options=DEFAULTS
         )
         return JacobianKernel(scene, lowered.compile())
 

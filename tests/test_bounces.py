@@ -9,6 +9,7 @@ import pytest
 
 import pathjax as pj
 from pathjax.compile import runtime
+from pathjax.integrators.options import Options
 from pathjax.rendering import bounces, tail
 
 RHO = np.array([0.2, 0.5, 0.8])
@@ -223,7 +224,8 @@ def test_terms_are_one_native_kernel(furnace, derivative):
     colors = ((parameter.path, parameter.index),) if derivative else ()
     pixels = jnp.arange(256, dtype=jnp.int32)
     work = pixels, 0, jnp.full((4, 256), 4), jnp.arange(4, dtype=jnp.uint32)
-    lowered = bounces._kernel.lower(replace(furnace, about=None), *work, depth=DEPTH, strategy="mis", colors=colors)
+    static = {"depth": DEPTH, "options": Options(by_vertex=True), "colors": colors}
+    lowered = bounces._kernel.lower(replace(furnace, about=None), *work, **static)
     text = lowered.compile().as_text()
     entry = text[text.index("\nENTRY ") :]
     assert entry.count("xla_cpu_small_call") == 1 and " while(" not in entry

@@ -10,7 +10,8 @@ import pytest
 import pathjax as pj
 from pathjax import bsdfs
 from pathjax.compile import runtime
-from pathjax.integrators import path, pixel
+from pathjax.integrators import pixel
+from pathjax.integrators.options import MOST_SPLITS, Options
 from pathjax.rendering.render import pixel_means, render_pixels
 
 INTERFACE = """
@@ -143,10 +144,10 @@ def test_two_by_two_strata_lower_the_error_of_independent_numbers(make_scene, es
 # ---- what is compiled -----------------------------------------------------------------------------------------------
 
 
-def lowered(scene, fresnel="exact", **static):
+def lowered(scene, form=None, **chosen):
     pixels = jnp.arange(256, dtype=jnp.int32)
-    scene = replace(scene, materials=bsdfs.with_fresnel(scene.materials, fresnel), about=None)
-    return pixel_means.lower(scene, pixels, *pixel.numbers(pixels, 0, 4, 1), strategy="mis", **static)
+    work = replace(scene, about=None), pixels, *pixel.numbers(pixels, 0, 4, 1)
+    return pixel_means.lower(*work, options=Options(**chosen), form=form)
 
 
 TRACES = {  # what the debug information of a program names, if it was chosen
@@ -183,7 +184,7 @@ def test_vectorised_form_splits_into_the_same_image(default):
     images = [pj.render(scene, 4, split_depth=2)]
     pixels = jnp.arange(144, dtype=jnp.int32)
     for form in ("loop", "vmap"):
-        images.append(render_pixels(scene, pixels, 0, 4, 0, split_depth=2, form=form).reshape(12, 12, 3))
+        images.append(render_pixels(scene, pixels, 0, 4, 0, Options(split_depth=2), form=form).reshape(12, 12, 3))
     for image in images[1:]:
         assert np.isclose(images[0], image, rtol=1e-4, atol=1e-5).all(-1).mean() > 0.97
 
@@ -207,7 +208,7 @@ def test_float64_splits_into_the_same_image(shipped, default, x64):
         ({"fresnel": "shlick"}, "fresnel 'shlick' is unknown; use one of exact, schlick"),
         ({"sampler": "sobol"}, "sampler 'sobol' is unknown"),
         ({"split_depth": -1}, "split_depth = -1"),
-        ({"split_depth": path.MOST_SPLITS + 1}, "split_depth = 9"),
+        ({"split_depth": MOST_SPLITS + 1}, "split_depth = 9"),
         ({"split_depth": 1.5}, "split_depth = 1.5"),
         ({"sampler": "subpixel", "spp": 6}, "spp = 6.*multiple of 4"),
     ],

@@ -15,8 +15,9 @@ import pathjax as pj
 from pathjax.compile import runtime
 from pathjax.compile.lanes import lanes
 from pathjax.compile.lanes.interpreter import Lanes
-from pathjax.derivatives import gradient, ior_step
+from pathjax.derivatives import ior_step, jacobian, tangents
 from pathjax.integrators import pixel
+from pathjax.integrators.options import DEFAULTS, Options
 from pathjax.rendering import aovs, bounces, query
 from pathjax.rendering.progressive import replicates
 from pathjax.rendering.render import pixel_means
@@ -36,7 +37,7 @@ pytestmark = pytest.mark.skipif(not runtime.native(), reason="native loops are o
 def lowered(scene, strategy="mis", devices=None, pixels=256, form=None):
     pixels = jnp.arange(pixels, dtype=jnp.int32)
     numbers = pixel.numbers(pixels, 0, 4, 1)
-    static = {"strategy": strategy, "devices": devices, "form": form}
+    static = {"options": Options(strategy), "devices": devices, "form": form}
     return pixel_means.lower(replace(scene, about=None), pixels, *numbers, **static)
 
 
@@ -182,8 +183,8 @@ def test_no_primitive_of_an_image_is_left_to_vmap(shipped, left_to_vmap, name):
     scene = replace(shipped(name, res=16), about=None)
     pixels = jnp.arange(256, dtype=jnp.int32)
     work = pixels, *pixel.numbers(pixels, 0, 4, 1)
-    for how in ({"strategy": "mis"}, {"strategy": "light", "split_depth": 2, "sampler": "subpixel"}):
-        trace(pixel_means, scene, *work, **how)
+    for options in (DEFAULTS, Options("light", split_depth=2, sampler="subpixel")):
+        trace(pixel_means, scene, *work, options=options)
     trace(aovs._render_aovs, scene, *work)
     trace(query._closest_hit, scene.geometry, jnp.ones((1000, 3)), jnp.ones((1000, 3)))
     assert not left_to_vmap
@@ -195,7 +196,7 @@ def test_no_primitive_of_light_on_patches_is_left_to_vmap(shipped, left_to_vmap)
     work = pixels, *pixel.numbers(pixels, 0, 4, 1)
     cells, one, seed = patches.cut(shipped("cornell_box", res=16), 50), jnp.uint32(1), jnp.uint32(2)
     light = view.radiosity(cells, jnp.ones((cells.count, 3)))
-    trace(pixel_means, scene, *work, control.Control(light, jnp.float32(2)), strategy="mis")
+    trace(pixel_means, scene, *work, control.Control(light, jnp.float32(2)), options=Options(controlled=True))
     trace(view._seen, scene, cells, pixels, one, seed)
     trace(rays._cast, scene.geometry, cells, pixels, pixels, seed)
     trace(factors._visibility, scene.geometry, cells, pixels % 50, pixels % 49, jnp.int32(8), seed)
@@ -212,20 +213,20 @@ def test_no_primitive_of_a_derivative_is_left_to_vmap(shipped, left_to_vmap, nam
     """Nor of the terms of the series, from which derivatives are taken too, nor of the step of an IOR."""
     scene = shipped(name, res=16)
     parameters = scene.about.parameters.values()
-    colors = tuple((p.path, p.index) for p in parameters if not gradient.is_glass(p))
-    glass = sorted({p.index[0] for p in parameters if gradient.is_glass(p)})
+    colors = tangents.places(p for p in parameters if not p.moves_paths)
+    glass = sorted({p.index[0] for p in parameters if p.moves_paths})
     scene, pixels = replace(scene, about=None), jnp.arange(256, dtype=jnp.int32)
     work = pixels, *pixel.numbers(pixels, 0, 4, 1)
-    wanted = gradient.Wanted(colors, tuple(glass))
-    trace(gradient._jacobians, scene, *work, jnp.full(len(glass), 0.02), wanted=wanted, strategy="mis")
+    wanted = jacobian.Wanted(colors, tuple(glass))
+    trace(jacobian._jacobians, scene, *work, jnp.full(len(glass), 0.02), wanted=wanted, options=DEFAULTS)
     series = pixels, jnp.uint32(0), jnp.ones((replicates.COUNT, 256), jnp.uint32), replicates.seeds(1)
-    trace(bounces._kernel, scene, *series, depth=3, strategy="mis", colors=colors)
+    trace(bounces._kernel, scene, *series, depth=3, options=Options(by_vertex=True, derivative=True), colors=colors)
     if glass:
         trace(ior_step.motions, scene, jnp.asarray(glass, jnp.int32))
-        attached = tuple((p.path, p.index) for p in parameters if gradient.is_glass(p))
-        choosing = gradient._choosing_by(scene, glass)
-        wanted = gradient.Wanted(attached, ())
-        trace(gradient._jacobians, choosing, *work, jnp.zeros(0), wanted=wanted, strategy="mis")
+        attached = tangents.places(p for p in parameters if p.moves_paths)
+        choosing = jacobian.choosing_by_present_iors(scene, glass)
+        wanted = jacobian.Wanted(attached, ())
+        trace(jacobian._jacobians, choosing, *work, jnp.zeros(0), wanted=wanted, options=DEFAULTS)
     assert not left_to_vmap
 
 

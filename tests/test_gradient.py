@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 import pathjax as pj
-from pathjax.derivatives import gradient, ior_step
+from pathjax.derivatives import ior_difference, ior_step, jacobian
 from pathjax.images import write_exr
+from pathjax.integrators.options import DEFAULTS
 from pathjax.scene import parameters as named
 from pathjax.sensors.film import pixel_count
 
@@ -702,6 +703,35 @@ def test_every_transformation_gives_the_jacobian(dim_plane):
         np.testing.assert_allclose(its, mine, **close)
 
 
+def test_a_table_set_by_hand_has_its_derivative_too(dim_plane):
+    """Beside parameters set by name: a table without any is refused, one that holds some is differentiated in all."""
+    sky = pj.parameters(dim_plane)["sky.radiance"]
+
+    def image(albedo, radiance):
+        emitters = dim_plane.emitters
+        by_hand = replace(emitters, constant=replace(emitters.constant, radiance=radiance))
+        return pj.render(pj.with_parameters(replace(dim_plane, emitters=by_hand), {PLATE: albedo}), 2)
+
+    at = pj.parameters(dim_plane)[PLATE], sky
+    direction = jnp.asarray([0.3, -0.2, 0.5]), jnp.asarray([1.0, 2.0, -1.0])
+    by_name = jax.jvp(plane_image(dim_plane), at, direction)[1]
+    np.testing.assert_allclose(jax.jvp(image, at, direction)[1], by_name, rtol=1e-6)
+
+
+def test_second_derivative_in_a_colour_is_that_of_the_series(furnace):
+    """1 + rho + rho^2, sample by sample."""
+    scene = without_roulette(furnace, 3)
+
+    def slope(rho):
+        one = jnp.ones(3)
+        image = lambda rho: pj.render(pj.with_parameters(scene, {FURNACE_NAMES[0]: rho}), 1, strategy="bsdf")  # noqa: E731
+        return jax.jvp(image, (rho,), (one,))[1]
+
+    slopes, curvature = jax.jvp(slope, (jnp.asarray(RHO, jnp.float32),), (jnp.ones(3),))
+    np.testing.assert_allclose(slopes, np.broadcast_to(1 + 2 * RHO, (8, 8, 3)), rtol=1e-5)
+    np.testing.assert_allclose(curvature, np.full((8, 8, 3), 2), rtol=1e-5)
+
+
 def test_jacobian_inside_the_users_jit(dim_plane):
     def weighted(albedo):
         scene = pj.with_parameters(dim_plane, {PLATE: albedo})
@@ -775,9 +805,7 @@ def test_jacobian_is_the_same_on_every_number_of_devices(plane, ball_before_chec
     wanted = {name: named.find(scene, name) for name in names}
     pixels = jnp.arange(pixel_count(scene.film), dtype=jnp.int32)
     one, all_of_them = (
-        gradient.pixel_jacobians(
-            scene, wanted, pixels, 0, 4, 1, strategy="mis", method="difference", step=0.01, **devices
-        )
+        jacobian.pixel_jacobians(replace(scene, about=None), wanted, pixels, 0, 4, 1, DEFAULTS, step=0.01, **devices)
         for devices in ({"devices": 1}, {})
     )
     jax.tree.map(np.testing.assert_array_equal, one[0], all_of_them[0])
@@ -912,7 +940,7 @@ def test_colours_of_every_scene_against_differences(shipped, derivatives, agree,
 def test_more_dielectrics_than_one_kernel_takes(shipped, monkeypatch):
     scene, names = shipped("glass_and_mirror", res=8), ["glass.int_ior", "block-glass.int_ior"]
     _, together = pj.jacobian(scene, names, spp=2)
-    monkeypatch.setattr(gradient, "MOST_GLASS", 1)
+    monkeypatch.setattr(ior_difference, "MOST_GLASS", 1)
     _, apart = pj.jacobian(scene, names, spp=2)
     for name in names:
         np.testing.assert_allclose(apart[name], together[name], atol=1e-5)

@@ -9,11 +9,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax import lax
 
 import pathjax as pj
 from pathjax import emitters
 from pathjax.compile.runtime import native_map
 from pathjax.integrators import path
+from pathjax.integrators.options import Options
+from pathjax.integrators.random_numbers import Bounce
 from pathjax.rendering.render import render_pixels
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -367,9 +370,11 @@ def test_random_numbers_at_their_ends_give_finite_light(shipped, name, strategy)
     def radiances(items, scene, choice):
         def one(item, scene, choice):
             position, u, u_lens = item
-            bounce = path.Bounce(u[0:2], u[2:4], u[4], u[5])
-            ray = scene.camera.sample_ray(position, u_lens)
-            return path.trace(scene, choice, ray, lambda _: bounce, strategy).L
+            bounce, options = Bounce(u[0:2], u[2:4], u[4], u[5]), Options(strategy)
+            start = path.start(scene, scene.camera.sample_ray(position, u_lens), options)
+            return lax.while_loop(
+                lambda now: now.alive, lambda now: path.extend(scene, choice, now, bounce, options), start
+            ).L
 
         return native_map(one, items, scene, choice)
 
@@ -392,7 +397,7 @@ def test_film_samples_at_the_ends_of_random_numbers_are_finite(shipped):
 def test_a_million_samples_keep_their_digits(shipped):
     """By bsdf sampling every sample of a furnace is exact: what is off is the sum. A plain one loses 1e-3."""
     scene = shipped("furnace", res=16, max_depth=3)
-    image = render_pixels(scene, jnp.arange(4, dtype=jnp.int32), 0, 10**6, 1, "bsdf")
+    image = render_pixels(scene, jnp.arange(4, dtype=jnp.int32), 0, 10**6, 1, Options("bsdf"))
     expected = (1 - RHO**3) / (1 - RHO)
     np.testing.assert_allclose(image, np.broadcast_to(expected, image.shape), rtol=2e-6)
 
@@ -401,7 +406,7 @@ def test_a_million_samples_keep_their_digits(shipped):
 def test_a_million_noisy_samples_have_the_right_mean(shipped):
     """To 1e-5, and four standard errors of 32 pixels, which are about as much."""
     scene = shipped("furnace", res=16, max_depth=3)
-    pixels = np.asarray(render_pixels(scene, jnp.arange(32, dtype=jnp.int32), 0, 10**6, 1, "mis"), float)
+    pixels = np.asarray(render_pixels(scene, jnp.arange(32, dtype=jnp.int32), 0, 10**6, 1), float)
     expected, error = (1 - RHO**3) / (1 - RHO), pixels.std(0, ddof=1) / 32**0.5
     assert (error < 2e-5 * expected).all()
     assert (np.abs(pixels.mean(0) - expected) < 1e-5 * expected + 4 * error).all()

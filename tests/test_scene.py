@@ -243,6 +243,27 @@ def test_derivative_passes_through_with_parameters(zoo):
     np.testing.assert_array_equal(jax.grad(total)(jnp.full(3, 0.5)), [1, 1, 1])
 
 
+def test_scenes_of_other_known_values_have_the_structure_of_the_first(zoo):
+    """So that they can be stacked, and share kernels; traced values are kept by name beside the tables."""
+    changed = pj.with_parameters(zoo, {"glass.int_ior": 1.7, "paint.reflectance": 0.1})
+    assert jax.tree.structure(changed) == jax.tree.structure(zoo)
+
+    def inside(color):
+        scene = pj.with_parameters(zoo, {"paint.reflectance": color, "glass.int_ior": 1.7})
+        assert set(scene.varied) == {"paint.reflectance"}
+        known = pj.with_parameters(scene, {"paint.reflectance": 0.1})
+        assert jax.tree.structure(known) == jax.tree.structure(zoo)
+        return color
+
+    jax.jvp(inside, (jnp.ones(3),), (jnp.ones(3),))
+
+
+def test_a_scene_made_in_a_jitted_function_holds_its_values(zoo):
+    made = jax.jit(lambda color: pj.with_parameters(zoo, {"paint.reflectance": color}))(jnp.array([0.1, 0.2, 0.3]))
+    np.testing.assert_allclose(values(made)["paint.reflectance"], [0.1, 0.2, 0.3])
+    np.testing.assert_allclose(values(pj.with_parameters(made, {"paint.reflectance": 0.4}))["paint.reflectance"], 0.4)
+
+
 def test_float64_is_refused_where_jax_would_cut_it_down(zoo, x64):
     with pytest.raises(pj.InputError, match="jax_enable_x64"):
         build(zoo.about.description, jnp.float64)

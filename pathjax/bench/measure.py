@@ -17,7 +17,7 @@ import pathjax
 from pathjax.bench import figures, peers, rays
 from pathjax.bench.figures import Reference
 from pathjax.bench.peers.mitsuba3 import SAMPLERS
-from pathjax.integrators.path import STRATEGIES
+from pathjax.integrators.options import STRATEGIES
 from pathjax.scene.scene import Scene
 from pathjax.sensors import film
 

@@ -10,11 +10,11 @@ from jax import lax
 from pathjax import bsdfs
 from pathjax.bsdfs import dielectric
 from pathjax.compile.runtime import native_map
-from pathjax.core.math import at, dot, safe_divide, spawn_ray, to_world
+from pathjax.core.math import at, dot, safe_divide, spawn_ray
+from pathjax.derivatives import ior
 from pathjax.integrators import path
-from pathjax.kinds import Table
-from pathjax.scene import parameters as named
-from pathjax.scene.scene import Scene
+from pathjax.integrators.random_numbers import bsdf_dimensions
+from pathjax.integrators.vertex import vertex
 from pathjax.sensors import film
 from pathjax.shapes import geometry
 
@@ -26,19 +26,13 @@ MIN_STEP, MAX_STEP = 2e-4, 0.03
 _PILOTS, _PILOT_DEPTH = 1024, 12
 
 
-def dielectrics(scene: Scene) -> tuple[int, Table]:
-    """Place of the table of dielectrics, and the table."""
-    return next((i, t) for i, t in enumerate(scene.materials.tables) if t.kind.branches)
-
-
 def steps(scene, rows, step):
-    """(G,) steps of the relative IOR."""
-    _, table = dielectrics(scene) if rows else (None, None)
+    """(G,) steps of the relative IOR of some dielectrics; `step`, if that is not None."""
     dtype = scene.camera.origin.dtype
     if not rows:
         return jnp.zeros((0,), dtype)
     rows = jnp.asarray(rows, jnp.int32)
-    ratio = dielectric.relative_ior(table)[rows]
+    ratio = dielectric.relative_ior(ior.table(scene))[rows]
     if step is not None:
         # Twice the step must leave a positive IOR.
         return jnp.minimum(jnp.asarray(step, dtype), 0.4 * ratio)
@@ -64,30 +58,30 @@ def _median(x):
 
 def _motion(pixel_number, scene, row):
     """Pixels per unit of relative IOR of one dielectric, for the ray through the middle of a pixel; NaN: not seen."""
-    place, table = dielectrics(scene)
-    ratio = at(dielectric.relative_ior(table), row)
+    table = ior.table(scene)
+    ratios = dielectric.relative_ior(table)
+    ratio = at(ratios, row)
     half = jnp.full((2,), 0.5, ratio.dtype)
     middle, _ = film.sample_position(scene.film, pixel_number, half)
     size = jnp.array([scene.film.width, scene.film.height], ratio.dtype)
 
     def seen(x):
         """Where the ray ends that refracts wherever it can: a point, or a direction if it hits nothing."""
-        varied = dielectric.with_relative_ior(table, x[0], jnp.arange(len(dielectric.relative_ior(table))) == row)
-        materials = named.put(scene.materials, ("tables", place), varied)
+        varied = ior.with_table(scene, dielectric.with_relative_ior(table, x[0], jnp.arange(len(ratios)) == row))
         ray = scene.camera.sample_ray(middle + x[1:] / size, half)
+
+        refracts = jnp.full((bsdf_dimensions(scene.materials),), 1 - 2**-24, ratio.dtype)
 
         def extend(state):
             ray, _, met, depth, _ = state
             hit = geometry.closest_hit(scene.geometry, ray)
             found = hit.primitive >= 0
-            surface = geometry.surface(scene.geometry, ray, hit)
-            frame, wi, kind, at_row = path.shading(materials, ray, hit, surface)
-            drawn = bsdfs.sample(materials, kind, at_row, surface, wi, jnp.full_like(half, 1 - 2**-24))
-            d = to_world(frame, drawn.wo)
-            on = found & drawn.delta & (kind >= 0)
-            end = jnp.where(found, surface.p, ray.d)
-            met = met | (found & bsdfs.has(materials, kind, "moves_paths") & (at_row == row))
-            return spawn_ray(surface, d, hit.primitive), end, met, depth + 1, on
+            here = vertex(varied, ray, hit)
+            drawn, d = path.bsdf_sample(varied, here, refracts)
+            on = found & drawn.delta & (here.kind >= 0)
+            end = jnp.where(found, here.surface.p, ray.d)
+            met = met | (found & bsdfs.has(varied.materials, here.kind, "moves_paths") & (here.row == row))
+            return spawn_ray(here.surface, d, hit.primitive), end, met, depth + 1, on
 
         start = ray, ray.o, jnp.bool_(False), jnp.int32(0), jnp.bool_(True)
         _, end, met, _, unfinished = lax.while_loop(lambda s: s[-1] & (s[-2] < _PILOT_DEPTH), extend, start)

@@ -12,7 +12,9 @@ from pathjax import bsdfs
 from pathjax.core import sampler
 from pathjax.core.math import dot, spawn_ray
 from pathjax.integrators import path
-from pathjax.integrators.pixel import camera_path
+from pathjax.integrators.pixel import camera_ray
+from pathjax.integrators.random_numbers import bounce_numbers
+from pathjax.integrators.vertex import vertex
 from pathjax.shapes import geometry
 
 
@@ -38,20 +40,20 @@ def mean(work, scene) -> FirstHit:
 
 
 def sample(scene, pixel, stream, number) -> FirstHit:
-    """One sample, at the film position of `pixel.camera_path`."""
-    start, weight = camera_path(scene, pixel, stream, number)
+    """One sample, at the film position of `pixel.camera_ray`."""
+    ray, weight = camera_ray(scene, pixel, stream, number)
     if not scene.geometry.tables:
         return _nothing(scene)
-    ray, hit, passed = _first(scene, start.ray)
+    ray, hit, passed = _first(scene, ray)
 
     def seen():
-        surface = geometry.surface(scene.geometry, ray, hit)
-        _, wi, kind, row = path.shading(scene.materials, ray, hit, surface)
-        u = path.bounce_numbers(scene, stream, number, start.depth)
+        here = vertex(scene, ray, hit)
+        u = bounce_numbers(scene, stream, number, jnp.int32(0))
         # The mean weight of a bsdf sample is the albedo, exact where all directions carry the same.
-        drawn = bsdfs.sample(scene.materials, kind, row, surface, wi, u.bsdf)
-        albedo = jnp.where(bsdfs.has(scene.materials, kind, "transmissive"), 1, jnp.where(kind >= 0, drawn.weight, 0))
-        return FirstHit((passed + hit.t)[None], surface.shading_n, albedo)
+        drawn, _ = path.bsdf_sample(scene, here, u.bsdf)
+        transmits = bsdfs.has(scene.materials, here.kind, "transmissive")
+        albedo = jnp.where(transmits, 1, jnp.where(here.kind >= 0, drawn.weight, 0))
+        return FirstHit((passed + hit.t)[None], here.surface.shading_n, albedo)
 
     found = lax.cond(hit.primitive >= 0, seen, lambda: _nothing(scene))
     return jax.tree.map(lambda x: weight * x, found)

@@ -11,7 +11,9 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from pathjax.core.math import at
+from pathjax import bsdfs
+from pathjax.core.math import at, spawn_ray, to_world
+from pathjax.integrators.vertex import Vertex
 
 
 def start(path, depth: int):
@@ -21,7 +23,33 @@ def start(path, depth: int):
     return path._replace(pending=nothing)
 
 
-def push(path, branch):
+def takes_place(scene, here: Vertex, path):
+    """() bool: whether both branches are followed at a vertex."""
+    return bsdfs.has(scene.materials, here.kind, "branches") & (path.splits > 0)
+
+
+def split(scene, here: Vertex, u, splits, path, on):
+    """The path behind a vertex, `on`, which has taken one branch there; where it `splits`, the other one waits.
+
+    Args:
+        u: of `Bounce.bsdf`; path: before the vertex.
+    """
+
+    def with_other(path, on):
+        other = bsdfs.sample_other(scene.materials, here.row, here.surface, here.wi, u)
+        branch = on._replace(
+            ray=spawn_ray(here.surface, to_world(here.frame, other.wo), here.hit.primitive),
+            throughput=path.throughput * other.weight * other.pdf,  # roulette comes at the next vertex
+            passive=path.passive * other.passive,
+            alive=other.pdf > 0,
+        )
+        return _push(on, branch)
+
+    on = on._replace(splits=path.splits - splits.astype(jnp.int32))
+    return lax.cond(splits, with_other, lambda path, on: on, path, on)
+
+
+def _push(path, branch):
     """Let a branch, a Path, wait; branch.splits < depth."""
 
     def put(entries, new):
@@ -40,11 +68,11 @@ def resume(path):
     def take():
         branch = jax.tree.map(lambda entries: at(entries, youngest), path.pending)
         left = path.pending._replace(alive=waits & (numbers != youngest))
-        return branch._replace(L=path.L, glass=path.glass, pending=left)
+        return branch._replace(L=path.L, moving=path.moving, pending=left)
 
     return lax.cond(path.alive | (youngest == len(waits)), lambda: path, take)
 
 
 def _branch(path):
     """What a branch has of its own; the rest belongs to the whole sample."""
-    return path._replace(L=None, glass=None, pending=None)
+    return path._replace(L=None, moving=None, pending=None)

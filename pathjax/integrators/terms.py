@@ -5,15 +5,17 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jax import lax
 
+from pathjax.integrators.options import Options
 from pathjax.integrators.pixel import over_vertices
 
 
-def sums(work, scene, choice, strategy, depth, derivative=False):
+def sums(work, scene, choice, depth, options: Options):
     """(depth, 3) sums over a pixel's samples, the paths of `pixel.mean`: row k is T^k Le.
 
     Args:
         work: the pixel () int32, and its `pixel.numbers`. Sums are plain, so for some thousand samples at most.
-        depth: number of terms, max_depth of the scene; derivative: of `path.extend`.
+        depth: number of terms, max_depth of the scene.
+        options: by vertex.
     """
     rows = jnp.arange(depth)[:, None]
 
@@ -21,6 +23,4 @@ def sums(work, scene, choice, strategy, depth, derivative=False):
         emission, light = lax.optimization_barrier((weight * now.L.emission, weight * now.L.light))
         return sums + jnp.where(rows == k, emission, jnp.where(rows == k + 1, light, 0))
 
-    zeros = jnp.zeros((depth, 3), scene.camera.origin.dtype)
-    extend = {"strategy": strategy, "derivative": derivative}
-    return over_vertices(work, scene, choice, add, zeros, {"by_vertex": True}, extend)
+    return over_vertices(work, scene, choice, add, jnp.zeros((depth, 3), scene.camera.origin.dtype), options)

@@ -23,6 +23,7 @@ import optimistix as optx
 
 from pathjax.compile.runtime import usual_promotion
 from pathjax.errors import InputError
+from pathjax.integrators.options import check_counts
 from pathjax.inverse import problem, uncertainty
 from pathjax.inverse.approach import approach
 from pathjax.inverse.refine import refine
@@ -105,10 +106,7 @@ def fit(
     Clipped pixels are left out, and so are those that noise may have clipped: to leave out only those that it did clip
     would keep the darker ones. Which these are is told by renders and the noise around, never by the pixel itself.
     """
-    if not isinstance(spp, int) or not 1 <= spp < 2**31:
-        raise InputError(f"spp = {spp}; it must be an integer in [1, 2^31)")
-    if not isinstance(seed, int) or not 0 <= seed < 2**31:
-        raise InputError(f"seed = {seed}; it must be an integer in [0, 2^31)")
+    check_counts(spp, seed)
     solver = solver or optx.LevenbergMarquardt(rtol=1e-4, atol=1e-4)
     if not isinstance(solver, optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser):
         raise InputError(f"solver is a {type(solver).__name__}; use a least-squares solver or minimiser of optimistix")

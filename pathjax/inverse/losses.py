@@ -10,7 +10,7 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 
-from pathjax.derivatives.gradient import jacobian
+from pathjax.derivatives.jacobian import jacobian
 from pathjax.inverse.uncertainty import Evidence
 from pathjax.rendering.render import render
 

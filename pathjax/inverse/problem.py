@@ -149,7 +149,7 @@ def _target(scene, target, number, count) -> Target:
 def _groups(scenes, targets, exposure, names) -> list[Views]:
     groups: dict = {}
     for number, scene in enumerate(scenes):
-        leaves, tree = jax.tree.flatten(replace(scene, about=None))
+        leaves, tree = jax.tree.flatten(named.nameless(scene))
         held = tuple(name for name in names if name in scene.about.parameters)
         places = tuple(scene.about.parameters[name] for name in held)
         key = tree, tuple((leaf.shape, leaf.dtype) for leaf in leaves), held, places

@@ -5,7 +5,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 import numpy as np
 
-from pathjax.derivatives.gradient import ior_at, is_glass
+from pathjax.derivatives import ior
 from pathjax.inverse import losses
 from pathjax.inverse.approach import approach
 from pathjax.inverse.state import State
@@ -18,7 +18,7 @@ MOST_CANDIDATES = 3
 def scan(state: State) -> list[np.ndarray]:
     """Values (n,) to begin with, the most promising first; the present ones if there is nothing to scan."""
     parameters = state.vector.parameters
-    names = [name for name, parameter in parameters if is_glass(parameter)]
+    names = [name for name, parameter in parameters if parameter.moves_paths]
     if not names:
         return [state.values]
     if len(names) < len(parameters):
@@ -48,5 +48,5 @@ def _at_ratio(state: State, name: str, ratio: float) -> np.ndarray:
     """The present values with another index of one glass, given by its relative index."""
     scene = next(scene for scene in state.problem.scenes if name in scene.about.parameters)
     values = state.vector.unpack(state.values.copy())
-    values[name] = ior_at(state.problem.with_values(scene, values), name, ratio)
+    values[name] = ior.at_ratio(state.problem.with_values(scene, values), name, ratio)
     return state.vector.pack(values)

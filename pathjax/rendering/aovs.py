@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from functools import partial
 
 import jax
@@ -11,8 +10,10 @@ import numpy as np
 
 from pathjax.compile.runtime import native_map, usual_promotion
 from pathjax.errors import InputError
-from pathjax.integrators import aov, path, pixel
+from pathjax.integrators import aov, pixel
+from pathjax.integrators.options import check_counts
 from pathjax.rendering.progressive import replicates
+from pathjax.scene.parameters import nameless
 from pathjax.scene.scene import Scene
 from pathjax.sensors import film
 
@@ -40,7 +41,7 @@ def render_aovs(scene: Scene, names: Sequence[str], spp: int = MAX_SPP, seed: in
         InputError: a name is unknown or repeated; spp or seed is out of range.
     """
     check_names(names, NAMES)
-    path.check_sampling("mis", spp, seed)
+    check_counts(spp, seed)
     spp = min(spp, MAX_SPP)
     shares = replicates.shares(np.array([spp], np.int32))
     count, seeds = film.pixel_count(scene.film), replicates.seeds(seed)
@@ -51,7 +52,7 @@ def render_aovs(scene: Scene, names: Sequence[str], spp: int = MAX_SPP, seed: in
         pixels = np.minimum(np.arange(first, first + chunk, dtype=np.int32), count - 1)
         tiled = np.tile(pixels, replicates.COUNT)
         numbers = pixel.numbers(tiled, 0, *(np.repeat(x, chunk) for x in (np.maximum(shares, 1), seeds)))
-        for image, means in zip(images, _render_aovs(replace(scene, about=None), tiled, *numbers), strict=True):
+        for image, means in zip(images, _render_aovs(nameless(scene), tiled, *numbers), strict=True):
             means = np.asarray(means, np.float32).reshape(replicates.COUNT, chunk, -1)
             mean = (means * (shares / np.float32(spp))[..., None]).sum(0, dtype=np.float32)
             image[first : first + chunk] = mean[: count - first]

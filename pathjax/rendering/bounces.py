@@ -12,14 +12,12 @@ from jax import lax
 
 from pathjax import emitters
 from pathjax.compile.runtime import native_map, usual_promotion
-from pathjax.derivatives import gradient
+from pathjax.derivatives import rules, tangents
 from pathjax.errors import InputError
-from pathjax.integrators import path, pixel, terms
-from pathjax.kinds.parameter import Parameter
+from pathjax.integrators import pixel, terms
+from pathjax.integrators.options import DEFAULTS, Options
 from pathjax.rendering import tail
 from pathjax.rendering.progressive import error_estimate, replicates
-from pathjax.rendering.render import differentiable, differentiated
-from pathjax.scene import parameters as named
 from pathjax.scene.scene import Scene
 from pathjax.sensors import film
 
@@ -92,17 +90,18 @@ def render_bounces(
             anything but named parameters.
     """
     _check_depth(depth)
-    path.check_sampling(strategy, spp, seed)
+    options = Options(strategy)
+    options.check_counts(spp, seed)
     shape = film.image_shape(scene.film)
     pixels = jnp.arange(film.pixel_count(scene.film), dtype=jnp.int32).reshape(shape)
-    return _bounces(scene, int(depth), pixels, spp, seed, strategy, errors)
+    return _bounces(scene, int(depth), pixels, spp, seed, options, errors)
 
 
 def pilot(scene: Scene, seed: int = 0) -> tail.Tail:
     """The Tail after 12 terms, from 64 samples of at most 4096 pixels, spread evenly over the image."""
     count = film.pixel_count(scene.film)
     pixels = np.unique(np.linspace(0, count - 1, min(PILOT_PIXELS, count)).astype(np.int32))
-    return _bounces(scene, PILOT_TERMS, jnp.asarray(pixels)[None], PILOT_SPP, seed, "mis", True).tail()
+    return _bounces(scene, PILOT_TERMS, jnp.asarray(pixels)[None], PILOT_SPP, seed, DEFAULTS, True).tail()
 
 
 def _check_depth(depth) -> None:
@@ -113,28 +112,21 @@ def _check_depth(depth) -> None:
         )
 
 
-@dataclass(frozen=True)
-class _Static:
-    wanted: tuple[tuple[str, Parameter], ...]  # parameters in which a derivative may be wanted
-    depth: int
-    strategy: str
-
-
-def _bounces(scene, depth, pixels, spp, seed, strategy, errors) -> Bounces:
+def _bounces(scene, depth, pixels, spp, seed, options, errors) -> Bounces:
     """Of pixels (H, W)."""
     samples = jnp.broadcast_to(jnp.asarray(spp, jnp.int32), pixels.shape)
     shares = replicates.shares(samples.ravel()) if errors else samples.reshape(1, -1)
     seeds = replicates.seeds(seed) if errors else jnp.asarray(seed, jnp.uint32)[None]
     most = None if isinstance(shares, jax.core.Tracer) else int(shares.max())
-    static = _Static(differentiable(scene), depth, strategy)
-    scene = replace(scene, max_depth=jnp.int32(depth), about=None)
+    estimator = _TermSums(depth, replace(options, by_vertex=True))
+    scene = replace(scene, max_depth=jnp.int32(depth))
     if most is None or most <= _PORTION:
-        sums = _term_sums(static, scene, pixels.ravel(), 0, shares, seeds)
+        sums = rules.estimate(estimator, scene, pixels.ravel(), 0, shares, seeds)
     else:
         sums = 0
         for first in range(0, most, _PORTION):
             portion = jnp.clip(shares - first, 0, _PORTION)
-            sums = sums + _term_sums(static, scene, pixels.ravel(), first, portion, seeds)
+            sums = sums + rules.estimate(estimator, scene, pixels.ravel(), first, portion, seeds)
     return Bounces(*_moments(sums, shares, shape=pixels.shape), samples)
 
 
@@ -155,48 +147,42 @@ def _moments(sums, shares, *, shape):
     return tuple(jnp.moveaxis(x, 1, 0).reshape(depth, *shape, 3) for x in (mean, deviation))
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _term_sums(static: _Static, scene, pixels, first_sample, spp, seeds):
+@dataclass(frozen=True)
+class _TermSums:
     """(R, N, depth, 3) sums of pixels (N,); spp: (R, N) of each replicate, whose seeds (R,) are given."""
-    sums, _ = _kernel(scene, pixels, first_sample, spp, seeds, depth=static.depth, strategy=static.strategy)
-    return sums
+
+    depth: int
+    options: Options
+
+    def value(self, scene, pixels, first_sample, spp, seeds):
+        sums, _ = _kernel(scene, pixels, first_sample, spp, seeds, depth=self.depth, options=self.options)
+        return sums
+
+    def jacobian(self, scene, wanted, *work):
+        for name, parameter in wanted.items():
+            if parameter.moves_paths:
+                raise InputError(
+                    f"terms of the series are not differentiated in {name}: the IOR of glass moves paths, which takes "
+                    "differences; differentiate `render` in it, or `render` of scenes that differ in max_depth"
+                )
+        colors, options = tangents.places(wanted.values()), replace(self.options, derivative=bool(wanted))
+        sums, by_color = _kernel(scene, *work, depth=self.depth, options=options, colors=colors)
+        return sums, {name: tangents.by_channel(by_color[:, :, place]) for place, name in enumerate(wanted)}
 
 
-@partial(_term_sums.defjvp, symbolic_zeros=True)
-@usual_promotion
-def _term_sums_jvp(static: _Static, primals, tangents):
-    """Linear in the tangents, so that it also transposes."""
-    scene, *work = primals
-    scene_tangent, *_ = tangents
-    wanted = differentiated(static.wanted, scene_tangent)
-    for name, parameter in wanted.items():
-        if gradient.is_glass(parameter):
-            raise InputError(
-                f"terms of the series are not differentiated in {name}: the IOR of glass moves paths, which takes "
-                "differences; differentiate `render` in it, or `render` of scenes that differ in max_depth"
-            )
-    colors = tuple((parameter.path, parameter.index) for parameter in wanted.values())
-    sums, by_color = _kernel(scene, *work, depth=static.depth, strategy=static.strategy, colors=colors)
-    tangent = jnp.zeros_like(sums)
-    for place, parameter in enumerate(wanted.values()):
-        # Light keeps its channel, so the derivative in a colour is diagonal.
-        tangent = tangent + by_color[:, :, place] * named.get(scene_tangent, parameter.path)[parameter.index]
-    return sums, tangent
+@partial(jax.jit, static_argnames=("depth", "options", "colors"))
+def _kernel(scene, pixels, first_sample, spp, seeds, *, depth, options: Options, colors: tangents.Places = ()):
+    """Sums (R, N, depth, 3), and derivatives (R, N, T, depth, 3) in some colours."""
+    choice = emitters.choice(scene.emitters, options.strategy)
 
-
-@partial(jax.jit, static_argnames=("depth", "strategy", "colors"))
-def _kernel(scene, pixels, first_sample, spp, seeds, *, depth, strategy, colors=()):
-    """Sums (R, N, depth, 3), and derivatives (R, N, T, depth, 3) in the entries that `colors` lists."""
-    choice = emitters.choice(scene.emitters, strategy)
-
-    def one_pixel(work, scene, choice, tangents):
+    def one_pixel(work, scene, choice, unit_tangents):
         def of(scene):
-            return terms.sums(work, scene, choice, strategy, depth, bool(colors)), ()
+            return terms.sums(work, scene, choice, depth, options), ()
 
-        sums, by_color, _ = gradient.by_tangent(of, scene, colors, tangents)
+        sums, by_color, _ = tangents.by_tangent(of, scene, colors, unit_tangents)
         return sums, by_color
 
     tiled = jnp.tile(pixels, len(seeds))
     work = tiled, *pixel.numbers(tiled, first_sample, spp.ravel(), jnp.repeat(seeds, len(pixels)))
-    results = native_map(one_pixel, work, scene, choice, gradient.unit_tangents(scene, colors))
+    results = native_map(one_pixel, work, scene, choice, tangents.unit_tangents(scene, colors))
     return tuple(x.reshape(*spp.shape, *x.shape[1:]) for x in results)

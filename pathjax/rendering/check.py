@@ -8,7 +8,8 @@ import numpy as np
 from scipy import stats
 
 from pathjax.compile.runtime import usual_promotion
-from pathjax.derivatives.gradient import is_glass, jacobian, ratio_by
+from pathjax.derivatives import ior
+from pathjax.derivatives.jacobian import jacobian
 from pathjax.errors import InputError
 from pathjax.rendering.render import render
 from pathjax.scene import parameters as named
@@ -63,8 +64,8 @@ def check_gradient(scene: Scene, name: str, spp: int = 64, seed: int = 0, *, see
         _, J = jacobian(scene, [name], spp, k)
         d = np.asarray(J[name], float)
         derivatives.append(np.einsum("...cc->...c", d) if parameter.shape else d)
-        if is_glass(parameter):
-            nodes = np.array([-1.0, 1.0]) * float(J.step[name]) / abs(float(ratio_by(scene, parameter)))
+        if parameter.moves_paths:
+            nodes = np.array([-1.0, 1.0]) * float(J.step[name]) / abs(float(ior.ratio_by(scene, parameter)))
         else:
             nodes = _nodes(parameter, present)
         images = [np.asarray(render(with_parameters(scene, {name: present + x}), spp, k), float) for x in nodes]

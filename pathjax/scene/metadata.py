@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import weakref
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from pathjax import description as desc
 from pathjax.kinds.parameter import Parameter
@@ -19,9 +18,6 @@ class About:
     parameters: Mapping[str, Parameter]
     refused: Mapping[str, str]  # what is none, though it looks like one, and why
     trees: Mapping[str, Tree]  # kind of shape -> its hierarchy, for reports
-    # Of tables that `with_parameters` made: a weak reference to the array, and which of its parameters are traced.
-    # Tables hold many parameters, and a derivative costs time for each that may be wanted.
-    traced: Mapping[tuple, tuple[weakref.ref, frozenset[str]]] = field(default_factory=dict)
 
     def __eq__(self, other):
         return isinstance(other, About) and self.parameters is other.parameters

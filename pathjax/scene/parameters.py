@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import difflib
-import weakref
 from collections.abc import Mapping
 from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 
 from pathjax.compile.runtime import usual_promotion
 from pathjax.errors import InputError
@@ -21,6 +21,7 @@ from pathjax.scene.scene import Scene
 @usual_promotion
 def parameters(scene: Scene) -> dict[str, jax.Array]:
     """Return all parameters of the scene by name, `ID.field`."""
+    scene = attached(scene)
     return {name: get(scene, p.path)[p.index] for name, p in about(scene).parameters.items()}
 
 
@@ -33,28 +34,33 @@ def with_parameters(scene: Scene, values: Mapping) -> Scene:
     Raises:
         InputError: a name is unknown, or a value has the wrong shape or lies outside the parameter's bounds.
     """
-    known = about(scene)
-    traced = dict(known.traced)
+    varied = dict(scene.varied)
     for name, value in values.items():
         parameter = find(scene, name)
-        array = get(scene, parameter.path)
-        value = checked(name, value, parameter, array.dtype)
-        names = traced_in(scene, parameter.path) if isinstance(array, jax.core.Tracer) else frozenset()
+        value = checked(name, value, parameter, get(scene, parameter.path).dtype)
+        varied.pop(name, None)
         if isinstance(value, jax.core.Tracer):
-            names |= {name}
-        array = array.at[parameter.index].set(value)
-        traced[parameter.path] = weakref.ref(array), names
-        scene = replace(put(scene, parameter.path, array), about=replace(known, traced=traced))
+            varied[name] = value
+        scene = with_values(scene, {name: lax.stop_gradient(value)}, about(scene).parameters)
+    return replace(scene, varied=varied)
+
+
+def attached(scene: Scene) -> Scene:
+    """The scene whose tables carry the derivatives of `varied`: for what is differentiated by way of the tables."""
+    return with_values(scene, scene.varied, about(scene).parameters) if scene.varied else scene
+
+
+def with_values(scene: Scene, values: Mapping[str, jax.Array], parameters: Mapping[str, Parameter]) -> Scene:
+    """The scene with values of parameters in its tables, unchecked."""
+    for name, value in values.items():
+        path, index = parameters[name].path, parameters[name].index
+        scene = put(scene, path, get(scene, path).at[index].set(value))
     return scene
 
 
-def traced_in(scene: Scene, path) -> frozenset[str]:
-    """Names of the parameters of a table that may hold traced values: all, unless `with_parameters` made the table."""
-    known = about(scene)
-    made, names = known.traced.get(path, (lambda: None, frozenset()))
-    if made() is get(scene, path):
-        return names
-    return frozenset(name for name, parameter in known.parameters.items() if parameter.path == path)
+def nameless(scene: Scene) -> Scene:
+    """What kernels get, so that scenes of one structure share them: without names, and what is told by them."""
+    return replace(scene, about=None, varied={})
 
 
 def about(scene: Scene) -> About:

@@ -30,4 +30,7 @@ class Scene:
     max_depth: jax.Array  # () int32 vertices of the longest path; 1: emission only
     rr_depth: jax.Array  # () int32 vertices before roulette begins
     hide_emitters: bool = field(metadata={"static": True})  # from the camera
-    about: About | None = field(metadata={"static": True})
+    about: About | None = field(metadata={"static": True})  # None: within kernels
+    # Parameters that `with_parameters` set to traced values, by name. They carry the derivative, and tables hold the
+    # same numbers detached: so a derivative that comes by a table is one that was asked for by other means.
+    varied: dict[str, jax.Array] = field(default_factory=dict)

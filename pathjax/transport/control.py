@@ -20,8 +20,9 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from pathjax.core.math import dot, larger, safe_divide, smaller
+from pathjax.core.math import dot, safe_divide
 from pathjax.errors import InputError
+from pathjax.integrators import roulette
 from pathjax.shapes.geometry import Geometry
 from pathjax.transport.view import Radiosity, radiance
 
@@ -46,12 +47,12 @@ class Control:
                 "op = transport.operator(scene); control = op.control(op.solve().L)"
             )
 
-    def roulette(self, shapes: Geometry, path, hit, surface, u, least, most):
+    def roulette(self, shapes: Geometry, path, hit, surface, u):
         """Decide at a vertex, before its light is sampled, whether a path goes on.
 
         Args:
             path: `integrators.path.Path` that has reached the vertex, where `geometry.surface` is `surface`.
-            u: () uniform; least, most: () bounds of survival.
+            u: () uniform.
         Returns:
             Path, its L and throughput weighted; () bool whether it goes on.
         """
@@ -61,7 +62,7 @@ class Control:
         expected = jnp.where(path.depth == 1, size, path.expected)
         # Where nothing is expected, the patches know nothing.
         share = jnp.where(expected > 0, safe_divide(size, expected), 1)
-        survival = larger(smaller(self.effort * share, most), least)
+        survival = roulette.bounded(self.effort * share)
         survival = lax.optimization_barrier(jnp.where(path.depth >= _FIRST, survival, 1))
         survives = u < survival
         L = path.L + left * jnp.where(survives, 1 - 1 / survival, 1)

@@ -27,6 +27,8 @@ from pathjax import bsdfs, emitters
 from pathjax.compile.runtime import usual_promotion
 from pathjax.core.math import safe_divide
 from pathjax.errors import InputError
+from pathjax.integrators.options import check_counts
+from pathjax.scene.parameters import attached
 from pathjax.scene.scene import Scene
 from pathjax.transport import factors as dense_factors
 from pathjax.transport import rays as ray_casting
@@ -255,9 +257,7 @@ def operator(
     if method not in METHODS:
         raise InputError(f"method {method!r} is unknown; use one of {', '.join(METHODS)}")
     rays = METHODS[method] if rays is None else rays
-    for name, value, least in (("rays", rays, 1), ("seed", seed, 0)):
-        if not least <= value < 2**31:
-            raise InputError(f"{name} = {value}; it must lie in [{least}, 2^31)")
+    check_counts(rays, seed, "rays")
     area = np.asarray(cells.area, float)
     if method == "dense":
         exchange, errors, closed = dense_factors.form_factors(scene, cells, rays, seed)
@@ -294,6 +294,7 @@ def _closing(exchange, area):
 
 def _albedos_and_lights(scene: Scene, patches: Patches):
     """Albedo (U, 3) and emitted radiance (U, 3) of the patches."""
+    scene = attached(scene)
 
     def of(table, rows):
         # A row of black at the end stands for none.

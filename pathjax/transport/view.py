@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 
 import jax
@@ -13,8 +13,9 @@ from pathjax.compile.runtime import native_map, usual_promotion
 from pathjax.core import sampler
 from pathjax.core.math import at, dot
 from pathjax.errors import InputError
-from pathjax.integrators.path import check_sampling
-from pathjax.integrators.pixel import camera_path
+from pathjax.integrators.options import check_counts
+from pathjax.integrators.pixel import camera_ray
+from pathjax.scene.parameters import nameless
 from pathjax.scene.scene import Scene
 from pathjax.sensors import film
 from pathjax.shapes import geometry
@@ -58,7 +59,7 @@ def image(scene: Scene, light: Radiosity, spp: int = 16, seed: int = 0) -> jax.A
     Raises:
         InputError: spp or seed out of range; a scene that hides its emitters.
     """
-    check_sampling("mis", spp, seed)
+    check_counts(spp, seed)
     if scene.hide_emitters:
         raise InputError(
             "this scene hides its emitters from the camera, and patches show them; load it with hide_emitters false"
@@ -66,7 +67,7 @@ def image(scene: Scene, light: Radiosity, spp: int = 16, seed: int = 0) -> jax.A
     pixels = jnp.arange(film.pixel_count(scene.film), dtype=jnp.int32)
     total = jnp.zeros((len(pixels), 3), light.L.dtype)
     for number in range(spp):
-        total = _with_sample(total, replace(scene, about=None), light, pixels, jnp.uint32(number), jnp.uint32(seed))
+        total = _with_sample(total, nameless(scene), light, pixels, jnp.uint32(number), jnp.uint32(seed))
     return (total / spp).reshape(*film.image_shape(scene.film), 3)
 
 
@@ -83,9 +84,9 @@ def _seen(scene, patches, pixels, number, seed, form=None, devices=None):
 
 def _one(pixel, scene, patches, number, seed):
     """Patch that the ray of a sample meets, and the sample's weight."""
-    start, weight = camera_path(scene, pixel, sampler.pixel_stream(seed, pixel), number)
-    hit = geometry.closest_hit(scene.geometry, start.ray)
-    surface = geometry.surface(scene.geometry, start.ray, hit)
+    ray, weight = camera_ray(scene, pixel, sampler.pixel_stream(seed, pixel), number)
+    hit = geometry.closest_hit(scene.geometry, ray)
+    surface = geometry.surface(scene.geometry, ray, hit)
     primitive = jnp.maximum(hit.primitive, 0)
-    patch = patch_at(patches, scene.geometry, primitive, surface.p, dot(surface.n, start.ray.d) > 0)
+    patch = patch_at(patches, scene.geometry, primitive, surface.p, dot(surface.n, ray.d) > 0)
     return jnp.where(hit.primitive >= 0, patch, patches.count), lax.stop_gradient(weight)

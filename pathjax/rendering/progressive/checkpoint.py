@@ -19,6 +19,7 @@ from pathjax import version
 from pathjax.errors import InputError, InputWarning
 from pathjax.rendering.progressive.passes import State, plan
 from pathjax.rendering.progressive.replicates import one_if_equal
+from pathjax.scene.parameters import nameless
 from pathjax.scene.scene import Scene
 from pathjax.sensors import film
 from pathjax.system.files import write_whole
@@ -47,7 +48,7 @@ def identity(scene: Scene, seed: int, strategy: str, adaptive: bool) -> dict[str
 
 def fingerprint(scene: Scene) -> str:
     """Hash of a scene's structure and arrays; names and files do not count."""
-    leaves, structure = jax.tree.flatten(replace(scene, about=None))
+    leaves, structure = jax.tree.flatten(nameless(scene))
     digest = hashlib.sha256(str(structure).encode())
     for leaf in map(np.asarray, leaves):
         digest.update(f"{leaf.dtype}{leaf.shape}".encode())

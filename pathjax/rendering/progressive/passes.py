@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 
 import jax
@@ -11,8 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from pathjax.compile import runtime
+from pathjax.integrators.options import DEFAULTS, Options
 from pathjax.rendering.progressive import replicates
 from pathjax.rendering.render import pixel_means
+from pathjax.scene.parameters import nameless
 from pathjax.scene.scene import Scene
 from pathjax.sensors import film
 
@@ -61,7 +63,7 @@ def plan(state: State, spp: int) -> None:
 
 
 def extend(
-    scene: Scene, state: State, seed: int, strategy: str, stopped: Callable[[], object] = lambda: False
+    scene: Scene, state: State, seed: int, options: Options, stopped: Callable[[], object] = lambda: False
 ) -> Iterator[None]:
     """Render what is missing of the round; yields after every call of the kernel, when the state is whole.
 
@@ -71,7 +73,7 @@ def extend(
     Args:
         stopped: asked by other threads before each call. Once it is true none begins; those that run are waited for.
     """
-    kernel, chunk = compile(scene, strategy), _chunk(scene)
+    kernel, chunk = compile(scene, options), _chunk(scene)
 
     def rendered(portion):
         if stopped():
@@ -119,25 +121,25 @@ def _portions(state: State, chunk: int) -> Iterator[tuple[np.ndarray, np.ndarray
             yield pixels, before, after
 
 
-def compile(scene: Scene, strategy: str = "mis") -> Callable:
+def compile(scene: Scene, options: Options = DEFAULTS) -> Callable:
     """The kernel of `extend`: (3, n) int32 of a chunk, the pixels and their numbers of samples before and after, and a
     seed -> means of each replicate over the samples between, 0 of none, (R, n, 3) float32."""
     # Without the derivatives of `render_pixels`, whose machinery takes longer than a call of few samples.
-    scene = replace(scene, about=None)
+    scene = nameless(scene)
     numbers = jax.ShapeDtypeStruct((3, _chunk(scene)), np.int32)
     # JAX keeps what it has compiled. A compiled kernel, unlike a jitted function, does not ask for the calling thread's
     # contexts, such as `jax.enable_x64`.
-    return partial(_replicate_means.lower(scene, numbers, np.uint32(0), strategy=strategy).compile(), scene)
+    return partial(_replicate_means.lower(scene, numbers, np.uint32(0), options=options).compile(), scene)
 
 
-@partial(jax.jit, static_argnames="strategy")
-def _replicate_means(scene, numbers, seed, *, strategy):
+@partial(jax.jit, static_argnames="options")
+def _replicate_means(scene, numbers, seed, *, options):
     pixels, before, after = numbers
     first_sample = replicates.shares(before)
     spp = replicates.shares(after) - first_sample
     unsigned = first_sample.ravel(), spp.ravel(), jnp.repeat(replicates.seeds(seed), len(pixels))
     work = jnp.tile(pixels, replicates.COUNT), *(x.astype(jnp.uint32) for x in unsigned)
-    means = pixel_means(scene, *work, strategy=strategy, devices=runtime.devices_of_a_call())
+    means = pixel_means(scene, *work, options=options, devices=runtime.devices_of_a_call())
     return means.reshape(*spp.shape, 3).astype(jnp.float32)
 
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from pathjax.compile.runtime import usual_promotion
 from pathjax.errors import InputError
-from pathjax.integrators import path
+from pathjax.integrators.options import Options, check_counts
 from pathjax.rendering.progressive import error_estimate, passes, replicates
 from pathjax.rendering.progressive.checkpoint import Checkpoint, identity
 from pathjax.scene.scene import Scene
@@ -99,8 +99,9 @@ class Render:
 
     def __init__(self, scene, target_error, time_limit, spp, seed, strategy, checkpoint):
         _check(target_error, time_limit, spp)
-        path.check_sampling(strategy, MAX_SPP if spp is None else spp, seed)
-        self.scene, self.seed, self.strategy = scene, operator.index(seed), strategy
+        self.options = Options(strategy)
+        check_counts(MAX_SPP if spp is None else spp, seed)
+        self.scene, self.seed = scene, operator.index(seed)
         self.target_error, self.time_limit = target_error, time_limit
         self.spp = MAX_SPP if spp is None else int(spp)
         self.compile_seconds = 0.0
@@ -117,7 +118,7 @@ class Render:
 
     def compile(self) -> None:
         started = time.perf_counter()
-        passes.compile(self.scene, self.strategy)
+        passes.compile(self.scene, self.options)
         self.compile_seconds += time.perf_counter() - started
 
     def run(self, progress: bool = False) -> RenderResult:
@@ -148,7 +149,7 @@ class Render:
             return None
 
         while True:
-            for _ in passes.extend(self.scene, state, self.seed, self.strategy, stopped):
+            for _ in passes.extend(self.scene, state, self.seed, self.options, stopped):
                 state.seconds = time.perf_counter() - started
                 if self.checkpoint is not None:
                     self.checkpoint.save_if_due(state)
@@ -193,8 +194,6 @@ def _check(target_error, time_limit, spp) -> None:
     for name, value in (("target_error", target_error), ("time_limit", time_limit)):
         if value is not None and not (value > 0 and math.isfinite(value)):
             raise InputError(f"{name} = {value}; it must be positive and finite")
-    if spp is not None and not (isinstance(spp, int | np.integer) and 1 <= spp <= MAX_SPP):
-        raise InputError(f"spp = {spp}; it must be an integer in [1, 2^31)")
 
 
 def _next_spp(spp: int, error: error_estimate.ImageError, target: float | None) -> int:

@@ -1,0 +1,99 @@
+"""Derivatives in the IOR of smooth glass: central differences of paths that share all that chance decides.
+
+The IOR moves the path itself, and what is seen through glass has edges, which no derivative of a moving point knows. So
+a pixel's paths are traced again with the IOR a step h higher and lower, with the same random numbers and with the
+probabilities of their choices at the IOR that the scene has, so that no choice flips by itself:
+
+    dI/d(eta) = (I(eta + h) - I(eta - h)) / (2 h) + bias,        bias = h^2 I'''/6 + O(h^4)
+
+which a few paths at twice the step estimate: (difference at 2 h - difference at h) / 3 (Richardson).
+"""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+from jax import lax
+
+from pathjax.bsdfs import dielectric
+from pathjax.core import sampler
+from pathjax.core.math import at
+from pathjax.derivatives import ior
+from pathjax.integrators import path, pixel
+from pathjax.integrators.options import Options
+from pathjax.integrators.random_numbers import bounce_numbers
+
+# One path in so many is also traced at twice the step, to estimate the bias.
+RICHARDSON_EVERY = 16
+# Dielectrics of one kernel: the four shifts of each are bits of an int32.
+MOST_GLASS = 7
+
+
+def mean_and_differences(work, scene, choice, steps, rows: tuple[int, ...], options: Options):
+    """Mean of a pixel (3,), and of its central differences in the IOR of some dielectrics (G, 3), with biases (G, 3).
+
+    A sample is a path at the IORs of the scene, then four for each of the dielectrics that it met: at + h, - h, and now
+    and then at + 2 h, - 2 h. A path that never met a glass is the same at every IOR of it.
+
+    Args:
+        work: the pixel () int32, and its `pixel.numbers`.
+        steps: (G,) h, in relative IOR.
+        rows: of the dielectrics, G, at most MOST_GLASS.
+        options: that watch what moves.
+    """
+    pixel_number, first_sample, spp, seed = work
+    stream = sampler.pixel_stream(seed, pixel_number)
+    table = ior.table(scene)
+    ratios = dielectric.relative_ior(table)
+    rows = jnp.asarray(rows, jnp.int32)
+    shifts = jnp.arange(4 * len(rows), dtype=jnp.int32)  # dielectric 4 k, 4 k + 1, ...
+
+    def shifted(shift):
+        """The scene at a shift, choosing its branches by the IORs that it has; as it is where shift < 0."""
+        place, k = jnp.maximum(shift, 0) // 4, shift % 4
+        row, h = at(rows, place), at(steps, place)
+        moves = (jnp.arange(len(ratios)) == row) & (shift >= 0)
+        change = jnp.where(k % 2 == 0, h, -h) * (1 + k // 2).astype(h.dtype)
+        moved = dielectric.with_relative_ior(table, ratios + change, moves)
+        return ior.with_table(scene, dielectric.choosing_by(moved, ratios, moves))
+
+    def twice(number):
+        return sampler.combine(stream, number) % RICHARDSON_EVERY == 0
+
+    def step(state):
+        number, shift, todo, now, weight, plus, sums = state
+        now, weight = pixel.begun(scene, pixel_number, stream, number, now, weight, options)
+        u = bounce_numbers(scene, stream, number, now.depth)
+        now = path.extend(shifted(shift), choice, now, u, options)
+
+        def end():
+            place, k = jnp.maximum(shift, 0) // 4, shift % 4
+            value, place, k, again = lax.optimization_barrier((weight * now.L, place, k, twice(number)))
+            # The sample itself, or the second of a pair, whose first was kept.
+            mean, by_ior, bias = sums
+            mean = pixel.add_compensated(mean, jnp.where(shift < 0, value, 0))
+            width = 2 * at(steps, place) * (1 + k // 2).astype(value.dtype)
+            quotient = lax.optimization_barrier((plus - value) / width)
+            mine = ((jnp.arange(len(rows)) == place) & (shift >= 0) & (k % 2 == 1))[:, None]
+            by_ior = pixel.add_compensated(by_ior, jnp.where(mine & (k == 1), quotient, 0))
+            doubled = (RICHARDSON_EVERY / 3) * jnp.where(k == 1, -quotient, quotient)
+            bias = pixel.add_compensated(bias, jnp.where(mine & again, doubled, 0))
+            # Shifts of this sample that are still to do are the bits of `todo`.
+            touched = (jnp.right_shift(now.moving, rows % 31) & 1) == 1
+            touched = jnp.broadcast_to(touched[:, None], (len(rows), 4)).reshape(shifts.shape)  # for each shift
+            wanted = touched & ((shifts % 4 < 2) | again)
+            bits = jnp.sum(jnp.where(wanted, jnp.left_shift(jnp.int32(1), shifts), 0), dtype=jnp.int32)
+            left = jnp.where(shift < 0, bits, todo)
+            next_shift = jnp.where(left == 0, -1, lax.population_count(~left & (left - 1)))
+            next_number = number + (left == 0).astype(number.dtype)
+            return next_number, next_shift, left & (left - 1), now, weight, value, (mean, by_ior, bias)
+
+        return lax.cond(now.alive, lambda: (number, shift, todo, now, weight, plus, sums), end)
+
+    zero = jnp.zeros((3,), scene.camera.origin.dtype)
+    zeros = jnp.zeros((len(rows), 3), zero.dtype)
+    base = jnp.int32(-1)
+    nothing = pixel.no_path(scene, options)
+    start = first_sample, base, jnp.int32(0), *nothing, zero, tuple((z, z) for z in (zero, zeros, zeros))
+    *_, sums = lax.while_loop(lambda state: state[0] != first_sample + spp, step, start)
+    mean, by_ior, bias = (total / spp.astype(zero.dtype) for total, _ in sums)
+    return mean, (by_ior, bias)

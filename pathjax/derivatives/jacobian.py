@@ -1,0 +1,190 @@
+"""Image and Jacobian: how every pixel changes with the parameters of materials and lights.
+
+Colours (reflectances, radiances, a metal's eta and k) change what paths carry, not where they go: the derivative is
+that of the weights (detached sampling), unbiased (`tangents`). The IOR of smooth glass moves the path itself, which
+takes differences (`ior_difference`). No general derivative exists here for moving geometry or cameras.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from pathjax import emitters
+from pathjax.bsdfs import dielectric
+from pathjax.compile.runtime import native_map, usual_promotion
+from pathjax.derivatives import ior, ior_difference, ior_step, rules, tangents
+from pathjax.description.parameter import Parameter
+from pathjax.errors import InputError
+from pathjax.integrators import pixel
+from pathjax.integrators.options import Options
+from pathjax.scene import parameters as named
+from pathjax.scene.scene import Scene
+from pathjax.sensors import film
+
+METHODS = ("difference", "attached")
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True, eq=False)
+class Jacobian(Mapping):
+    """Derivatives of an image by the names of parameters: `J[name]` is (H, W, 3, *shape of the parameter).
+
+    bias: of those that are differences, an estimate of derivative minus truth (H, W, 3) from a second step; noisy in a
+        single pixel, meant for averages.
+    step: of those, the change of the relative IOR to either side.
+    """
+
+    derivatives: dict[str, jax.Array]
+    bias: dict[str, jax.Array]
+    step: dict[str, jax.Array]
+
+    def __getitem__(self, name):
+        return self.derivatives[name]
+
+    def __iter__(self):
+        return iter(self.derivatives)
+
+    def __len__(self):
+        return len(self.derivatives)
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What the kernel differentiates; static."""
+
+    colors: tangents.Places  # of the colours that get a tangent
+    glass: tuple[int, ...]  # rows of the dielectrics that get a difference
+
+
+@usual_promotion
+def jacobian(scene: Scene, names, spp: int = 64, seed: int = 0, *, strategy="mis", method="difference", step=None):
+    """Image and its derivative with respect to named parameters, from the same paths, in one kernel.
+
+    Pure; may be called inside `jax.jit`, and under `jax.vmap` over scenes that differ in parameters or cameras.
+
+    Args:
+        names: of parameters, as `parameters` lists them.
+        spp, seed, strategy: of `render`; the image is that of `render`, to rounding.
+        method: how the IOR of smooth glass is differentiated: "difference" (central, common random numbers), or
+            "attached", which follows points that move and is right only where no edge is seen through glass. An
+            attached image chooses its branches otherwise than `render`, without bias.
+        step: of differences, in relative IOR; None: what moves the image by about a third of a pixel.
+    Returns:
+        image (H, W, 3), and a Jacobian.
+    Raises:
+        InputError: unknown name, method or strategy; spp, seed or step out of range.
+    """
+    if isinstance(names, str):
+        raise InputError(f"names is a list of names; write [{names!r}]")
+    if method not in METHODS:
+        raise InputError(f"method {method!r} is unknown; use one of {', '.join(METHODS)}")
+    if step is not None and not isinstance(step, jax.core.Tracer) and not 0 < step < 1:
+        raise InputError(f"step = {step}; it must lie between 0 and 1, in units of relative IOR")
+    options = Options(strategy)
+    options.check_counts(spp, seed)
+    wanted = {name: named.find(scene, name) for name in names}
+    pixels = jnp.arange(film.pixel_count(scene.film), dtype=jnp.int32)
+    image, derivatives, bias, used = pixel_jacobians(
+        named.nameless(named.attached(scene)), wanted, pixels, 0, spp, seed, options, method=method, step=step
+    )
+    shape = (*film.image_shape(scene.film), 3)
+
+    def as_image(x):
+        return x.reshape(*shape, *x.shape[2:])
+
+    return as_image(image), Jacobian(*jax.tree.map(as_image, (derivatives, bias)), used)
+
+
+@usual_promotion
+def pixel_jacobians(
+    scene: Scene,
+    wanted: dict[str, Parameter],
+    pixels,
+    first_sample,
+    spp,
+    seed,
+    options: Options,
+    *,
+    method: str = "difference",
+    step=None,
+    **how,
+):
+    """Means (N, 3), and by name: derivatives (N, 3, *shape), biases (N, 3), steps ().
+
+    Args:
+        scene: without names.
+        first_sample, spp, seed: each one number, or (N,) of the pixels.
+        how: `form` and `devices` of `runtime.native_map`.
+    """
+    attached = method == "attached"
+    colors = [name for name, p in wanted.items() if attached or not p.moves_paths]
+    rows = tuple(sorted({p.index[0] for p in wanted.values() if p.moves_paths}))
+    glass = () if attached else rows
+    if rows:
+        scene = rules.differentiated_once(scene)
+    if attached and rows:
+        scene = choosing_by_present_iors(scene, rows)
+    steps = ior_step.steps(scene, glass, step)
+    numbers = pixel.numbers(pixels, first_sample, spp, seed)
+    places = tangents.places(wanted[name] for name in colors)
+
+    def of(places, first):
+        here = slice(first, first + ior_difference.MOST_GLASS)
+        static = Wanted(places, glass[here])
+        return _jacobians(scene, pixels, *numbers, steps[here], wanted=static, options=options, **how)
+
+    image, by_color, *by_glass = of(places, 0)
+    more = [of((), first)[2:] for first in range(ior_difference.MOST_GLASS, len(glass), ior_difference.MOST_GLASS)]
+    by_ior, bias = (jnp.concatenate(parts, axis=1) for parts in zip(by_glass, *more, strict=True))
+
+    derivatives, biases, used = {}, {}, {}
+    for name, parameter in wanted.items():
+        if name in colors:
+            slope = by_color[:, colors.index(name)]
+            derivatives[name] = tangents.by_channel(slope) if parameter.shape else slope
+        else:
+            place, scale = glass.index(parameter.index[0]), ior.ratio_by(scene, parameter)
+            derivatives[name], biases[name] = by_ior[:, place] * scale, bias[:, place] * scale
+            used[name] = steps[place]
+    return image, derivatives, biases, used
+
+
+def choosing_by_present_iors(scene: Scene, rows) -> Scene:
+    """The scene whose dielectrics of some rows choose their branches by the IOR that they have now, detached."""
+    table = ior.table(scene)
+    ratio = lax.stop_gradient(dielectric.relative_ior(table))
+    chosen = jnp.isin(jnp.arange(len(ratio)), jnp.asarray(rows, jnp.int32))
+    return ior.with_table(scene, dielectric.choosing_by(table, ratio, chosen))
+
+
+@partial(jax.jit, static_argnames=("wanted", "options", "form", "devices"))
+def _jacobians(scene, pixels, first_sample, spp, seed, steps, *, wanted, options, form=None, devices=None):
+    scene = options.applied(scene)
+    choice = emitters.choice(scene.emitters, options.strategy)
+    options = replace(options, derivative=bool(wanted.colors), watch_moving=bool(wanted.glass))
+    one_pixel = partial(_pixel_jacobian, wanted=wanted, options=options)
+    work = pixels, first_sample, spp, seed
+    shared = scene, choice, tangents.unit_tangents(scene, wanted.colors), steps
+    return native_map(one_pixel, work, *shared, form=form, devices=devices)
+
+
+def _pixel_jacobian(work, scene, choice, unit_tangents, steps, wanted: Wanted, options: Options):
+    """Means of a pixel: radiance (3,), tangents (T, 3), differences (G, 3) and their biases (G, 3).
+
+    work: the pixel () int32, and its `pixel.numbers`.
+    """
+
+    def of(scene):
+        if wanted.glass:
+            return ior_difference.mean_and_differences(work, scene, choice, steps, wanted.glass, options)
+        none = jnp.zeros((0, 3), scene.camera.origin.dtype)
+        return pixel.mean(work, scene, choice, options=options), (none, none)
+
+    mean, by_color, differences = tangents.by_tangent(of, scene, wanted.colors, unit_tangents)
+    return mean, by_color, *differences

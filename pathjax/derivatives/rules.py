@@ -1,0 +1,98 @@
+"""The rule of differentiation of whatever is estimated of a scene: in named parameters, and in nothing else.
+
+An estimate E(theta) is differentiated by the Jacobian J that its own kernel makes beside it: the tangent of E is
+J d(theta). That is linear in d(theta), so JAX transposes it: `jax.jvp`, `jax.linearize`, `jax.jacfwd`, `jax.grad` and
+optimistix's solvers all work, and what they ask of the kernel is always the same.
+
+What d(theta) is, the scene says: `with_parameters` keeps traced values by name in `Scene.varied`, and puts them into
+the tables detached. A derivative that arrives by a table all the same was asked for by other means; it is that of all
+parameters in the table, and where there are none it is refused.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import partial
+from typing import Protocol
+
+import jax
+import jax.numpy as jnp
+from jax.custom_derivatives import SymbolicZero
+
+from pathjax.compile.runtime import usual_promotion
+from pathjax.description.parameter import Parameter
+from pathjax.errors import InputError
+from pathjax.scene import parameters as named
+from pathjax.scene.scene import Scene
+
+
+class Estimator(Protocol):
+    """Something that is estimated of a scene."""
+
+    def value(self, scene: Scene, *work) -> jax.Array: ...
+
+    def jacobian(self, scene: Scene, wanted: dict[str, Parameter], *work) -> tuple[jax.Array, dict[str, jax.Array]]:
+        """The value, and by name its derivative, (*shape of the value, *shape of the parameter).
+
+        Raises:
+            InputError: what it is not differentiated in.
+        """
+
+
+def estimate(estimator: Estimator, scene: Scene, *work) -> jax.Array:
+    """`estimator.value` of a scene without names, differentiable in the named parameters of the scene."""
+    parameters = {} if scene.about is None else scene.about.parameters
+    return _estimate((estimator, parameters), named.nameless(scene), scene.varied, *work)
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _estimate(static, scene, varied, *work):
+    estimator, _ = static
+    return estimator.value(scene, *work)
+
+
+@partial(_estimate.defjvp, symbolic_zeros=True)
+@usual_promotion
+def _estimate_jvp(static, primals, tangents):
+    estimator, parameters = static
+    scene, varied, *work = primals
+    scene_tangent, varied_tangent, *_ = tangents
+    changes = _changes(parameters, scene_tangent, varied_tangent)
+    # Attached, for derivatives of the derivative.
+    scene = named.with_values(scene, varied, parameters)
+    value, J = estimator.jacobian(scene, {name: parameters[name] for name in changes}, *work)
+    tangent = jnp.zeros_like(value)
+    for name, change in changes.items():
+        tangent = tangent + jnp.tensordot(J[name], change, change.ndim)
+    return value, tangent
+
+
+def _changes(parameters: Mapping[str, Parameter], scene_tangent, varied_tangent) -> dict[str, jax.Array]:
+    """Tangents of named parameters, by name; those that are known to be zero are left out."""
+    changes = {name: x for name, x in varied_tangent.items() if not isinstance(x, SymbolicZero)}
+    leaves, _ = jax.tree_util.tree_flatten_with_path(scene_tangent, is_leaf=lambda x: isinstance(x, SymbolicZero))
+    for keys, leaf in leaves:
+        if isinstance(leaf, SymbolicZero):
+            continue
+        place = tuple(key.name if isinstance(key, jax.tree_util.GetAttrKey) else key.idx for key in keys)
+        held = {name: parameter for name, parameter in parameters.items() if parameter.path == place}
+        if not held:
+            raise InputError(
+                f"a derivative in scene.{'.'.join(map(str, place))} was asked for, and pathjax does not differentiate "
+                "in it; set named parameters by with_parameters and differentiate in their values (`pathjax info` "
+                "lists them)"
+            )
+        for name, parameter in held.items():
+            changes[name] = changes.get(name, 0) + leaf[parameter.index]
+    return {name: changes[name] for name in parameters if name in changes}
+
+
+@jax.custom_jvp
+def differentiated_once(scene):
+    """The scene; a derivative in it is refused."""
+    return scene
+
+
+@partial(differentiated_once.defjvp, symbolic_zeros=True)
+def _refuse(primals, tangents):
+    raise InputError("second derivatives are not supported where the IOR of smooth glass is differentiated")

@@ -1,0 +1,63 @@
+"""Derivatives in colours, which change what paths carry: detached sampling, all tangents in one pass of a kernel.
+
+Light does not change its channel on the way, so one tangent stands for the three channels of a colour.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+
+from pathjax.scene import parameters as named
+
+# Of each colour the path to its table and its index there.
+Places = tuple[tuple[tuple, tuple], ...]
+
+
+def places(parameters) -> Places:
+    return tuple((parameter.path, parameter.index) for parameter in parameters)
+
+
+def by_channel(slope):
+    """Derivative (..., 3, 3) in a colour, from that of each channel in the same channel of the colour (..., 3)."""
+    return slope[..., None] * jnp.eye(3, dtype=slope.dtype)
+
+
+def unit_tangents(scene, colors: Places):
+    """A unit change of all channels of each colour: for every table (colors, *shape of the table)."""
+    tangents = []
+    for table_path in _tables(colors):
+        table = named.get(scene, table_path)
+        tangent = jnp.zeros((len(colors), *table.shape), table.dtype)
+        for number, (its_path, index) in enumerate(colors):
+            if its_path == table_path:
+                tangent = tangent.at[(number, *index)].set(1)
+        tangents.append(tangent)
+    return tangents
+
+
+def by_tangent(of, scene, colors: Places, tangents):
+    """A value of the scene, its derivatives (T, *shape), and what comes with it: `of(scene)` is value and company.
+
+    tangents: `unit_tangents` of the colors.
+    """
+    if not colors:
+        value, company = of(scene)
+        return value, jnp.zeros((0, *value.shape), value.dtype), company
+    paths = _tables(colors)
+
+    def varied(tables):
+        changed = scene
+        for path, table in zip(paths, tables, strict=True):
+            changed = named.put(changed, path, table)
+        return of(changed)
+
+    def push(tangents):
+        return jax.jvp(varied, ([named.get(scene, path) for path in paths],), (tangents,), has_aux=True)
+
+    return jax.vmap(push, out_axes=(None, 0, None))(tangents)
+
+
+def _tables(colors: Places):
+    """Paths of the tables that hold the colours, each once."""
+    return list(dict.fromkeys(table_path for table_path, _ in colors))

@@ -1,0 +1,70 @@
+"""Next event estimation: light that is looked for instead of found by chance, and how the two share (Veach 1997)."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+from jax import lax
+
+from pathjax import bsdfs, emitters
+from pathjax.core.math import spawn_ray, to_local
+from pathjax.integrators.options import Options
+from pathjax.integrators.random_numbers import Bounce
+from pathjax.integrators.vertex import Vertex
+from pathjax.shapes import geometry
+
+
+def occurs(scene, choice, options: Options) -> bool:
+    """Whether any light is sampled: not where all bsdfs are Dirac's, whose directions no light sample has."""
+    return options.strategy != "bsdf" and choice is not None and bsdfs.occurs(scene.materials, "smooth")
+
+
+def light_sample(scene, choice, vertex: Vertex, u: Bounce, goes_on, options: Options):
+    """One sample (3,) of what a vertex reflects of direct light: the integral over all lights of f Le |cos theta| V.
+
+    Args:
+        choice: how lights are chosen, of `emitters.choice`.
+        goes_on: () bool, else the sample is of no use, and its shadow ray not traced.
+    """
+    materials = scene.materials
+    smooth = bsdfs.has(materials, vertex.kind, "smooth")
+
+    def sample():
+        drawn = emitters.sample(scene.emitters, scene.geometry, choice, vertex.surface.p, u.light, u.triangle)
+        drawn = lax.optimization_barrier(drawn)
+        wo = to_local(vertex.frame, drawn.d)
+        f, pdf_bsdf = bsdfs.evaluate(materials, vertex.kind, vertex.row, vertex.surface, vertex.wi, wo)
+        possible = (drawn.pdf > 0) & (pdf_bsdf > 0)
+        scale = lax.optimization_barrier(_weight(drawn, pdf_bsdf, options) / jnp.where(possible, drawn.pdf, 1))
+        contribution = f * drawn.Le * scale
+        # A shadow ray of negative length is not traced.
+        useful = goes_on & smooth & possible & (options.derivative | jnp.any(contribution > 0))
+        reach = jnp.where(useful, drawn.distance, -1)
+        shadow_ray = spawn_ray(vertex.surface, drawn.d, vertex.hit.primitive)._replace(t_max=reach)
+        shadow_ray, contribution = lax.optimization_barrier((shadow_ray, contribution))
+        visible = useful & ~geometry.occluded(scene.geometry, shadow_ray, drawn.primitive)
+        return jnp.where(visible, contribution, 0)
+
+    return lax.cond(smooth, sample, lambda: jnp.zeros_like(vertex.wi))
+
+
+def _weight(drawn, pdf_bsdf, options: Options):
+    """Share () of a light sample in the light that bsdf sampling finds too."""
+    return mis_weight(drawn.density, pdf_bsdf) if options.strategy == "mis" else 1
+
+
+def share_of_bsdf_sampling(scene, choice, pdf, pdf_light, options: Options):
+    """Share () of bsdf sampling in light that it found with density `pdf` and a light sample with `pdf_light`."""
+    if options.strategy == "mis":
+        return mis_weight(pdf, pdf_light)
+    if occurs(scene, choice, options):
+        return jnp.where(jnp.isfinite(pdf) & (pdf_light > 0), 0, 1)
+    return 1
+
+
+def mis_weight(pdf, other_pdf):
+    """Power heuristic for a sample of density `pdf` > 0 that the other technique finds with `other_pdf`.
+
+    1 for an infinite `pdf`, what cannot be found otherwise, even where a grazing light makes the other one overflow.
+    """
+    ratio = other_pdf / pdf
+    return jnp.where(jnp.isinf(pdf), 1, 1 / (1 + ratio * ratio))

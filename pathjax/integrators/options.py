@@ -1,0 +1,86 @@
+"""What a path tracer may be asked to do: one record, made and checked where the public functions begin.
+
+It is what `jax.jit` gets as a static argument, so each choice compiles a kernel of its own, and the defaults compile
+nothing of the other choices.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import jax
+import numpy as np
+
+from pathjax import bsdfs
+from pathjax.core import sampler
+from pathjax.errors import InputError
+
+STRATEGIES = ("mis", "light", "bsdf")
+SAMPLERS = tuple(sampler.POINTS)
+# Branches double with each.
+MOST_SPLITS = 8
+
+
+@dataclass(frozen=True)
+class Options:
+    """Choices of one path tracer.
+
+    Raises:
+        InputError: a choice that is unknown or out of range.
+    """
+
+    # What users choose; `pathjax.render` says what it means.
+    strategy: str = "mis"  # of STRATEGIES
+    fresnel: str = "exact"  # of `bsdfs.FRESNEL`
+    split_depth: int = 0  # at most MOST_SPLITS
+    sampler: str = "lattice"  # of SAMPLERS
+    controlled: bool = False  # a `transport.Control` decides on roulette
+    # What other parts of the package ask for.
+    derivative: bool = False  # follow also what carries nothing, since its derivative may; the value is the same
+    by_vertex: bool = False  # `Path.L` is the Gain of the last vertex
+    watch_moving: bool = False  # tell which bsdfs it met that move paths
+
+    def __post_init__(self):
+        named = {"strategy": STRATEGIES, "fresnel": bsdfs.FRESNEL, "sampler": SAMPLERS}
+        for name, known in named.items():
+            if getattr(self, name) not in known:
+                raise InputError(f"{name} {getattr(self, name)!r} is unknown; use one of {', '.join(known)}")
+        if not isinstance(self.split_depth, int) or not 0 <= self.split_depth <= MOST_SPLITS:
+            raise InputError(f"split_depth = {self.split_depth!r}; it must be an integer in [0, {MOST_SPLITS}]")
+
+    def check_counts(self, spp, seed) -> None:
+        """Refuse, with an InputError, numbers of samples and seeds out of range; see `check_counts`."""
+        check_counts(spp, seed)
+        if self.sampler == "subpixel" and not isinstance(spp, jax.core.Tracer):
+            if np.any(np.asarray(spp) % sampler.SUBPIXELS):
+                raise InputError(f"spp = {spp}; sampler='subpixel' takes samples by fours, so make it a multiple of 4")
+
+    def check_differentiable(self) -> None:
+        """Refuse, with an InputError, what derivatives are not made with."""
+        if self.split_depth or self.sampler != "lattice":
+            raise InputError(
+                f"derivatives are not made with split_depth={self.split_depth} and sampler={self.sampler!r}; "
+                "differentiate with split_depth=0 and sampler='lattice', whose image has the same expectation"
+            )
+        if self.controlled:
+            raise InputError("derivatives are not made with a control; without one the image has the same expectation")
+
+    def applied(self, scene):
+        """The scene whose dielectrics reflect as chosen."""
+        return replace(scene, materials=bsdfs.with_fresnel(scene.materials, self.fresnel))
+
+
+DEFAULTS = Options()
+
+
+def check_counts(spp, seed, name: str = "spp") -> None:
+    """Refuse, with an InputError, a number of samples below 1 and a seed below 0; arrays, traced ones too, pass.
+
+    name: what the samples are called.
+    """
+    for its_name, value, least in ((name, spp, 1), ("seed", seed, 0)):
+        if isinstance(value, jax.Array) or np.ndim(value):
+            continue
+        whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
+        if not whole or not least <= value < 2**31:
+            raise InputError(f"{its_name} = {value!r}; it must be an integer in [{least}, 2^31)")

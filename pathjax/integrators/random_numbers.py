@@ -1,0 +1,55 @@
+"""The random numbers of a path: four of a low-discrepancy point for each vertex, and hashed ones for its other choices.
+
+The camera is vertex 0 of the sampler, so what a path meets at depth d is vertex d + 1.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from pathjax import bsdfs
+from pathjax.core import sampler
+
+# Hashed numbers of lobes begin here: the others are two for each depth, and depths end at `scene.UNBOUNDED`, 2^30.
+_LOBES = 1 << 31
+
+
+class Bounce(NamedTuple):
+    """Random numbers of one vertex, uniform in [0, 1)."""
+
+    light: jax.Array  # (2,)
+    bsdf: jax.Array  # (2,) or (3,), `bsdf_dimensions`
+    triangle: jax.Array  # () chooses within a mesh that emits
+    roulette: jax.Array  # ()
+
+
+def camera_numbers(scene, stream, sample, points="lattice"):
+    """Film (2,) and lens (2,).
+
+    Args:
+        stream: () uint32 of `sampler.pixel_stream`; sample: () uint32 number of the sample; points: of
+            `options.SAMPLERS`.
+    """
+    u = sampler.POINTS[points](stream, sample, 0).astype(scene.camera.origin.dtype)
+    return u[:2], u[2:]
+
+
+def bounce_numbers(scene, stream, sample, depth, points="lattice") -> Bounce:
+    """Random numbers of the vertex number depth."""
+    dtype = scene.camera.origin.dtype
+    u = sampler.POINTS[points](stream, sample, depth + 1).astype(dtype)
+    key = sampler.path_key(stream, sample)
+    rest = sampler.hashed(key, 2 * depth, 2).astype(dtype)
+    bsdf = u[2:]
+    if bsdf_dimensions(scene.materials) == 3:
+        lobe = sampler.hashed(key, jnp.uint32(_LOBES) + depth.astype(jnp.uint32), 1).astype(dtype)
+        bsdf = jnp.concatenate([bsdf, lobe])
+    return Bounce(u[:2], bsdf, rest[0], rest[1])
+
+
+def bsdf_dimensions(materials: bsdfs.Materials) -> int:
+    """How many numbers a bsdf draws: 2 for its direction, and a third where some kind chooses among lobes."""
+    return 3 if bsdfs.occurs(materials, "lobes") else 2
