@@ -1,0 +1,102 @@
+"""The path tracer of textbooks (Kajiya 1986; PBRT 4 ed., chapter 14): read it first. `path` gives the same, faster.
+
+With w = -ray.d, the radiance that arrives along a ray from the point that it meets is
+
+    L(w) = Le(w) + integral of f(w, w') L(w') |cos theta'| dw'        over the directions w' of the sphere.
+
+One direction, drawn by the bsdf, stands for the integral, so that a path is a loop. Light that a bsdf seldom finds is
+also looked for, by a sample of the lights; each technique gets the share of the power heuristic (Veach 1997).
+
+It knows no choices, has no care for speed and does not hide emitters, and is the oracle of tests: with the same random
+numbers a sample of `path` is the same to rounding.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from pathjax import bsdfs, emitters
+from pathjax.compile.runtime import native_map
+from pathjax.core import sampler
+from pathjax.core.math import spawn_ray, to_local, to_world
+from pathjax.core.types import Ray
+from pathjax.integrators.pixel import camera_ray
+from pathjax.integrators.random_numbers import bounce_numbers
+from pathjax.integrators.vertex import vertex
+from pathjax.sensors import film
+from pathjax.shapes import geometry
+
+
+def radiance(scene, choice, ray: Ray, numbers):
+    """One estimate (3,) of the radiance that arrives along a ray, unbiased up to the scene's max_depth.
+
+    Args:
+        choice: how lights are chosen, of `emitters.choice`.
+        numbers: depth () int32 -> Bounce.
+    """
+    shapes, materials = scene.geometry, scene.materials
+
+    def bounce(state):
+        ray, L, throughput, pdf, passive, depth, _ = state
+        u = numbers(depth)
+        hit = geometry.closest_hit(shapes, ray)
+        found = hit.primitive >= 0
+        here = vertex(scene, ray, hit)
+        bsdf = here.kind, here.row, here.surface, here.wi
+        goes_on = found & (here.kind >= 0) & (depth + 1 < scene.max_depth)
+
+        # Emission, of the surface or of the background.
+        lamp, pdf_lamp = emitters.hit(scene.emitters, shapes, choice, ray, hit, here.surface)
+        sky, pdf_sky = emitters.background(scene.emitters, choice, ray.d)
+        Le, pdf_light = jnp.where(found, lamp, sky), jnp.where(found, pdf_lamp, pdf_sky)
+        L = L + throughput * Le * share(pdf, pdf_light)
+
+        # Light sample. A Dirac lobe reflects none of it.
+        if choice is not None and bsdfs.occurs(materials, "smooth"):
+            light = emitters.sample(scene.emitters, shapes, choice, here.surface.p, u.light, u.triangle)
+            f, pdf_bsdf = bsdfs.evaluate(materials, *bsdf, to_local(here.frame, light.d))
+            shadow_ray = spawn_ray(here.surface, light.d, hit.primitive)._replace(t_max=light.distance)
+            lit = goes_on & bsdfs.has(materials, here.kind, "smooth") & (light.pdf > 0) & (pdf_bsdf > 0)
+            lit &= ~geometry.occluded(shapes, shadow_ray, light.primitive)
+            pdf_light = jnp.where(lit, light.pdf, 1)
+            L = L + jnp.where(lit, throughput * f * light.Le / pdf_light * share(pdf_light, pdf_bsdf), 0)
+
+        # Bsdf sample.
+        drawn = bsdfs.sample(materials, *bsdf, u.bsdf)
+        throughput, passive = throughput * drawn.weight, passive * drawn.passive
+
+        # Roulette, by the share of light that is left, which refraction does not change.
+        depth = depth + 1
+        survival = jnp.where(depth >= scene.rr_depth, jnp.clip(jnp.max(throughput) / passive, 0.05, 0.95), 1)
+        alive = goes_on & (drawn.pdf > 0) & jnp.any(throughput > 0) & (u.roulette < survival)
+        ray = spawn_ray(here.surface, to_world(here.frame, drawn.wo), hit.primitive)
+        return ray, L, throughput / survival, jnp.where(drawn.delta, jnp.inf, drawn.pdf), passive, depth, alive
+
+    zero, one = jnp.zeros_like(ray.o), jnp.ones_like(ray.t_max)
+    state = ray, zero, zero + 1, one * jnp.inf, one, jnp.int32(0), scene.max_depth > 0
+    return lax.while_loop(lambda state: state[-1], bounce, state)[1]
+
+
+def share(pdf, other_pdf):
+    """Power heuristic for what was drawn with density `pdf` and might have been with `other_pdf`; inf: Dirac's."""
+    return jnp.where(jnp.isinf(pdf), 1, 1 / (1 + (other_pdf / pdf) ** 2))
+
+
+@partial(jax.jit, static_argnames="spp")
+def samples(scene, spp: int, seed):
+    """(spp, H, W, 3) samples of an image of a scene without names; their mean is that of `pathjax.render`."""
+    pixels = jnp.arange(film.pixel_count(scene.film), dtype=jnp.int32)
+    choice = emitters.choice(scene.emitters, "mis")
+
+    def sample(item, scene, choice):
+        pixel, number = item
+        stream = sampler.pixel_stream(seed, pixel)
+        ray, weight = camera_ray(scene, pixel, stream, number)
+        return weight * radiance(scene, choice, ray, lambda depth: bounce_numbers(scene, stream, number, depth))
+
+    items = jnp.tile(pixels, spp), jnp.repeat(jnp.arange(spp, dtype=jnp.uint32), len(pixels))
+    return native_map(sample, items, scene, choice).reshape(spp, *film.image_shape(scene.film), 3)

@@ -1,0 +1,61 @@
+"""The path tracer of renders against that of textbooks: the same samples, where they draw the same random numbers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from pathjax.integrators import pixel, reference
+from pathjax.integrators.options import DEFAULTS
+from pathjax.rendering.render import pixel_means
+from pathjax.scene.parameters import nameless
+from pathjax.sensors import film
+
+ROOT = Path(__file__).resolve().parents[2]
+NAMES = sorted(path.stem for path in (*ROOT.glob("scenes/*.xml"), *ROOT.glob("tests/scenes/*.xml")))
+QUICK = ("cornell_box", "glass_and_mirror", "triangle_box")
+SPP, SEED = 4, 7
+# What rounding leaves of a sample after some ten vertices, relative to it or to the mean of the image; and the share of
+# samples that it may send another way, at an edge or where roulette decides. A wrong term changes nearly all.
+ROUNDING, ASTRAY = {jnp.float32: 1e-3, jnp.float64: 1e-9}, {jnp.float32: 5e-3, jnp.float64: 0}
+
+
+def rendered(scene):
+    """(SPP, H, W, 3) samples of `path`, each an image of one."""
+    count = film.pixel_count(scene.film)
+    pixels = jnp.tile(jnp.arange(count, dtype=jnp.int32), SPP)
+    numbers = pixel.numbers(pixels, jnp.repeat(jnp.arange(SPP), count), 1, SEED)
+    means = pixel_means(scene, pixels, *numbers, options=DEFAULTS)
+    return np.asarray(means).reshape(SPP, *film.image_shape(scene.film), 3)
+
+
+def assert_same_samples(scene, dtype):
+    scene = nameless(scene)
+    fast, plain = rendered(scene), np.asarray(reference.samples(scene, SPP, SEED))
+    assert fast.dtype == plain.dtype == dtype
+    assert plain.mean() > 0
+    near = np.isclose(fast, plain, rtol=ROUNDING[dtype], atol=ROUNDING[dtype] * plain.mean()).all(-1)
+    assert 1 - near.mean() <= ASTRAY[dtype]
+
+
+@pytest.mark.parametrize("name", [pytest.param(n, marks=() if n in QUICK else pytest.mark.slow) for n in NAMES])
+def test_samples_are_those_of_the_textbook(shipped, name):
+    assert_same_samples(shipped(name, res=16), jnp.float32)
+
+
+@pytest.mark.parametrize("name", ["cornell_box", pytest.param("glass_and_mirror", marks=pytest.mark.slow)])
+def test_in_float64_no_sample_goes_astray(shipped, x64, name):
+    with x64():
+        assert_same_samples(shipped(name, jnp.float64, res=16), jnp.float64)
+
+
+@pytest.mark.parametrize("name", ["cornell_box", pytest.param("glass_and_mirror", marks=pytest.mark.slow)])
+def test_images_of_other_random_numbers_agree(shipped, estimate, estimate_type, agree, name):
+    """With the false-alarm rate of `agree`, 1e-4."""
+    scene = shipped(name, res=8)
+    images = np.stack([np.asarray(reference.samples(nameless(scene), 64, seed)).mean(0) for seed in range(101, 117)])
+    plain = estimate_type(images.mean(0), images.var(0, ddof=1) / len(images), len(images))
+    agree(estimate(scene, spp=64), plain)
