@@ -19,10 +19,10 @@ from pathjax import emitters
 from pathjax.bsdfs import dielectric
 from pathjax.compile.runtime import native_map, usual_promotion
 from pathjax.derivatives import ior, ior_difference, ior_step, rules, tangents
-from pathjax.description.parameter import Parameter
 from pathjax.errors import InputError
 from pathjax.integrators import pixel
 from pathjax.integrators.options import Options
+from pathjax.kinds.parameter import Parameter
 from pathjax.scene import parameters as named
 from pathjax.scene.scene import Scene
 from pathjax.sensors import film

@@ -20,8 +20,8 @@ import jax.numpy as jnp
 from jax.custom_derivatives import SymbolicZero
 
 from pathjax.compile.runtime import usual_promotion
-from pathjax.description.parameter import Parameter
 from pathjax.errors import InputError
+from pathjax.kinds.parameter import Parameter
 from pathjax.scene import parameters as named
 from pathjax.scene.scene import Scene
 
