@@ -17,7 +17,8 @@ from contextlib import contextmanager, suppress
 # Not every system has the one of a closed terminal.
 SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
 
-_waited_for: list[threading.Thread] = []
+# Of calls that `wait_for` began: set at their end. (A thread whose `join` was interrupted is said to be dead, in 3.11.)
+_ends: list[threading.Event] = []
 
 
 class Interrupts:
@@ -69,20 +70,19 @@ def wait_for(call: Callable):
 
     It goes on in a thread of its own, so the program must end by `leave`.
     """
-    outcome = []
+    outcome, end = [], threading.Event()
 
     def work():
         try:
             outcome.append((True, call()))
         except BaseException as error:
             outcome.append((False, error))
+        end.set()
 
-    thread = threading.Thread(target=work, daemon=True)
-    _waited_for.append(thread)
-    thread.start()
-    while thread.is_alive():
-        thread.join(0.1)
-    _waited_for.remove(thread)
+    _ends.append(end)
+    threading.Thread(target=work, daemon=True).start()
+    while not end.wait(0.1):
+        pass
     succeeded, result = outcome[0]
     if not succeeded:
         raise result
@@ -94,7 +94,7 @@ def leave(status: int) -> int:
 
     XLA aborts the process if the interpreter ends under such a call.
     """
-    if any(thread.is_alive() for thread in _waited_for):
+    if not all(end.is_set() for end in _ends):
         for stream in (sys.stdout, sys.stderr):
             with suppress(Exception):
                 stream.flush()
