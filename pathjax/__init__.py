@@ -1,6 +1,6 @@
 """pathjax: a differentiable Monte Carlo path tracer in pure JAX."""
 
-from pathjax.compile import runtime as _runtime  # noqa: F401  first: sets XLA up before a backend starts
+import pathjax.compile  # noqa: F401  first: sets XLA up before a backend starts
 from pathjax.derivatives.jacobian import Jacobian, jacobian
 from pathjax.errors import InputError, InputWarning
 from pathjax.io.load import load_scene

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import pathjax as pj
-from pathjax.compile import runtime
+from pathjax.compile import native
 from pathjax.integrators.options import Options
 from pathjax.rendering import bounces, tail
 
@@ -217,7 +217,7 @@ def test_variance_has_no_derivative_and_nothing_is_nan(furnace):
 # ---- compilation ----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.skipif(not runtime.native(), reason="native loops are off")
+@pytest.mark.skipif(not native(), reason="native loops are off")
 @pytest.mark.parametrize("derivative", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_terms_are_one_native_kernel(furnace, derivative):
     parameter = furnace.about.parameters["wall.reflectance"]

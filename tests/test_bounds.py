@@ -16,7 +16,8 @@ from jax.experimental import checkify
 
 import pathjax as pj
 from pathjax import emitters, transport
-from pathjax.compile import runtime
+from pathjax.compile import mapping, native_map, one_by_one, primitives
+from pathjax.compile.jax_compat import jaxpr_as_fun
 from pathjax.core import math
 from pathjax.sensors import film
 from pathjax.shapes import triangle
@@ -37,6 +38,13 @@ class SignedStarts:
 
     def dynamic_update_slice(self, array, update, starts, **how):
         return lax.dynamic_update_slice(array, update, [start.astype(jnp.int32) for start in starts], **how)
+
+
+class Inline:
+    """`one_by_one` without its primitive, into which `checkify` does not look."""
+
+    def bind(self, *inputs, program):
+        return jaxpr_as_fun(program)(*inputs)
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +68,8 @@ def outside_of():
         return [message for message in met if message]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(runtime, "_map", checked_map)
+        patch.setattr(mapping, "_map", checked_map)
+        patch.setattr(primitives, "one_by_one_p", Inline())
         for module in (math, triangle, bvh):
             patch.setattr(module, "lax", SignedStarts())
         jax.clear_caches()
@@ -75,18 +84,19 @@ def some_slow(names, quick):
 # ---- the check itself -----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("how", [lambda f: f, one_by_one], ids=["plainly", "one by one"])
 @pytest.mark.parametrize("index, found", [(0, False), (3, False), (-1, True), (4, True), (1 << 30, True)])
-def test_check_finds_what_lies_outside(outside_of, index, found):
+def test_check_finds_what_lies_outside(outside_of, how, index, found):
     """Within control flow, as most reads of kernels are."""
 
     def read(i, table):
         def add(k, total):
-            return lax.cond(k == 1, lambda: total + math.at(table, i), lambda: total)
+            return lax.cond(k == 1, how(lambda: total + math.at(table, i)), lambda: total)
 
         return lax.fori_loop(0, 2, add, jnp.zeros(2))
 
     table = jnp.arange(8.0).reshape(4, 2)
-    assert bool(outside_of(lambda: runtime.native_map(read, jnp.int32([0, index]), table))) == found
+    assert bool(outside_of(lambda: native_map(read, jnp.int32([0, index]), table))) == found
 
 
 # ---- kernels --------------------------------------------------------------------------------------------------------
@@ -186,7 +196,7 @@ def test_lights_are_chosen_inside_of_arrays(outside_of, make_scene):
     def draw(u, scene, chosen):
         return emitters.sample(scene.emitters, scene.geometry, chosen, jnp.zeros(3), u[:2], u[2])
 
-    assert not outside_of(lambda: runtime.native_map(draw, numbers, scene, chosen))
+    assert not outside_of(lambda: native_map(draw, numbers, scene, chosen))
 
 
 def test_textures_are_read_inside_of_arrays_wherever_uv_lies(outside_of, shipped):
@@ -199,7 +209,7 @@ def test_textures_are_read_inside_of_arrays_wherever_uv_lies(outside_of, shipped
     def look_up(item, textures):
         return textures.look_up(item[0], SimpleNamespace(uv=item[1]))
 
-    assert not outside_of(lambda: runtime.native_map(look_up, items, textures))
+    assert not outside_of(lambda: native_map(look_up, items, textures))
 
 
 @pytest.mark.parametrize("filter", ["box", "tent", "gaussian"])
@@ -210,4 +220,4 @@ def test_filters_are_sampled_inside_of_arrays(outside_of, make_scene, filter):
     def sample(u, table):
         return film.sample_position(table, jnp.int32(3), u)
 
-    assert not outside_of(lambda: runtime.native_map(sample, numbers, table))
+    assert not outside_of(lambda: native_map(sample, numbers, table))

@@ -9,7 +9,7 @@ import pytest
 
 import pathjax as pj
 from pathjax import bsdfs
-from pathjax.compile import runtime
+from pathjax.compile import native
 from pathjax.integrators import pixel
 from pathjax.integrators.options import MOST_SPLITS, Options
 from pathjax.rendering.render import pixel_means, render_pixels
@@ -170,7 +170,7 @@ def test_scene_without_glass_is_the_same_program(shipped):
     assert lowered(scene, form="loop", split_depth=2, fresnel="schlick").as_text() == text
 
 
-@pytest.mark.skipif(not runtime.native(), reason="native loops are off")
+@pytest.mark.skipif(not native(), reason="native loops are off")
 def test_choices_are_one_native_kernel(shipped):
     chosen = lowered(shipped("glass_ball", res=16), split_depth=2, fresnel="schlick", sampler="subpixel")
     text = chosen.compile().as_text()

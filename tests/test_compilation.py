@@ -12,9 +12,10 @@ import pytest
 from jax.extend import source_info_util
 
 import pathjax as pj
-from pathjax.compile import runtime
+from pathjax.compile import native
 from pathjax.compile.lanes import lanes
-from pathjax.compile.lanes.interpreter import Lanes
+from pathjax.compile.lanes.interpreter import Interpreter
+from pathjax.compile.lanes.scheduling import from_queue
 from pathjax.derivatives import ior_step, jacobian, tangents
 from pathjax.integrators import pixel
 from pathjax.integrators.options import DEFAULTS, Options
@@ -31,7 +32,7 @@ NAMES = sorted(path.stem for path in (*ROOT.glob("scenes/*.xml"), *ROOT.glob("te
 LARGE = ("normals", "shapes_and_filters", "textures")
 SCENES = [pytest.param(name, marks=pytest.mark.slow if name in LARGE else ()) for name in NAMES]
 
-pytestmark = pytest.mark.skipif(not runtime.native(), reason="native loops are off")
+pytestmark = pytest.mark.skipif(not native(), reason="native loops are off")
 
 
 def lowered(scene, strategy="mis", devices=None, pixels=256, form=None):
@@ -144,7 +145,7 @@ def test_no_derivative_of_a_million_paths_is_nan(jacobian_kernel_of, name):
 def left_to_vmap(monkeypatch):
     """What lanes leave to vmap, which costs them their registers, while they are traced: "primitive at file:line"."""
     found, within = set(), []
-    apply, by_vmap = Lanes.apply, Lanes.by_vmap
+    apply, by_vmap = Interpreter.apply, Interpreter.by_vmap
 
     def applied(self, eqn, *rest):
         within.append(source_info_util.summarize(eqn.source_info))
@@ -158,8 +159,8 @@ def left_to_vmap(monkeypatch):
         found.add(f"{eqn.primitive.name} at {place}")
         return by_vmap(self, eqn, inputs)
 
-    monkeypatch.setattr(Lanes, "apply", applied)
-    monkeypatch.setattr(Lanes, "by_vmap", recorded)
+    monkeypatch.setattr(Interpreter, "apply", applied)
+    monkeypatch.setattr(Interpreter, "by_vmap", recorded)
     return found
 
 
@@ -228,6 +229,28 @@ def test_no_primitive_of_a_derivative_is_left_to_vmap(shipped, left_to_vmap, nam
         wanted = jacobian.Wanted(attached, ())
         trace(jacobian._jacobians, choosing, *work, jnp.zeros(0), wanted=wanted, options=DEFAULTS)
     assert not left_to_vmap
+
+
+def test_every_kernel_over_samples_has_a_persistent_loop(shipped, monkeypatch):
+    """Or lanes would wait for the longest path of their pixel: right, and slow."""
+    found = []
+
+    def counted(*arguments):
+        found.append(1)
+        return from_queue(*arguments)
+
+    monkeypatch.setattr("pathjax.compile.lanes.from_queue", counted)
+    scene = shipped("glass_ball", res=16)
+    colors = tangents.places(p for p in scene.about.parameters.values() if not p.moves_paths)
+    scene, pixels = replace(scene, about=None), jnp.arange(256, dtype=jnp.int32)
+    work = pixels, *pixel.numbers(pixels, 0, 4, 1)
+    trace(pixel_means, scene, *work, options=DEFAULTS)
+    for glass in ((), (0,)):
+        wanted = jacobian.Wanted(colors, glass)
+        trace(jacobian._jacobians, scene, *work, jnp.full(len(glass), 0.02), wanted=wanted, options=DEFAULTS)
+    series = pixels, jnp.uint32(0), jnp.ones((replicates.COUNT, 256), jnp.uint32), replicates.seeds(1)
+    trace(bounces._kernel, scene, *series, depth=3, options=Options(by_vertex=True, derivative=True), colors=colors)
+    assert len(found) == 4
 
 
 # ---- nothing that the scene lacks -----------------------------------------------------------------------------------

@@ -13,7 +13,7 @@ from jax import lax
 
 import pathjax as pj
 from pathjax import emitters
-from pathjax.compile.runtime import native_map
+from pathjax.compile import native_map
 from pathjax.integrators import path
 from pathjax.integrators.options import Options
 from pathjax.integrators.random_numbers import Bounce

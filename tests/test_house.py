@@ -13,8 +13,8 @@ ROOMS = (
     "version",
     "errors",
     "system",
-    "core",
     "compile",
+    "core",
     "images",
     "kinds",
     "description",
@@ -195,6 +195,33 @@ def test_questions_are_noticed(code):
 @pytest.mark.parametrize("code", ["isinstance(x, int)", "x.smooth", "x['int_ior']", "Sphere(1)", "type(x) is int"])
 def test_what_asks_of_no_kind_is_none(code):
     assert not list(questions(ast.parse(code), {"Sphere", "Mesh"}, {"int_ior"}))
+
+
+# ---- JAX --------------------------------------------------------------------------------------------------------
+
+PRIVATE = ("core", "extend", "_src", "interpreters", "custom_derivatives.SymbolicZero", "experimental")
+
+
+def names_of_jax(tree: ast.AST):
+    """Dotted names that a module imports from JAX or reads of it: "core.Tracer"."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from (alias.name.removeprefix("jax.") for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            module = f"{node.module}.".removeprefix("jax.")
+            yield from (f"{module}{alias.name}" for alias in node.names if node.module.split(".")[0] == "jax")
+        elif isinstance(node, ast.Attribute):
+            yield ast.unparse(node).removeprefix("jax.") if ast.unparse(node).startswith("jax.") else ""
+
+
+def test_one_module_uses_what_is_not_public_in_jax():
+    found = {
+        name
+        for name, tree in MODULES.items()
+        for used in names_of_jax(tree)
+        if any(f"{used}.".startswith(f"{private}.") for private in PRIVATE)
+    }
+    assert found == {"pathjax.compile.jax_compat"}
 
 
 if __name__ == "__main__":

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from pathjax.compile import runtime
+from pathjax.compile import keep_kernels
 from pathjax.errors import InputError
 from pathjax.io.mitsuba import loader
 from pathjax.scene.builder import build
@@ -17,7 +17,7 @@ def load(options) -> Scene:
 
 
 def _load(options) -> Scene:
-    runtime.keep_kernels()
+    keep_kernels()
     scene = build(loader.load(options.scene, **dict(options.defines)))
     return with_parameters(scene, {name: numbers("--set", name, text) for name, text in options.settings})
 

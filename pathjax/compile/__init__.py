@@ -1,1 +1,39 @@
-"""How a function of one ray becomes a native kernel over millions."""
+"""How a function of one ray becomes a native kernel over millions, and what its code may say of that.
+
+- `native_map` runs a function of one item over all items, on all devices; `lanes/` is how, on CPUs.
+- `compute_once`, `one_by_one` and `persistent_loop` stand in code of one item. They change nothing of its results, only
+  what is computed when.
+- `concurrently` calls one kernel several times at once.
+- `setup` prepares XLA. It runs here, so that importing pathjax is enough; `keep_kernels` is for programs.
+
+Whatever of JAX is not public is imported by `jax_compat` alone.
+"""
+
+from __future__ import annotations
+
+from pathjax.compile.cache import keep_kernels
+from pathjax.compile.jax_compat import is_symbolic_zero, is_traced
+from pathjax.compile.mapping import MANY_ITEMS, native_map
+from pathjax.compile.primitives import compute_once, one_by_one, persistent_loop
+from pathjax.compile.promotion import usual_promotion
+from pathjax.compile.threads import calls_at_once, concurrently, devices_of_a_call
+from pathjax.compile.xla import native, setup
+
+__all__ = [
+    "MANY_ITEMS",
+    "calls_at_once",
+    "compute_once",
+    "concurrently",
+    "devices_of_a_call",
+    "is_symbolic_zero",
+    "is_traced",
+    "keep_kernels",
+    "native",
+    "native_map",
+    "one_by_one",
+    "persistent_loop",
+    "setup",
+    "usual_promotion",
+]
+
+setup()

@@ -10,6 +10,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int, Integer, Real, Shaped
 
+from pathjax.compile import compute_once
 from pathjax.core.types import Frame, Ray, Surface
 
 # x, y and z, each of one number or of some, as the leaves of hierarchies have them.
@@ -94,7 +95,7 @@ def cos_sin_octant(x: Float[Array, ""]) -> tuple[Float[Array, ""], Float[Array, 
     terms = range(5 if x.dtype == jnp.float32 else 9)
     squared = x * x
     cos, sin = ([(-1) ** k / math.factorial(2 * k + first) for k in terms] for first in (0, 1))
-    return lax.optimization_barrier((_series(squared, cos), x * _series(squared, sin)))
+    return compute_once((_series(squared, cos), x * _series(squared, sin)))
 
 
 def cos_sin_turns(u: Float[Array, ""]) -> tuple[Float[Array, ""], Float[Array, ""]]:

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from pathjax.bsdfs import dielectric
+from pathjax.compile import compute_once, persistent_loop
 from pathjax.core import sampler
 from pathjax.core.math import at
 from pathjax.derivatives import ior
@@ -67,12 +68,12 @@ def mean_and_differences(work, scene, choice, steps, rows: tuple[int, ...], opti
 
         def end():
             place, k = jnp.maximum(shift, 0) // 4, shift % 4
-            value, place, k, again = lax.optimization_barrier((weight * now.L, place, k, twice(number)))
+            value, place, k, again = compute_once((weight * now.L, place, k, twice(number)))
             # The sample itself, or the second of a pair, whose first was kept.
             mean, by_ior, bias = sums
             mean = pixel.add_compensated(mean, jnp.where(shift < 0, value, 0))
             width = 2 * at(steps, place) * (1 + k // 2).astype(value.dtype)
-            quotient = lax.optimization_barrier((plus - value) / width)
+            quotient = compute_once((plus - value) / width)
             mine = ((jnp.arange(len(rows)) == place) & (shift >= 0) & (k % 2 == 1))[:, None]
             by_ior = pixel.add_compensated(by_ior, jnp.where(mine & (k == 1), quotient, 0))
             doubled = (RICHARDSON_EVERY / 3) * jnp.where(k == 1, -quotient, quotient)
@@ -94,6 +95,6 @@ def mean_and_differences(work, scene, choice, steps, rows: tuple[int, ...], opti
     base = jnp.int32(-1)
     nothing = pixel.no_path(scene, options)
     start = first_sample, base, jnp.int32(0), *nothing, zero, tuple((z, z) for z in (zero, zeros, zeros))
-    *_, sums = lax.while_loop(lambda state: state[0] != first_sample + spp, step, start)
+    *_, sums = persistent_loop(lambda state: state[0] != first_sample + spp, step, start)
     mean, by_ior, bias = (total / spp.astype(zero.dtype) for total, _ in sums)
     return mean, (by_ior, bias)

@@ -9,7 +9,7 @@ from jax import lax
 
 from pathjax import bsdfs
 from pathjax.bsdfs import dielectric
-from pathjax.compile.runtime import native_map
+from pathjax.compile import native_map
 from pathjax.core.math import at, dot, safe_divide, spawn_ray
 from pathjax.derivatives import ior
 from pathjax.integrators import path

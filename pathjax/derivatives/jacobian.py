@@ -17,7 +17,7 @@ from jax import lax
 
 from pathjax import emitters
 from pathjax.bsdfs import dielectric
-from pathjax.compile.runtime import native_map, usual_promotion
+from pathjax.compile import is_traced, native_map, usual_promotion
 from pathjax.derivatives import ior, ior_difference, ior_step, rules, tangents
 from pathjax.errors import InputError
 from pathjax.integrators import pixel
@@ -84,7 +84,7 @@ def jacobian(scene: Scene, names, spp: int = 64, seed: int = 0, *, strategy="mis
         raise InputError(f"names is a list of names; write [{names!r}]")
     if method not in METHODS:
         raise InputError(f"method {method!r} is unknown; use one of {', '.join(METHODS)}")
-    if step is not None and not isinstance(step, jax.core.Tracer) and not 0 < step < 1:
+    if step is not None and not is_traced(step) and not 0 < step < 1:
         raise InputError(f"step = {step}; it must lie between 0 and 1, in units of relative IOR")
     options = Options(strategy)
     options.check_counts(spp, seed)
@@ -120,7 +120,7 @@ def pixel_jacobians(
     Args:
         scene: without names.
         first_sample, spp, seed: each one number, or (N,) of the pixels.
-        how: `form` and `devices` of `runtime.native_map`.
+        how: `form` and `devices` of `native_map`.
     """
     attached = method == "attached"
     colors = [name for name, p in wanted.items() if attached or not p.moves_paths]

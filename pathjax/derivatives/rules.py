@@ -17,9 +17,8 @@ from typing import Protocol
 
 import jax
 import jax.numpy as jnp
-from jax.custom_derivatives import SymbolicZero
 
-from pathjax.compile.runtime import usual_promotion
+from pathjax.compile import is_symbolic_zero, usual_promotion
 from pathjax.errors import InputError
 from pathjax.kinds.parameter import Parameter
 from pathjax.scene import parameters as named
@@ -69,10 +68,10 @@ def _estimate_jvp(static, primals, tangents):
 
 def _changes(parameters: Mapping[str, Parameter], scene_tangent, varied_tangent) -> dict[str, jax.Array]:
     """Tangents of named parameters, by name; those that are known to be zero are left out."""
-    changes = {name: x for name, x in varied_tangent.items() if not isinstance(x, SymbolicZero)}
-    leaves, _ = jax.tree_util.tree_flatten_with_path(scene_tangent, is_leaf=lambda x: isinstance(x, SymbolicZero))
+    changes = {name: x for name, x in varied_tangent.items() if not is_symbolic_zero(x)}
+    leaves, _ = jax.tree_util.tree_flatten_with_path(scene_tangent, is_leaf=is_symbolic_zero)
     for keys, leaf in leaves:
-        if isinstance(leaf, SymbolicZero):
+        if is_symbolic_zero(leaf):
             continue
         place = tuple(key.name if isinstance(key, jax.tree_util.GetAttrKey) else key.idx for key in keys)
         held = {name: parameter for name, parameter in parameters.items() if parameter.path == place}

@@ -12,6 +12,7 @@ import jax
 import numpy as np
 
 from pathjax import bsdfs
+from pathjax.compile import is_traced
 from pathjax.core import sampler
 from pathjax.errors import InputError
 
@@ -51,7 +52,7 @@ class Options:
     def check_counts(self, spp, seed) -> None:
         """Refuse, with an InputError, numbers of samples and seeds out of range; see `check_counts`."""
         check_counts(spp, seed)
-        if self.sampler == "subpixel" and not isinstance(spp, jax.core.Tracer):
+        if self.sampler == "subpixel" and not is_traced(spp):
             if np.any(np.asarray(spp) % sampler.SUBPIXELS):
                 raise InputError(f"spp = {spp}; sampler='subpixel' takes samples by fours, so make it a multiple of 4")
 

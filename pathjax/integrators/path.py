@@ -22,6 +22,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from pathjax import bsdfs, emitters
+from pathjax.compile import compute_once
 from pathjax.core.math import dot, spawn_ray, to_world
 from pathjax.core.types import Ray
 from pathjax.emitters import Choice
@@ -91,7 +92,7 @@ def extend(scene, choice: Choice | None, path: Path, u: Bounce, options: Options
     hit = geometry.closest_hit(scene.geometry, ray)
     here = vertex(scene, ray, hit) if scene.geometry.tables else None
     # What many results share is computed once.
-    u, here = lax.optimization_barrier((u, here))
+    u, here = compute_once((u, here))
     path = path._replace(L=_with_emission(path.L, emission(scene, choice, path, hit, here, options)))
     path = path._replace(depth=path.depth + 1)
     if here is None:
@@ -150,7 +151,7 @@ def scatter(scene, choice, here: Vertex, u: Bounce, goes_on, options: Options, p
     L = path.L
     if next_event.occurs(scene, choice, options):
         L = _with_light(L, path.throughput * next_event.light_sample(scene, choice, here, u, goes_on, options))
-    drawn, d = lax.optimization_barrier(bsdf_sample(scene, here, u.bsdf))
+    drawn, d = compute_once(bsdf_sample(scene, here, u.bsdf))
     if path.pending is not None:
         splits = splitting.takes_place(scene, here, path)
         drawn = drawn._replace(weight=jnp.where(splits, drawn.pdf, 1) * drawn.weight)

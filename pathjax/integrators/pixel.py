@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from pathjax.compile import compute_once, persistent_loop
 from pathjax.core import sampler
 from pathjax.integrators import path
 from pathjax.integrators.options import Options
@@ -25,9 +26,9 @@ def camera_ray(scene, pixel, stream, number, points="lattice"):
         pixel: () int32; stream: () uint32, its `sampler.pixel_stream`; number: () uint32; points: of
             `options.SAMPLERS`.
     """
-    u_film, u_lens = lax.optimization_barrier(camera_numbers(scene, stream, number, points))
+    u_film, u_lens = compute_once(camera_numbers(scene, stream, number, points))
     position, weight = film.sample_position(scene.film, pixel, u_film)
-    return lax.optimization_barrier((scene.camera.sample_ray(position, u_lens), weight))
+    return compute_once((scene.camera.sample_ray(position, u_lens), weight))
 
 
 def camera_path(scene, pixel, stream, number, options: Options):
@@ -51,7 +52,7 @@ def mean(work, scene, choice, control=None, *, options: Options):
     """
 
     def add(sums, depth, now, weight):
-        value = lax.optimization_barrier(weight * now.L)
+        value = compute_once(weight * now.L)
         return lax.cond(now.alive, lambda: sums, lambda: add_compensated(sums, value))
 
     zero = jnp.zeros((3,), scene.camera.origin.dtype)
@@ -81,7 +82,7 @@ def over_vertices(work, scene, choice, add, sums, options: Options, control=None
         return number + jnp.where(now.alive, 0, 1).astype(number.dtype), now, weight, sums
 
     state = first_sample, *no_path(scene, options), sums
-    return lax.while_loop(lambda state: state[0] != first_sample + spp, step, state)[-1]
+    return persistent_loop(lambda state: state[0] != first_sample + spp, step, state)[-1]
 
 
 def begun(scene, pixel, stream, number, now, weight, options: Options):
@@ -90,7 +91,7 @@ def begun(scene, pixel, stream, number, now, weight, options: Options):
     def begin():
         return camera_path(scene, pixel, stream, number, options)
 
-    return lax.optimization_barrier(lax.cond(now.alive, lambda: (now, weight), begin))
+    return compute_once(lax.cond(now.alive, lambda: (now, weight), begin))
 
 
 def add_compensated(state, term):

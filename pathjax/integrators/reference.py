@@ -20,7 +20,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from pathjax import bsdfs, emitters
-from pathjax.compile.runtime import native_map
+from pathjax.compile import native_map
 from pathjax.core import sampler
 from pathjax.core.math import spawn_ray, to_local, to_world
 from pathjax.core.types import Ray

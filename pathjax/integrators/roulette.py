@@ -5,6 +5,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jax import lax
 
+from pathjax.compile import compute_once
 from pathjax.core.math import larger, safe_divide, smaller
 
 # Roulette never spares a path for certain, so that every path ends even between perfect mirrors; and never ends one for
@@ -24,7 +25,7 @@ def survival(scene, depth, throughput, passive):
     left = lax.stop_gradient(largest(throughput))
     if passive is not None:
         left = safe_divide(left, passive)
-    return lax.optimization_barrier(jnp.where(depth >= scene.rr_depth, bounded(left), 1))
+    return compute_once(jnp.where(depth >= scene.rr_depth, bounded(left), 1))
 
 
 def bounded(survival):

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import jax.numpy as jnp
-from jax import lax
 
+from pathjax.compile import compute_once
 from pathjax.integrators.options import Options
 from pathjax.integrators.pixel import over_vertices
 
@@ -20,7 +20,7 @@ def sums(work, scene, choice, depth, options: Options):
     rows = jnp.arange(depth)[:, None]
 
     def add(sums, k, now, weight):
-        emission, light = lax.optimization_barrier((weight * now.L.emission, weight * now.L.light))
+        emission, light = compute_once((weight * now.L.emission, weight * now.L.light))
         return sums + jnp.where(rows == k, emission, jnp.where(rows == k + 1, light, 0))
 
     return over_vertices(work, scene, choice, add, jnp.zeros((depth, 3), scene.camera.origin.dtype), options)

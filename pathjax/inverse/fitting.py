@@ -21,7 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 import optimistix as optx
 
-from pathjax.compile.runtime import usual_promotion
+from pathjax.compile import usual_promotion
 from pathjax.errors import InputError
 from pathjax.integrators.options import check_counts
 from pathjax.inverse import problem, uncertainty

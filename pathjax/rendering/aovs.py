@@ -8,7 +8,7 @@ from functools import partial
 import jax
 import numpy as np
 
-from pathjax.compile.runtime import native_map, usual_promotion
+from pathjax.compile import native_map, usual_promotion
 from pathjax.errors import InputError
 from pathjax.integrators import aov, pixel
 from pathjax.integrators.options import check_counts

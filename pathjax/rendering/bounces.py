@@ -11,7 +11,7 @@ import numpy as np
 from jax import lax
 
 from pathjax import emitters
-from pathjax.compile.runtime import native_map, usual_promotion
+from pathjax.compile import is_traced, native_map, usual_promotion
 from pathjax.derivatives import rules, tangents
 from pathjax.errors import InputError
 from pathjax.integrators import pixel, terms
@@ -117,7 +117,7 @@ def _bounces(scene, depth, pixels, spp, seed, options, errors) -> Bounces:
     samples = jnp.broadcast_to(jnp.asarray(spp, jnp.int32), pixels.shape)
     shares = replicates.shares(samples.ravel()) if errors else samples.reshape(1, -1)
     seeds = replicates.seeds(seed) if errors else jnp.asarray(seed, jnp.uint32)[None]
-    most = None if isinstance(shares, jax.core.Tracer) else int(shares.max())
+    most = None if is_traced(shares) else int(shares.max())
     estimator = _TermSums(depth, replace(options, by_vertex=True))
     scene = replace(scene, max_depth=jnp.int32(depth))
     if most is None or most <= _PORTION:

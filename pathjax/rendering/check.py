@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 
-from pathjax.compile.runtime import usual_promotion
+from pathjax.compile import usual_promotion
 from pathjax.derivatives import ior
 from pathjax.derivatives.jacobian import jacobian
 from pathjax.errors import InputError

@@ -7,7 +7,7 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 
-from pathjax.compile.runtime import native_map, usual_promotion
+from pathjax.compile import native_map, usual_promotion
 from pathjax.core.math import normalize, rescale
 from pathjax.core.types import Hit, Ray
 from pathjax.scene.scene import Scene

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from pathjax import emitters
-from pathjax.compile.runtime import native_map, usual_promotion
+from pathjax.compile import native_map, usual_promotion
 from pathjax.derivatives.jacobian import pixel_jacobians
 from pathjax.derivatives.rules import estimate
 from pathjax.errors import InputError
@@ -82,7 +82,7 @@ def render_pixels(scene: Scene, pixels, first_sample, spp, seed, options: Option
 
     first_sample, spp, seed: each one number, or (N,) of the pixels.
     control: of `render`, for options that are controlled.
-    how: `form` and `devices` of `runtime.native_map`.
+    how: `form` and `devices` of `native_map`.
     """
     numbers = pixel.numbers(pixels, first_sample, spp, seed)
     return estimate(_PixelMeans(options, tuple(how.items())), scene, control, pixels, *numbers)

@@ -8,7 +8,7 @@ import numpy as np
 
 from pathjax import bsdfs, emitters, shapes
 from pathjax import description as desc
-from pathjax.compile.runtime import usual_promotion
+from pathjax.compile import usual_promotion
 from pathjax.errors import InputError
 from pathjax.kinds import Parameters
 from pathjax.scene.metadata import About

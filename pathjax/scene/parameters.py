@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from pathjax.compile.runtime import usual_promotion
+from pathjax.compile import is_traced, usual_promotion
 from pathjax.errors import InputError
 from pathjax.kinds.parameter import Parameter
 from pathjax.scene.metadata import About
@@ -39,7 +39,7 @@ def with_parameters(scene: Scene, values: Mapping) -> Scene:
         parameter = find(scene, name)
         value = checked(name, value, parameter, get(scene, parameter.path).dtype)
         varied.pop(name, None)
-        if isinstance(value, jax.core.Tracer):
+        if is_traced(value):
             varied[name] = value
         scene = with_values(scene, {name: lax.stop_gradient(value)}, about(scene).parameters)
     return replace(scene, varied=varied)
@@ -93,7 +93,7 @@ def checked(name, value, parameter: Parameter, dtype):
     except (TypeError, ValueError):
         wanted = f"{parameter.shape[0]} numbers" if parameter.shape else "one number"
         raise InputError(f"{name} takes {wanted}, not {value!r}") from None
-    if not isinstance(value, jax.core.Tracer):
+    if not is_traced(value):
         low, high = parameter.bounds
         if not bool(jnp.all((value >= low) & (value <= high) & jnp.isfinite(value))):
             raise InputError(f"{name} = {np.asarray(value).tolist()} lies outside its bounds [{low:g}, {high:g}]")

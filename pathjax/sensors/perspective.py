@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 
+from pathjax.compile import compute_once
 from pathjax.core.math import dot
 from pathjax.core.types import Ray
 from pathjax.description.fields import Fields
@@ -35,7 +35,7 @@ class PerspectiveCamera(Camera):
         def to_world(v):
             return v[0] * right + v[1] * up + v[2] * forward
 
-        v = lax.optimization_barrier(to_world(local))
+        v = compute_once(to_world(local))
         length = jnp.sqrt(dot(v, v))
         d = v / length
         along = length / local[2]

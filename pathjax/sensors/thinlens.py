@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 
+from pathjax.compile import compute_once
 from pathjax.core.warp import square_to_disk
 from pathjax.description.fields import Fields
 from pathjax.sensors.film import HDRFilm
@@ -24,7 +24,7 @@ class ThinLensCamera(PerspectiveCamera):
     def through_lens(self, local, u_lens):
         aperture = self.aperture_radius * square_to_disk(u_lens)
         start = jnp.stack([aperture[0], aperture[1], jnp.zeros_like(local[0])])
-        return lax.optimization_barrier((start, local * self.focus_distance - start))
+        return compute_once((start, local * self.focus_distance - start))
 
 
 @dataclass(frozen=True)

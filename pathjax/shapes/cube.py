@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 
+from pathjax.compile import compute_once
 from pathjax.core.math import at, dot, larger, smaller
 from pathjax.shapes.accel.leaves import numbers_of, pack, rows_of
 from pathjax.shapes.accel.traverse import Tree
@@ -65,7 +65,7 @@ class Cubes(Searched):
             exact = (2 * (started & 1) - 1).astype(leaf.dtype)
             x.append(jnp.where(started >> 1 == axis, exact, dot(dual, from_c)))
             inverse.append(1 / dot(dual, d))
-        x, inverse = lax.optimization_barrier((x, inverse))
+        x, inverse = compute_once((x, inverse))
         end = [jnp.copysign(jnp.ones_like(i), i) for i in inverse]  # of each slab where the ray leaves it
         near = [(-end[axis] - x[axis]) * inverse[axis] for axis in range(3)]
         far = [(end[axis] - x[axis]) * inverse[axis] for axis in range(3)]

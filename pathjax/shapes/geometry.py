@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from pathjax.compile.lanes import one_by_one
+from pathjax.compile import compute_once, one_by_one
 from pathjax.core.math import at, dot, frame_from_normal, integer_like, smaller
 from pathjax.core.types import Hit, Ray, Surface
 from pathjax.shapes.accel import traverse as bvh
@@ -46,15 +46,15 @@ def closest_hit(geometry: Geometry, ray: Ray) -> Hit:
 
     def leaf_test(distances, rows, first, t, primitive):
         if len(distances) == 1:
-            (distance,), (candidate,) = lax.optimization_barrier((distances, rows + first))
+            (distance,), (candidate,) = compute_once((distances, rows + first))
             nearer = (distance > 0) & ((distance < t) | ((distance == t) & (primitive == none)))
             return jnp.where(nearer, distance, t), jnp.where(nearer, candidate, primitive)
-        hit, distances = lax.optimization_barrier(((distances > 0) & (distances <= t), distances))
+        hit, distances = compute_once(((distances > 0) & (distances <= t), distances))
 
         def update():
             # Positive floats order as integers, and integer minima vectorise.
-            bits = lax.optimization_barrier(jnp.where(hit, _bits(distances), beyond))
-            nearest = lax.optimization_barrier(_least(bits))
+            bits = compute_once(jnp.where(hit, _bits(distances), beyond))
+            nearest = compute_once(_least(bits))
             found = lax.bitcast_convert_type(nearest, distances.dtype)
             # The lowest of those that tie is the first: primitives ascend with the lanes.
             lanes = jnp.left_shift(jnp.int32(1), jnp.arange(len(bits), dtype=jnp.int32))
@@ -174,13 +174,13 @@ def _visit_table(table: Searched, first, ray, leaf_test, t, primitive):
     # A search goes its own way for each ray; what it starts from is made for all of them.
     @one_by_one
     def search(slabs, entry, prepared, exclude, t, primitive):
-        of_ray = partial(leaf, lax.optimization_barrier(prepared), exclude)
+        of_ray = partial(leaf, compute_once(prepared), exclude)
         return bvh.traverse(table.tree, of_ray, slabs, entry, t, primitive)
 
-    prepared = lax.optimization_barrier(table.prepare(ray.o, ray.d))
+    prepared = compute_once(table.prepare(ray.o, ray.d))
     if table.tree is not None:
-        slabs = lax.optimization_barrier(bvh.prepare(ray.o, ray.d))
-        entry = lax.optimization_barrier(bvh.enter(table.tree, slabs, t))
+        slabs = compute_once(bvh.prepare(ray.o, ray.d))
+        entry = compute_once(bvh.enter(table.tree, slabs, t))
         # Many rays meet no child of the root.
         return lax.cond(
             entry != 0,
@@ -190,7 +190,7 @@ def _visit_table(table: Searched, first, ray, leaf_test, t, primitive):
     of_ray = partial(leaf, prepared, ray.exclude)
     found = lax.fori_loop(0, len(table.leaves), lambda number, state: of_ray(number, *state), (t, primitive))
     # XLA dissolves a loop of one trip, and would test again for each consumer.
-    return lax.optimization_barrier(found)
+    return compute_once(found)
 
 
 def _least(x):

@@ -13,8 +13,8 @@ from typing import ClassVar, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 
+from pathjax.compile import compute_once
 from pathjax.core.math import at, dot, safe_divide, safe_sqrt
 from pathjax.core.types import Hit, Ray, Surface
 from pathjax.description.fields import Fields
@@ -185,7 +185,7 @@ class Table(Searched):
         squared = dot(to_p, to_p)
         distance = safe_sqrt(squared)
         d = to_p * safe_divide(1, distance)
-        d, distance = lax.optimization_barrier((d, distance))
+        d, distance = compute_once((d, distance))
         return LampSample(d, distance, n, safe_divide(squared, jnp.abs(dot(n, d)) * area), row)
 
     def row_of_lamp(self, lamps: Lamps, lamp, u_part):

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 
+from pathjax.compile import compute_once
 from pathjax.core.math import (
     at,
     cos_sin_turns,
@@ -130,7 +130,7 @@ class Spheres(Table):
         axis = normalize(to_center)
         frame = frame_from_normal(axis)
         # Read by five results: without the barrier each computes it again.
-        d = lax.optimization_barrier(to_world(frame, square_to_cone(u, one_minus_cos)))
+        d = compute_once(to_world(frame, square_to_cone(u, one_minus_cos)))
         b = dot(to_center, d)
         closest = b * d - to_center
         distance = larger(b - safe_sqrt(radius * radius - dot(closest, closest)), jnp.zeros_like(b))
@@ -145,7 +145,7 @@ class Spheres(Table):
         d = jnp.where(outside, d, d_inside)
         distance = jnp.where(outside, distance, distance_inside)
         n, pdf = outward * at(self.sign, row), _pdf(ball, one_minus_cos, outside, outward, d, distance)
-        return LampSample(*lax.optimization_barrier((d, distance, n, pdf)), row)
+        return LampSample(*compute_once((d, distance, n, pdf)), row)
 
     def lamp_density(self, lamps, lamp, first, ray, hit, surface):
         ball = at(self.balls, hit.primitive - first)

@@ -18,8 +18,8 @@ from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
-from jax import lax
 
+from pathjax.compile import compute_once
 from pathjax.core.math import dot, safe_divide
 from pathjax.errors import InputError
 from pathjax.integrators import roulette
@@ -63,7 +63,7 @@ class Control:
         # Where nothing is expected, the patches know nothing.
         share = jnp.where(expected > 0, safe_divide(size, expected), 1)
         survival = roulette.bounded(self.effort * share)
-        survival = lax.optimization_barrier(jnp.where(path.depth >= _FIRST, survival, 1))
+        survival = compute_once(jnp.where(path.depth >= _FIRST, survival, 1))
         survives = u < survival
         L = path.L + left * jnp.where(survives, 1 - 1 / survival, 1)
         return path._replace(L=L, throughput=path.throughput / survival, expected=expected), survives

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from pathjax.compile.runtime import native_map
+from pathjax.compile import compute_once, native_map
 from pathjax.core import sampler
 from pathjax.core.math import dot, larger, safe_divide, safe_sqrt, spawn_ray
 from pathjax.core.types import Surface
@@ -281,7 +281,7 @@ def _pair_visibility(work, shapes, patches, rays, seed):
     stream = sampler.combine(sampler.pixel_stream(seed, i), j)
 
     def add(number, sums):
-        numbers = lax.optimization_barrier(sampler.lattice_point(stream, number, 0).astype(patches.area.dtype))
+        numbers = compute_once(sampler.lattice_point(stream, number, 0).astype(patches.area.dtype))
         u, v = numbers[:2], numbers[2:]
         primitive, p, n, margin = point(patches, shapes, i, u)
         target, q, n_target, _ = point(patches, shapes, j, v)
@@ -291,7 +291,7 @@ def _pair_visibility(work, shapes, patches, rays, seed):
         carried = larger(dot(n, d), 0) * larger(-dot(n_target, d), 0) * safe_divide(1, squared)
         # A shadow ray of negative length is not traced.
         ray = spawn_ray(Surface(p, n, margin, n, u), d, primitive)._replace(t_max=jnp.where(carried > 0, distance, -1))
-        ray, carried = lax.optimization_barrier((ray, carried))
+        ray, carried = compute_once((ray, carried))
         seen = jnp.where(geometry.occluded(shapes, ray, target), 0, carried)
         return sums[0] + seen, sums[1] + carried, sums[2] + carried * carried
 

@@ -24,7 +24,7 @@ import numpy as np
 from jax import lax
 
 from pathjax import bsdfs, emitters
-from pathjax.compile.runtime import usual_promotion
+from pathjax.compile import is_traced, usual_promotion
 from pathjax.core.math import safe_divide
 from pathjax.errors import InputError
 from pathjax.integrators.options import check_counts
@@ -200,7 +200,7 @@ class Operator:
 
     def _check_radius(self) -> float | None:
         """Largest spectral radius; None: not known while traced."""
-        if any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves((self.factors, self.albedo))):
+        if any(is_traced(x) for x in jax.tree.leaves((self.factors, self.albedo))):
             return None
         radius = float(self.spectral_radius().max())
         # Closer to 1 and rounding makes up the solution.

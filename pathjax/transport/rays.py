@@ -7,10 +7,9 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from scipy import sparse
 
-from pathjax.compile.runtime import native_map
+from pathjax.compile import compute_once, native_map
 from pathjax.core import sampler
 from pathjax.core.math import dot, frame_from_normal, spawn_ray, to_world
 from pathjax.core.types import Surface
@@ -61,11 +60,11 @@ def _one(work, shapes, patches, seed):
     """Patch that ray `number` of the patch `sender` meets."""
     sender, number = work
     stream = sampler.pixel_stream(seed, sender)
-    numbers = lax.optimization_barrier(sampler.lattice_point(stream, number, 0).astype(patches.area.dtype))
+    numbers = compute_once(sampler.lattice_point(stream, number, 0).astype(patches.area.dtype))
     u, u_direction = numbers[:2], numbers[2:]
     primitive, p, n, margin = point(patches, shapes, sender, u)
     d = to_world(frame_from_normal(n), square_to_cosine_hemisphere(u_direction))
-    ray = lax.optimization_barrier(spawn_ray(Surface(p, n, margin, n, u), d, primitive))
+    ray = compute_once(spawn_ray(Surface(p, n, margin, n, u), d, primitive))
     hit = geometry.closest_hit(shapes, ray)
     surface = geometry.surface(shapes, ray, hit)
     met = patch_at(patches, shapes, jnp.maximum(hit.primitive, 0), surface.p, dot(surface.n, d) > 0)

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from pathjax.compile.runtime import native_map, usual_promotion
+from pathjax.compile import native_map, usual_promotion
 from pathjax.core import sampler
 from pathjax.core.math import at, dot
 from pathjax.errors import InputError

@@ -411,7 +411,7 @@ def test_ior_and_colours_are_recovered_together(ball, ball_target):
     ],
 )
 def test_bad_input_is_refused_before_anything_is_rendered(room, monkeypatch, change, words):
-    monkeypatch.setattr("pathjax.compile.runtime.native_map", None)
+    monkeypatch.setattr("pathjax.compile.mapping.native_map", None)
     monkeypatch.setattr(jax, "jit", None)
     arguments = {"scene": room, "target": np.ones((16, 16, 3)), "names": NAMES, **change}
     if change.get("scene") == []:

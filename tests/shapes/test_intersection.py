@@ -8,7 +8,7 @@ import trimesh
 
 from pathjax import description as desc
 from pathjax.bsdfs import Diffuse
-from pathjax.compile.runtime import native_map
+from pathjax.compile import native_map
 from pathjax.core.math import normalize, spawn_ray
 from pathjax.core.types import Ray
 from pathjax.scene import build

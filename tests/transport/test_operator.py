@@ -10,7 +10,7 @@ from scipy import stats
 
 import pathjax as pj
 from pathjax import transport
-from pathjax.compile import runtime
+from pathjax.compile import native
 from pathjax.transport import factors, rays, view
 
 RHO = np.array([0.2, 0.5, 0.8])
@@ -389,7 +389,7 @@ def test_an_operator_may_be_passed_to_jitted_functions(cornell):
     np.testing.assert_allclose(compiled(op), op.solve().L, rtol=1e-5, atol=1e-6)
 
 
-@pytest.mark.skipif(not runtime.native(), reason="native loops are off")
+@pytest.mark.skipif(not native(), reason="native loops are off")
 def test_rays_are_cast_in_native_kernels(make_scene):
     scene = make_scene(plates())
     op = transport.operator(scene, 8)

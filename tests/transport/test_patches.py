@@ -9,7 +9,7 @@ import pytest
 
 import pathjax as pj
 from pathjax import transport
-from pathjax.compile.runtime import native_map
+from pathjax.compile import native_map
 from pathjax.core.math import at, dot
 from pathjax.core.types import Hit, Ray
 from pathjax.shapes import geometry

@@ -3,13 +3,10 @@
 `jax.vmap` puts an axis in front of each array: the x of two points then lie three apart, and stacking them costs
 branches, so that LLVM vectorises little. This transformation keeps the components of every small array apart, each an
 array (W,) over the lanes. Structure (stack, slice, reshape) then costs nothing, arithmetic is SIMD across the lanes,
-and what all lanes share stays shared. Branches become selections; a loop goes on until its last lane is done, but lanes
-leave the loop that an item's own work consists of one by one, each for the next item.
+and what all lanes share stays shared. Branches become selections; a loop goes on until its last lane is done, but a
+`persistent_loop` is left by lanes one by one, each for the next item.
 
-- `one_by_one(f)` is run for one lane after another, of those that are in the branch or the loop where it stands: a
-  search whose lanes would go different ways.
-- `optimization_barrier(x)` is computed once. (XLA's own barrier is gone before fusion, which computes a value again for
-  each of its consumers.)
+README.md beside this file shows a function, its program and what lanes make of it, and says what of XLA this relies on.
 """
 
 from __future__ import annotations
@@ -20,11 +17,11 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from pathjax.compile.lanes.dataflow import flags_of, own_loop
-from pathjax.compile.lanes.interpreter import Lanes, one_by_one
-from pathjax.compile.lanes.persistent_loop import from_queue, in_groups
+from pathjax.compile.lanes.dataflow import differing_in, find_persistent_loop
+from pathjax.compile.lanes.interpreter import Interpreter
+from pathjax.compile.lanes.scheduling import from_queue, in_groups
 
-__all__ = ["lanes", "one_by_one"]
+__all__ = ["lanes"]
 
 
 def lanes(f: Callable, width: int) -> Callable:
@@ -32,6 +29,8 @@ def lanes(f: Callable, width: int) -> Callable:
 
     Returns:
         function of xs, a pytree of arrays (N, ...), and of what all items share, to pytrees of arrays (N, ...).
+    Raises:
+        ValueError: f holds two persistent loops.
     """
 
     def run(xs, *shared):
@@ -42,13 +41,13 @@ def lanes(f: Callable, width: int) -> Callable:
             return jax.tree.map(lambda y: jnp.zeros((0, *y.shape), y.dtype), out)
         # False, and no pass over HLO knows it.
         never = lax.population_count(xs[0].ravel()[0].astype(jnp.int32)) < 0
-        machine = Lanes(width, never)
-        flags = flags_of(program, [True] * len(xs) + [False] * len(shared))
-        place = own_loop(program, flags)
-        if place is None:
-            outputs = in_groups(machine, program, xs, shared)
+        interpreter = Interpreter(width, never)
+        differing = differing_in(program, [True] * len(xs) + [False] * len(shared))
+        loop = find_persistent_loop(program, differing)
+        if loop is None:
+            outputs = in_groups(interpreter, program, xs, shared)
         else:
-            outputs = from_queue(machine, program, xs, shared, place, flags)
+            outputs = from_queue(interpreter, program, xs, shared, loop, differing)
         return jax.tree.unflatten(jax.tree.structure(out), outputs)
 
     return run

@@ -14,7 +14,8 @@ def differs(value) -> bool:
     return isinstance(value, np.ndarray) and value.dtype == object
 
 
-def objects(shape, items) -> np.ndarray:
+def as_components(shape, items) -> np.ndarray:
+    """An array of this shape of objects, which NumPy would take apart."""
     flat = np.empty(math.prod(shape), object)
     for place, item in enumerate(items):
         flat[place] = item
@@ -24,7 +25,8 @@ def objects(shape, items) -> np.ndarray:
 def split(x) -> np.ndarray:
     """(W, ...) -> components (...)."""
     columns = x.reshape(len(x), -1)
-    return objects(x.shape[1:], [columns[:, k] for k in range(columns.shape[1])])
+    items = [lax.index_in_dim(columns, k, 1, keepdims=False) for k in range(columns.shape[1])]
+    return as_components(x.shape[1:], items)
 
 
 def join(value, width):
@@ -36,18 +38,24 @@ def join(value, width):
 
 
 def components(value) -> np.ndarray:
+    """Components of any value, those of a shared one being ()."""
     if differs(value):
         return value
     flat = jnp.ravel(value)
-    return objects(np.shape(value), [flat[k] for k in range(flat.size)])
+    return as_components(np.shape(value), [lax.index_in_dim(flat, k, keepdims=False) for k in range(flat.size)])
 
 
-def fits(shape, whole) -> bool:
-    """Whether an operand is one number, or repeats along axes of length 1."""
-    return shape == () or len(shape) == len(whole) and all(a in (1, b) for a, b in zip(shape, whole, strict=True))
+def entry(x, index):
+    """x[index] for an index () inside: one contiguous load. (Unsigned ones are clamped in two instructions.)"""
+    return lax.dynamic_index_in_dim(x, jnp.asarray(index, jnp.uint32), keepdims=False, allow_negative_indices=False)
 
 
-def entries(column, numbers):
-    """(W,) of a column (N,)."""
+def with_entry(x, value, index):
+    """x whose entry at an index () inside is the value."""
+    return lax.dynamic_update_index_in_dim(x, value, index, 0, allow_negative_indices=False)
+
+
+def gathered(column, indices):
+    """(W,) entries of a column (N,)."""
     dimensions = lax.GatherDimensionNumbers(offset_dims=(), collapsed_slice_dims=(0,), start_index_map=(0,))
-    return lax.gather(column, numbers[:, None], dimensions, (1,), mode="clip")
+    return lax.gather(column, indices[:, None], dimensions, (1,), mode="clip")

@@ -1,112 +1,99 @@
-"""Which values of a program may differ between lanes, and the parts of its equations."""
+"""Which values of a program may differ between lanes."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 
-import jax
-from jax.extend import core
+from pathjax.compile.jax_compat import ClosedJaxpr, Literal, called_program, scan_parts, while_parts
+from pathjax.compile.primitives import persistent_test_p
 
 
 def variables(atoms) -> set:
-    """Those that are no literals."""
-    return {atom for atom in atoms if not isinstance(atom, core.Literal)}
+    """Non-literal atoms."""
+    return {atom for atom in atoms if not isinstance(atom, Literal)}
 
 
-def read_by(eqns) -> set:
-    """Variables that equations read."""
+def variables_read_by(eqns) -> set:
     return variables(atom for eqn in eqns for atom in eqn.invars)
 
 
-def callee(eqn) -> core.ClosedJaxpr | None:
-    """What a call runs; None: this is no call."""
-    if eqn.primitive.name == "call_hi_primitive":  # jax 0.12, of what it writes in other primitives
-        return jax.make_jaxpr(partial(eqn.primitive.to_lojax, **eqn.params))(*(v.aval for v in eqn.invars))
-    for key in ("jaxpr", "call_jaxpr"):
-        if key in eqn.params:
-            program = eqn.params[key]
-            return program if hasattr(program, "consts") else core.ClosedJaxpr(program, ())
-    return None
+def differing_in(program: ClosedJaxpr, inputs_differ: list[bool]) -> Callable:
+    """A function from atoms of a program to whether each may differ between lanes, if these inputs do."""
+    differing = {v for v, d in zip(program.jaxpr.invars, inputs_differ, strict=True) if d}
+
+    def differ(atoms) -> list[bool]:
+        return [not isinstance(atom, Literal) and atom in differing for atom in atoms]
+
+    for eqn in program.jaxpr.eqns:
+        outputs_differ = equation_outputs_differ(eqn, differ(eqn.invars))
+        differing.update(v for v, d in zip(eqn.outvars, outputs_differ, strict=True) if d)
+    return differ
 
 
-def while_parts(eqn, values):
-    """Values of a while loop: constants of the condition, of the body, what is carried."""
-    n, m = eqn.params["cond_nconsts"], eqn.params["body_nconsts"]
-    return values[:n], values[n : n + m], values[n + m :]
+def program_outputs_differ(program: ClosedJaxpr, inputs_differ: list[bool]) -> list[bool]:
+    return differing_in(program, inputs_differ)(program.jaxpr.outvars)
 
 
-def scan_parts(eqn, values):
-    """Values of a scan: constants, what is carried, what is taken row by row."""
-    if "num_consts" in eqn.params:
-        n, m = eqn.params["num_consts"], eqn.params["num_carry"]
-    else:  # jax 0.12
-        n, m, _ = (len(tree.vals) for tree in eqn.params["ft_in"].unpack())
-    return values[:n], values[n : n + m], values[n + m :]
+def equation_outputs_differ(eqn, inputs_differ: list[bool]) -> list[bool]:
+    if not any(inputs_differ):
+        return [False] * len(eqn.outvars)
+    match eqn.primitive.name:
+        case "while":
+            return _while_outputs_differ(eqn, inputs_differ)
+        case "scan":
+            return _scan_outputs_differ(eqn, inputs_differ)
+        case "cond":
+            which_differs, *operands_differ = inputs_differ
+            results = [program_outputs_differ(branch, operands_differ) for branch in eqn.params["branches"]]
+            return [which_differs or any(each) for each in zip(*results, strict=True)]
+    called = called_program(eqn)
+    return [True] * len(eqn.outvars) if called is None else program_outputs_differ(called, inputs_differ)
 
 
-def settled(step, flags: list[bool]) -> list[bool]:
+def _while_outputs_differ(eqn, inputs_differ):
+    test_consts, body_consts, carry = while_parts(eqn, inputs_differ)
+
+    def step(carry):
+        (goes_on,) = program_outputs_differ(eqn.params["cond_jaxpr"], test_consts + carry)
+        return [goes_on or d for d in program_outputs_differ(eqn.params["body_jaxpr"], body_consts + carry)]
+
+    return _fixpoint(step, carry)
+
+
+def _scan_outputs_differ(eqn, inputs_differ):
+    consts, carry, xs = scan_parts(eqn, inputs_differ)
+
+    def step(carry):
+        return program_outputs_differ(eqn.params["jaxpr"], consts + carry + xs)
+
+    carry = _fixpoint(lambda carry: step(carry)[: len(carry)], carry)
+    return carry + step(carry)[len(carry) :]
+
+
+def _fixpoint(step, flags: list[bool]) -> list[bool]:
     """The least flags above these that `step` does not raise."""
     while (raised := [a or b for a, b in zip(flags, step(flags), strict=True)]) != flags:
         flags = raised
     return flags
 
 
-def flags_of(program: core.ClosedJaxpr, differing: list[bool]) -> Callable:
-    """A function from atoms of a program to whether each may differ between lanes if these inputs do."""
-    known = {v for v, d in zip(program.jaxpr.invars, differing, strict=True) if d}
+def find_persistent_loop(program: ClosedJaxpr, differ: Callable) -> int | None:
+    """Number of the equation that is the `persistent_loop` of an item; None: there is none, or lanes leave it together.
 
-    def flags(atoms) -> list[bool]:
-        return [not isinstance(atom, core.Literal) and atom in known for atom in atoms]
+    differ: of `differing_in`.
+    """
 
-    for eqn in program.jaxpr.eqns:
-        known.update(v for v, d in zip(eqn.outvars, eqn_flow(eqn, flags(eqn.invars)), strict=True) if d)
-    return flags
-
-
-def flow(program: core.ClosedJaxpr, differing: list[bool]) -> list[bool]:
-    """Which results may differ."""
-    return flags_of(program, differing)(program.jaxpr.outvars)
-
-
-def own_loop(program: core.ClosedJaxpr, flags: Callable) -> int | None:
-    """Number of the last equation of a program that is a loop which lanes leave at different times."""
-
-    def leaves_alone(eqn):
+    def is_persistent(eqn):
         if eqn.primitive.name != "while":
             return False
-        test_consts, *_ = while_parts(eqn, flags(eqn.invars))
-        return any(flow(eqn.params["cond_jaxpr"], test_consts + flags(eqn.outvars)))
+        test = eqn.params["cond_jaxpr"].jaxpr
+        return any(e.primitive is persistent_test_p and e.outvars == test.outvars for e in test.eqns)
 
-    return max((number for number, eqn in enumerate(program.jaxpr.eqns) if leaves_alone(eqn)), default=None)
+    def lanes_differ(eqn):
+        test_consts, *_ = while_parts(eqn, differ(eqn.invars))
+        return any(program_outputs_differ(eqn.params["cond_jaxpr"], test_consts + differ(eqn.outvars)))
 
-
-def eqn_flow(eqn, inputs: list[bool]) -> list[bool]:
-    if not any(inputs):
-        return [False] * len(eqn.outvars)
-    match eqn.primitive.name:
-        case "while":
-            return while_flow(eqn, inputs)
-        case "scan":
-            return scan_flow(eqn, inputs)
-        case "cond":
-            results = [flow(branch, inputs[1:]) for branch in eqn.params["branches"]]
-            return [inputs[0] or any(each) for each in zip(*results, strict=True)]
-    called = callee(eqn)
-    return [True] * len(eqn.outvars) if called is None else flow(called, inputs)
-
-
-def while_flow(eqn, inputs):
-    test_consts, body_consts, carry = while_parts(eqn, inputs)
-
-    def step(carry):
-        (goes_on,) = flow(eqn.params["cond_jaxpr"], test_consts + carry)
-        return [goes_on or d for d in flow(eqn.params["body_jaxpr"], body_consts + carry)]
-
-    return settled(step, carry)
-
-
-def scan_flow(eqn, inputs):
-    consts, carry, xs = scan_parts(eqn, inputs)
-    carry = settled(lambda carry: flow(eqn.params["jaxpr"], consts + carry + xs)[: len(carry)], carry)
-    return carry + flow(eqn.params["jaxpr"], consts + carry + xs)[len(carry) :]
+    found = [number for number, eqn in enumerate(program.jaxpr.eqns) if is_persistent(eqn)]
+    if len(found) > 1:
+        raise ValueError("an item has one persistent_loop; make the shorter ones a jax.lax.while_loop")
+    return found[0] if found and lanes_differ(program.jaxpr.eqns[found[0]]) else None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
 from weakref import WeakValueDictionary
 
@@ -10,79 +9,28 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.extend import core
 
-from pathjax.compile.lanes.columns import components, differs, entries, fits, join, objects, split
-from pathjax.compile.lanes.dataflow import callee, eqn_flow, read_by, scan_parts, variables, while_parts
-from pathjax.compile.lanes.primitive_rules import RULES
-from pathjax.core.math import at
+from pathjax.compile.jax_compat import ClosedJaxpr, Literal, called_program, jaxpr_as_fun, scan_parts, while_parts
+from pathjax.compile.lanes import flags
+from pathjax.compile.lanes.columns import (
+    as_components,
+    components,
+    differs,
+    entry,
+    gathered,
+    join,
+    split,
+    with_entry,
+)
+from pathjax.compile.lanes.dataflow import equation_outputs_differ, variables, variables_read_by
+from pathjax.compile.lanes.primitive_rules import COMPONENTWISE, RULES
+from pathjax.compile.primitives import compute_once_p, one_by_one_p
 
 # Rows of a table from which lanes select what they want; gathering is faster from more.
 _FEW_ROWS = 8
-# Flags in a word.
-_WORD = 32
 
 
-def one_by_one(f: Callable) -> Callable:
-    """f, which `lanes` runs for one lane after another: those that are in the branch, or the loop, where it stands."""
-
-    def one_by_one(*args):
-        return f(*args)
-
-    return jax.jit(one_by_one)
-
-
-def words_of(flags):
-    """Flags (W,) bool of lanes as bits of words (K,) uint32: bit b of word k is that of lane K b + k.
-
-    Halves are laid upon each other, by SIMD: XLA reduces flags one by one.
-    """
-    count = -(-len(flags) // _WORD)
-    words = jnp.pad(flags, (0, count * _WORD - len(flags))).astype(jnp.uint32)
-    while len(words) > count:
-        low, high = jnp.split(words, 2)
-        words = low | high << (len(low) // count)
-    return words
-
-
-def some(words):
-    """() bool: whether any flag is set, of the `words_of` them."""
-    return lax.reduce_or(words, (0,)) != 0
-
-
-def in_turn(words, act: Callable, state):
-    """act(lane, state) -> state, for one after another of the lanes that `words_of` flags has set."""
-    count = len(words)
-
-    def seek(k, word):
-        """Number and flags of the next word, from this one on, that is not 0, or of the last."""
-
-        def empty(state):
-            k, word = state
-            return (word == 0) & (k < count - 1)
-
-        return lax.while_loop(empty, lambda state: (state[0] + 1, at(words, state[0] + 1)), (k, word))
-
-    def step(state):
-        k, word, state = state
-        lowest = lax.population_count((word & -word) - 1).astype(jnp.int32)
-        return *seek(k, word & (word - 1)), act(count * lowest + k, state)
-
-    return lax.while_loop(lambda state: state[1] != 0, step, (*seek(jnp.int32(0), words[0]), state))[2]
-
-
-def of_lane(lane, columns, differs, shape, dtype):
-    """A packed value, as one lane has it."""
-    if not differs:
-        return columns
-    return jnp.stack([at(column, lane) for column in columns]).reshape(shape) if columns else jnp.zeros(shape, dtype)
-
-
-def put(column, x, lane):
-    return lax.dynamic_update_index_in_dim(column, x, lane, 0, allow_negative_indices=False)
-
-
-class Lanes:
+class Interpreter:
     """Runs programs on values of `width` lanes."""
 
     def __init__(self, width: int, never):
@@ -91,13 +39,13 @@ class Lanes:
         self.computed = WeakValueDictionary()
         self.active = None  # (W,) bool lanes whose results are read; None: all. In the others they may be anything.
 
-    def run(self, program: core.ClosedJaxpr, inputs) -> list:
+    def run(self, program: ClosedJaxpr, inputs) -> list:
         jaxpr = program.jaxpr
-        values = self.environment(program, inputs)
-        self.run_equations(jaxpr.eqns, values, read_by(jaxpr.eqns) | variables(jaxpr.outvars))
+        values = self.initial_values(program, inputs)
+        self.run_equations(jaxpr.eqns, values, variables_read_by(jaxpr.eqns) | variables(jaxpr.outvars))
         return [self.read(values, v) for v in jaxpr.outvars]
 
-    def run_for(self, lanes, program: core.ClosedJaxpr, inputs) -> list:
+    def run_for(self, lanes, program: ClosedJaxpr, inputs) -> list:
         """`run` where only some lanes (W,) bool, of the active ones, read the results."""
         outer = self.active
         self.active = lanes if outer is None else outer & lanes
@@ -107,14 +55,14 @@ class Lanes:
             self.active = outer
 
     @staticmethod
-    def environment(program: core.ClosedJaxpr, inputs) -> dict:
+    def initial_values(program: ClosedJaxpr, inputs) -> dict:
         """Values by variable, before a program's first equation."""
         jaxpr = program.jaxpr
         return dict(zip([*jaxpr.constvars, *jaxpr.invars], [*program.consts, *inputs], strict=True))
 
     @staticmethod
     def read(values: dict, atom):
-        return atom.val if isinstance(atom, core.Literal) else values[atom]
+        return atom.val if isinstance(atom, Literal) else values[atom]
 
     def run_equations(self, eqns, values: dict, used: set | None = None) -> None:
         """Add the results of equations to the values. used: results that are read; None: all."""
@@ -124,83 +72,85 @@ class Lanes:
             values |= zip(eqn.outvars, outputs, strict=True)
 
     def apply(self, eqn, inputs, used) -> list:
-        name = eqn.primitive.name
-        match name:
-            case "while":
-                return self.while_loop(eqn, inputs, used)
-            case "scan":
-                return self.scan(eqn, inputs)
-            case "cond":
-                return self.cond(eqn, inputs)
-            case "optimization_barrier":
-                return self.once(inputs)
-        called = callee(eqn)
+        primitive, name = eqn.primitive, eqn.primitive.name
+        if name == "while":
+            return self.while_loop(eqn, inputs, used)
+        if name == "scan":
+            return self.scan(eqn, inputs)
+        if name == "cond":
+            return self.cond(eqn, inputs)
+        if primitive is compute_once_p:
+            return self.materialize(inputs)
+        if primitive is one_by_one_p:
+            return self.one_by_one(eqn.params["program"], inputs)
+        called = called_program(eqn)
         if called is not None:
-            if eqn.params.get("name") == one_by_one.__name__:
-                return self.one_by_one(called, inputs)
             return self.run(called, inputs)
         if not any(map(differs, inputs)):
-            outputs = eqn.primitive.bind(*inputs, **eqn.params)
-            return list(outputs) if eqn.primitive.multiple_results else [outputs]
+            outputs = primitive.bind(*inputs, **eqn.params)
+            return list(outputs) if primitive.multiple_results else [outputs]
         shape = eqn.outvars[0].aval.shape
-        if name in RULES:
-            result = RULES[name](self, inputs, eqn.params, shape)
-            if result is not None:
-                return list(result) if eqn.primitive.multiple_results else [result]
-        elif len(eqn.outvars) == 1 and all(fits(v.aval.shape, shape) for v in eqn.invars):
-            return [self.each(partial(eqn.primitive.bind, **eqn.params), inputs, shape)]
-        return self.by_vmap(eqn, inputs)
+        if name in COMPONENTWISE:
+            return [self.componentwise(partial(primitive.bind, **eqn.params), inputs, shape)]
+        result = RULES[name](self, inputs, eqn.params, shape) if name in RULES else None
+        if result is None:
+            return self.by_vmap(eqn, inputs)
+        return list(result) if primitive.multiple_results else [result]
 
     # ---- arithmetic -------------------------------------------------------------------------------------------------
 
-    def number(self, op, *operands):
+    def columnwise(self, op, *operands):
         """op of numbers, each (W,) or () where shared."""
         if any(map(jnp.ndim, operands)):
             operands = [x if jnp.ndim(x) else jnp.broadcast_to(x, (self.width,)) for x in operands]
         return op(*operands)
 
-    def each(self, op, inputs, shape):
+    def componentwise(self, op, inputs, shape):
         """op of each component; inputs have the shape or are single numbers."""
         columns = [np.broadcast_to(components(x), shape).flat for x in inputs]
-        return objects(shape, [self.number(op, *operands) for operands in zip(*columns, strict=True)])
+        return as_components(shape, [self.columnwise(op, *operands) for operands in zip(*columns, strict=True)])
 
     def select(self, which, *cases):
         """By the number `which`, components of one of the cases; what is the same in all stays as it is."""
-        columns = zip(*(components(case).flat for case in cases), strict=True)
-        items = [x[0] if all(other is x[0] for other in x) else self.number(lax.select_n, which, *x) for x in columns]
-        return objects(np.shape(cases[0]), items)
 
-    def picked(self, column, numbers):
+        def chosen(first, *others):
+            same = all(other is first for other in others)
+            return first if same else self.columnwise(lax.select_n, which, first, *others)
+
+        columns = (components(case).flat for case in cases)
+        return as_components(np.shape(cases[0]), list(map(chosen, *columns)))
+
+    def rows_of_column(self, column, numbers):
         """(W,) of a column (N,) that lanes share: selected from a few, which stay in registers, gathered from many."""
         if len(column) > _FEW_ROWS:
-            return entries(column, numbers)
+            return gathered(column, numbers)
         found = jnp.broadcast_to(column[0], numbers.shape)
         for k in range(1, len(column)):
             found = lax.select(numbers >= k, jnp.broadcast_to(column[k], numbers.shape), found)
         return found
 
-    def once(self, values):
+    def materialize(self, values):
         """The values, of which every consumer reads one result: what is carried through a loop that never runs.
 
-        Its body changes them, or XLA would remove it. A branch that is always taken does the same, but copies them all.
-        What lanes share stays as it is.
+        XLA's own barrier is gone before fusion. The loop's body changes an entry of each column, or XLA would remove
+        it; that costs one instruction where a change of the whole column is another loop for LLVM to compile. (A branch
+        that is always taken would do, but copies all columns.) What lanes share stays as it is.
         """
         items = {id(item): item for value in values if differs(value) for item in value.flat}
-        # Tangents of integers are float0, of which nothing is computed.
-        there = [item for item in items.values() if jax.typeof(item).dtype != jax.dtypes.float0]
-        new = [item for item in there if id(item) not in self.computed]
+        new = [item for item in items.values() if id(item) not in self.computed]
         if not new:
             return values
 
         def change(state):
             _, *items = state
-            return False, *(~x if x.dtype == bool else -x for x in items)
+            changed = (with_entry(x, jnp.zeros((), x.dtype), 0) if x.ndim else jnp.zeros_like(x) for x in items)
+            return False, *changed
 
         _, *results = lax.while_loop(lambda state: state[0], change, (self.never, *new))
         items |= zip(map(id, new), results, strict=True)
         self.computed.update((id(item), item) for item in results)
         return [
-            objects(value.shape, [items[id(item)] for item in value.flat]) if differs(value) else value
+            as_components(value.shape, [items[id(item)] for item in value.flat]) if differs(value) else value
             for value in values
         ]
 
@@ -216,11 +166,11 @@ class Lanes:
         active = jnp.ones((self.width,), bool) if self.active is None else self.active
 
         def act(lane, results):
-            mine = [at(row, lane) if differs(x) else x for row, x in zip(rows, inputs, strict=True)]
-            return list(map(partial(put, lane=lane), results, core.jaxpr_as_fun(program)(*mine)))
+            mine = [entry(row, lane) if differs(x) else x for row, x in zip(rows, inputs, strict=True)]
+            return [with_entry(r, y, lane) for r, y in zip(results, jaxpr_as_fun(program)(*mine), strict=True)]
 
         results = [jnp.zeros((self.width, *aval.shape), aval.dtype) for aval in program.out_avals]
-        return list(map(split, in_turn(words_of(active), act, results)))
+        return list(map(split, flags.for_each_lane(flags.packed(active), act, results)))
 
     # ---- control flow -----------------------------------------------------------------------------------------------
 
@@ -234,17 +184,17 @@ class Lanes:
     @staticmethod
     def unpack(packed, differing, shapes):
         return [
-            objects(shape, items) if differs else items
+            as_components(shape, items) if differs else items
             for items, differs, shape in zip(packed, differing, shapes, strict=True)
         ]
 
     def while_loop(self, eqn, inputs, used):
         test_consts, body_consts, init = while_parts(eqn, inputs)
         test, body = eqn.params["cond_jaxpr"], eqn.params["body_jaxpr"]
-        differing = eqn_flow(eqn, list(map(differs, inputs)))
+        differing = equation_outputs_differ(eqn, list(map(differs, inputs)))
         shapes = [v.aval.shape for v in eqn.outvars]
         # A lane that is done stays as it is in what is read later; the rest of it may go on.
-        tested = read_by(test.jaxpr.eqns)
+        tested = variables_read_by(test.jaxpr.eqns)
         kept = [u or v in tested for u, v in zip(used, test.jaxpr.invars[len(test_consts) :], strict=True)]
 
         def goes_on(packed):
@@ -257,7 +207,7 @@ class Lanes:
             carry = self.unpack(packed, differing, shapes)
             on = goes_on(packed)
             if jnp.ndim(on):
-                on = self.once([objects((), [on])])[0].item()
+                on = self.materialize([as_components((), [on])])[0].item()
                 new = self.run_for(on, body, [*body_consts, *carry])
                 pairs = zip(carry, new, kept, strict=True)
                 new = [self.select(on, old, value) if keep else value for old, value, keep in pairs]
@@ -267,7 +217,7 @@ class Lanes:
 
         def any_goes_on(packed):
             on = goes_on(packed)
-            return some(words_of(on)) if jnp.ndim(on) else on
+            return flags.any_set(flags.packed(on)) if jnp.ndim(on) else on
 
         packed = lax.while_loop(any_goes_on, advance, self.pack(init, differing))
         return self.unpack(packed, differing, shapes)
@@ -275,7 +225,7 @@ class Lanes:
     def scan(self, eqn, inputs):
         consts, init, xs = scan_parts(eqn, inputs)
         n = len(init)
-        differing = eqn_flow(eqn, list(map(differs, inputs)))
+        differing = equation_outputs_differ(eqn, list(map(differs, inputs)))
         carried, rows = differing[:n], differing[n:]
         shapes = [v.aval.shape for v in eqn.outvars]
         row_shapes = [shape[1:] for shape in shapes[n:]]
@@ -296,7 +246,7 @@ class Lanes:
         packed_xs = [by_row(x) if d else x for x, d in zip(xs, x_differs, strict=True)]
         last, ys = lax.scan(step, self.pack(init, carried), packed_xs, eqn.params["length"], eqn.params["reverse"])
         ys = [
-            np.stack([objects(shape, [item[k] for item in y]) for k in range(eqn.params["length"])]) if d else y
+            np.stack([as_components(shape, [item[k] for item in y]) for k in range(eqn.params["length"])]) if d else y
             for y, d, shape in zip(ys, rows, row_shapes, strict=True)
         ]
         return self.unpack(last, carried, shapes[:n]) + ys
@@ -305,10 +255,10 @@ class Lanes:
         which, *operands = inputs
         branches = eqn.params["branches"]
         if differs(which):
-            which = self.once([which])[0].item()
+            which = self.materialize([which])[0].item()
             which = which != 0 if len(branches) == 2 else jnp.clip(which, 0, len(branches) - 1)
             results = [self.run_for(which == k, branch, operands) for k, branch in enumerate(branches)]
             return [self.select(which, *cases) for cases in zip(*results, strict=True)]
-        differing = eqn_flow(eqn, list(map(differs, inputs)))
+        differing = equation_outputs_differ(eqn, list(map(differs, inputs)))
         calls = [lambda branch=branch: self.pack(self.run(branch, operands), differing) for branch in branches]
         return self.unpack(lax.switch(which, calls), differing, [v.aval.shape for v in eqn.outvars])

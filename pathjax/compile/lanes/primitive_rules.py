@@ -1,62 +1,65 @@
-"""Structure, which costs nothing.
+"""What lanes do for each primitive of JAX: arithmetic goes component by component, structure costs nothing.
 
-Rules are (lanes, inputs, params, shape of the first result) -> value, or values where the primitive has several, or
-None: not by this rule.
+What is named in neither table is left to `vmap`: right, and slow.
+
+Rules are (interpreter, inputs, params, shape of the first result) -> value, or values where the primitive has several,
+or None: not by this rule, but by `vmap`.
 """
 
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from pathjax.compile.lanes.columns import components, differs, objects
+from pathjax.compile.lanes.columns import as_components, components, differs
 
 
-def _broadcast_in_dim(lanes, inputs, params, shape):
+def _broadcast_in_dim(interpreter, inputs, params, shape):
     extents = [1] * len(shape)
     for axis, place in enumerate(params["broadcast_dimensions"]):
         extents[place] = inputs[0].shape[axis]
     return np.broadcast_to(inputs[0].reshape(extents), shape)
 
 
-def _slice(lanes, inputs, params, shape):
+def _slice(interpreter, inputs, params, shape):
     strides = params["strides"] or [1] * len(shape)
     limits = zip(params["start_indices"], params["limit_indices"], strides, strict=True)
     return inputs[0][tuple(slice(*limit) for limit in limits)]
 
 
-def _unstack(lanes, inputs, params, shape):
+def _unstack(interpreter, inputs, params, shape):
     axis = params["axis"]
     return [part.reshape(shape) for part in np.split(inputs[0], inputs[0].shape[axis], axis)]
 
 
 def _reduce(op):
-    def rule(lanes, inputs, params, shape):
+    def rule(interpreter, inputs, params, shape):
         axes = params["axes"]
         terms = np.moveaxis(inputs[0], axes, range(len(axes))).reshape(-1, math.prod(shape))
         while len(terms) > 1:
             half = len(terms) // 2
-            folded = lanes.each(op, [terms[:half], terms[half : 2 * half]], (half, terms.shape[1]))
+            folded = interpreter.componentwise(op, [terms[:half], terms[half : 2 * half]], (half, terms.shape[1]))
             terms = np.concatenate([folded, terms[2 * half :]])
         return terms.reshape(shape)
 
     return rule
 
 
-def _dot_general(lanes, inputs, params, shape):
+def _dot_general(interpreter, inputs, params, shape):
     (axes_a, axes_b), batch = params["dimension_numbers"]
     if any(batch) or len(axes_a) != 1:
         return None
     a, b = (np.moveaxis(components(x), axes, [0]) for x, axes in zip(inputs, (axes_a, axes_b), strict=True))
     a, b = a.reshape(len(a), -1, 1), b.reshape(len(b), 1, -1)
-    products = lanes.each(lax.mul, [a, b], (len(a), a.shape[1], b.shape[2]))
-    return _reduce(lax.add)(lanes, [products], {"axes": (0,)}, shape)
+    products = interpreter.componentwise(lax.mul, [a, b], (len(a), a.shape[1], b.shape[2]))
+    return _reduce(lax.add)(interpreter, [products], {"axes": (0,)}, shape)
 
 
-def _dynamic_slice(lanes, inputs, params, shape):
+def _dynamic_slice(interpreter, inputs, params, shape):
     """Entries that lanes pick: gathered from a table that they share, selected from components of their own."""
     table, *starts = inputs
     starts = [start.item() if differs(start) else start for start in starts]
@@ -77,7 +80,7 @@ def _dynamic_slice(lanes, inputs, params, shape):
             windows = [np.take(table, range(k, k + size), axis) for k in range(extent - size + 1)]
             table = windows[0]
             for k, window in enumerate(windows[1:], 1):
-                table = lanes.select(starts[axis] >= k, table, window)
+                table = interpreter.select(starts[axis] >= k, table, window)
         return table
     if not picked:
         return table
@@ -89,13 +92,13 @@ def _dynamic_slice(lanes, inputs, params, shape):
         for axis, extent, offset in zip(picked, extents, offsets, strict=True):
             index = index * extent + (starts[axis].astype(jnp.int32) + offset)
         # One column at a time: gathered from a reshaped table, every index would be divided and multiplied again.
-        blocks.append([lanes.picked(columns[:, k], index) for k in range(columns.shape[1])])
+        blocks.append([interpreter.rows_of_column(columns[:, k], index) for k in range(columns.shape[1])])
     rest = [size for axis, size in enumerate(shape) if axis not in picked]
-    block = objects([*(shape[axis] for axis in picked), *rest], [item for items in blocks for item in items])
+    block = as_components([*(shape[axis] for axis in picked), *rest], [item for items in blocks for item in items])
     return np.moveaxis(block, range(len(picked)), picked)
 
 
-def _gather(lanes, inputs, params, shape):
+def _gather(interpreter, inputs, params, shape):
     """One block, as a slice of which some axes of length 1 may be dropped."""
     table, starts = inputs
     numbers = params["dimension_numbers"]
@@ -104,35 +107,35 @@ def _gather(lanes, inputs, params, shape):
         return None
     places = dict(zip(numbers.start_index_map, components(starts), strict=True))
     offsets = [places.get(axis, jnp.int32(0)) for axis in range(np.ndim(table))]
-    offsets = [objects((), [x]) if jnp.ndim(x) else x for x in offsets]
-    block = _dynamic_slice(lanes, [table, *offsets], params, params["slice_sizes"])
+    offsets = [as_components((), [x]) if jnp.ndim(x) else x for x in offsets]
+    block = _dynamic_slice(interpreter, [table, *offsets], params, params["slice_sizes"])
     return None if block is None else block.reshape(shape)
 
 
-def _dynamic_update_slice(lanes, inputs, params, shape):
+def _dynamic_update_slice(interpreter, inputs, params, shape):
     table, update, *starts = inputs
     if len(starts) != 1 or np.shape(update)[0] != 1:
         return None
     start = starts[0].item() if differs(starts[0]) else starts[0]
     (new,) = components(update).flat
-    items = [lanes.number(lax.select_n, start == k, old, new) for k, old in enumerate(components(table))]
-    return objects(shape, items)
+    items = [interpreter.columnwise(lax.select_n, start == k, old, new) for k, old in enumerate(components(table))]
+    return as_components(shape, items)
 
 
 RULES = {
     "broadcast_in_dim": _broadcast_in_dim,
-    "reshape": lambda lanes, x, params, shape: x[0].reshape(shape),
-    "squeeze": lambda lanes, x, params, shape: x[0].reshape(shape),
-    "expand_dims": lambda lanes, x, params, shape: x[0].reshape(shape),
-    "transpose": lambda lanes, x, params, shape: x[0].transpose(params["permutation"]),
-    "stop_gradient": lambda lanes, x, params, shape: x[0],
-    "rev": lambda lanes, x, params, shape: np.flip(x[0], params["dimensions"]),
+    "reshape": lambda interpreter, x, params, shape: x[0].reshape(shape),
+    "squeeze": lambda interpreter, x, params, shape: x[0].reshape(shape),
+    "expand_dims": lambda interpreter, x, params, shape: x[0].reshape(shape),
+    "transpose": lambda interpreter, x, params, shape: x[0].transpose(params["permutation"]),
+    "stop_gradient": lambda interpreter, x, params, shape: x[0],
+    "rev": lambda interpreter, x, params, shape: np.flip(x[0], params["dimensions"]),
     "slice": _slice,
-    "concatenate": lambda lanes, x, params, shape: np.concatenate(list(map(components, x)), params["dimension"]),
-    "stack": lambda lanes, x, params, shape: np.stack(list(map(components, x)), params["axis"]),
+    "concatenate": lambda interpreter, x, params, shape: np.concatenate(list(map(components, x)), params["dimension"]),
+    "stack": lambda interpreter, x, params, shape: np.stack(list(map(components, x)), params["axis"]),
     "unstack": _unstack,
-    "split": lambda lanes, x, params, shape: np.split(x[0], np.cumsum(params["sizes"])[:-1], params["axis"]),
-    "select_n": lambda lanes, x, params, shape: lanes.each(lax.select_n, x, shape),
+    "split": lambda interpreter, x, params, shape: np.split(x[0], np.cumsum(params["sizes"])[:-1], params["axis"]),
+    "select_n": lambda interpreter, x, params, shape: interpreter.componentwise(lax.select_n, x, shape),
     "reduce_sum": _reduce(lax.add),
     "reduce_max": _reduce(lax.max),
     "reduce_min": _reduce(lax.min),
@@ -142,8 +145,22 @@ RULES = {
     "dynamic_slice": _dynamic_slice,
     "gather": _gather,
     "dynamic_update_slice": _dynamic_update_slice,
-    # Of the shape of their operands, and yet not component by component.
-    **dict.fromkeys(("cumsum", "cumprod", "cummax", "cummin", "cumlogsumexp", "sort", "scatter", "scatter-add",
-                     "scatter-mul", "scatter_add", "scatter_mul", "argmin", "argmax"),
-                    lambda lanes, x, params, shape: None),
+    "optimization_barrier": lambda interpreter, x, params, shape: x,
+    "persistent_test": lambda interpreter, x, params, shape: x[0],
+    # A number may become several narrower ones.
+    "bitcast_convert_type": lambda interpreter, x, params, shape: (
+        interpreter.componentwise(partial(lax.bitcast_convert_type_p.bind, **params), x, shape)
+        if x[0].shape == shape
+        else None
+    ),
 }
+
+# Every component of the result depends on the same component of the operands alone.
+COMPONENTWISE = frozenset(
+    "abs acos acosh add add_any and asin asinh atan atan2 atanh bessel_i0e bessel_i1e cbrt ceil clamp clz complex "
+    "conj convert_element_type copy copy_p cos cosh digamma div eq eq_to erf erf_inv erfc exp exp2 expm1 floor ge gt "
+    "igamma igamma_grad_a igammac imag integer_pow is_finite le le_to lgamma log log1p log2 logistic lt lt_to max min "
+    "mul mulhi ne neg nextafter not one_minus_square or polygamma population_count pow real reduce_precision "
+    "regularized_incomplete_beta rem round rsqrt shift_left shift_right_arithmetic shift_right_logical sign sin sinh "
+    "sqrt square sub tan tanh xor zeta".split()
+)

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pathjax.compile import runtime
+from pathjax.compile import MANY_ITEMS, calls_at_once, concurrently, devices_of_a_call
 from pathjax.integrators.options import DEFAULTS, Options
 from pathjax.rendering.progressive import replicates
 from pathjax.rendering.render import pixel_means
@@ -27,7 +27,7 @@ MAX_PASS_SPP = 48 * replicates.COUNT
 _FIRST_SPP = replicates.COUNT * np.array([1, 4, 16], np.int32)
 _GOALS = np.array([17, 256])
 # A call of few items is another program, whose last bits may differ.
-_LEAST_CHUNK = -(-runtime.MANY_ITEMS // replicates.COUNT)
+_LEAST_CHUNK = -(-MANY_ITEMS // replicates.COUNT)
 
 
 @dataclass
@@ -82,7 +82,7 @@ def extend(
         numbers[:, : len(portion[0])] = portion
         return np.asarray(kernel(numbers, np.uint32(seed)))[:, : len(portion[0])]
 
-    for portion, means in runtime.concurrently(rendered, _portions(state, chunk)):
+    for portion, means in concurrently(rendered, _portions(state, chunk)):
         if means is None:
             yield
             return
@@ -139,12 +139,12 @@ def _replicate_means(scene, numbers, seed, *, options):
     spp = replicates.shares(after) - first_sample
     unsigned = first_sample.ravel(), spp.ravel(), jnp.repeat(replicates.seeds(seed), len(pixels))
     work = jnp.tile(pixels, replicates.COUNT), *(x.astype(jnp.uint32) for x in unsigned)
-    means = pixel_means(scene, *work, options=options, devices=runtime.devices_of_a_call())
+    means = pixel_means(scene, *work, options=options, devices=devices_of_a_call())
     return means.reshape(*spp.shape, 3).astype(jnp.float32)
 
 
 def _chunk(scene: Scene) -> int:
     """Pixels of a call: all calls have one shape, so one kernel, and each of those that run at once gets as many."""
-    count, at_once = film.pixel_count(scene.film), runtime.calls_at_once()
+    count, at_once = film.pixel_count(scene.film), calls_at_once()
     calls = at_once * -(-count // (at_once * CHUNK_PIXELS))
     return min(count, max(-(-count // calls), _LEAST_CHUNK))

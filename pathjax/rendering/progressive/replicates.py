@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from pathjax.compile import is_traced
 from pathjax.core import sampler
 
 COUNT = 4
@@ -22,7 +23,7 @@ _BLOCK = 1 << 13
 def seeds(seed) -> np.ndarray | jax.Array:
     """(COUNT,) uint32 seeds of the replicates of a seed; a JAX array within `jax.jit`."""
     seeds = sampler.combine(jnp.arange(COUNT, dtype=jnp.uint32), jnp.uint32(seed))
-    return seeds if isinstance(seeds, jax.core.Tracer) else np.asarray(seeds)
+    return seeds if is_traced(seeds) else np.asarray(seeds)
 
 
 def shares(count: np.ndarray | jax.Array) -> np.ndarray | jax.Array:

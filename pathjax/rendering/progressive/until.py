@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pathjax.compile.runtime import usual_promotion
+from pathjax.compile import usual_promotion
 from pathjax.errors import InputError
 from pathjax.integrators.options import Options, check_counts
 from pathjax.rendering.progressive import error_estimate, passes, replicates

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import pathjax as pj
-from pathjax.compile import runtime
+from pathjax.compile import calls_at_once
 from pathjax.images import relative_error
 from pathjax.rendering.progressive import error_estimate, passes, until
 from pathjax.system.interrupts import SIGNALS
@@ -187,7 +187,7 @@ def after_calls(monkeypatch):
 def test_signals_end_a_render_with_what_is_done(cornell, after_calls, number):
     earlier = signal.signal(number, signal.default_int_handler)  # whatever started the tests may have it ignored
     try:
-        after_calls(3 * runtime.calls_at_once() - 1, lambda: signal.raise_signal(number))
+        after_calls(3 * calls_at_once() - 1, lambda: signal.raise_signal(number))
         result = pj.render_until(cornell, spp=10**6)
         assert signal.getsignal(number) == signal.default_int_handler
     finally:
@@ -264,7 +264,7 @@ def test_no_call_begins_once_it_is_stopped(cornell, monkeypatch):
     stopped.set()
     list(calls)
     # In each thread one that had just asked.
-    assert sum(begun) <= runtime.calls_at_once()
+    assert sum(begun) <= calls_at_once()
     assert (state.count < state.goal).any()
     # What is left leads on to the same bits.
     for one in (state, whole):

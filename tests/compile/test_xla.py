@@ -1,21 +1,17 @@
-"""How XLA is set up on import, and `native_map`."""
+"""How XLA is set up on import."""
+
+from __future__ import annotations
 
 import json
 import os
 import re
 import subprocess
 import sys
-import threading
-import time
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax import lax
 
-from pathjax.compile import runtime
-from pathjax.compile.runtime import native_map
+from pathjax.compile import xla
 
 OPTION = "xla_cpu_small_while_loop_byte_threshold"
 
@@ -36,11 +32,9 @@ def python(root):
     return run
 
 
-# ---- set-up on import -----------------------------------------------------------------------------------------------
-
 FLAGS_AND_DEVICES = """
 import os, pathjax, jax
-print(json.dumps([os.environ.get("XLA_FLAGS", ""), jax.local_device_count(), pathjax.runtime.native()]))
+print(json.dumps([os.environ.get("XLA_FLAGS", ""), jax.local_device_count(), pathjax.compile.native()]))
 """
 
 
@@ -86,6 +80,15 @@ def test_users_number_of_devices_is_kept(python, code, environment):
     assert "Warning" not in err
 
 
+def test_setting_up_again_changes_nothing(python):
+    (flags, devices, native), err = python("import pathjax.compile; pathjax.compile.setup()" + FLAGS_AND_DEVICES)
+    assert flags.count(OPTION) == 1
+    assert native
+    (_, _, native), err = python(STARTED + "import pathjax; pathjax.compile.setup()" + FLAGS_AND_DEVICES)
+    assert err.count("UserWarning") == 1
+    assert not native
+
+
 STARTED = "import jax; jax.devices()\n"
 
 
@@ -93,13 +96,13 @@ STARTED = "import jax; jax.devices()\n"
 def test_import_after_the_backend_warns_once_with_the_remedy(python, number):
     (flags, _, native), err = python(STARTED + "import pathjax" + FLAGS_AND_DEVICES, **number)
     assert err.count("UserWarning") == 1
-    assert "before" in err and f"XLA_FLAGS='{runtime._FLAG} {runtime._WIDTH_FLAG}'" in err
+    assert "before" in err and f"XLA_FLAGS='{xla._FLAG} {xla._WIDTH_FLAG}'" in err
     assert OPTION not in flags
     assert not native
 
 
 def test_import_after_the_backend_is_silent_where_the_user_set_the_option(python):
-    remedy = f"{runtime._FLAG} {runtime._WIDTH_FLAG}"
+    remedy = f"{xla._FLAG} {xla._WIDTH_FLAG}"
     (_, _, native), err = python(STARTED + FLAGS_AND_DEVICES, XLA_FLAGS=remedy)
     assert native
     assert "Warning" not in err
@@ -115,7 +118,7 @@ RENDER = """
 import pathjax, numpy
 scene = pathjax.load_scene("{scene}", res=4, max_depth=4)
 image = numpy.asarray(pathjax.render(scene, 2, strategy="bsdf"))
-print(json.dumps([pathjax.runtime.native(), image.tolist()]))
+print(json.dumps([pathjax.compile.native(), image.tolist()]))
 """
 
 
@@ -134,7 +137,7 @@ def test_renders_are_right_without_native_loops(python, root, opted_out):
 def test_parts_of_a_kernel_may_end_long_after_each_other(python):
     """XLA takes such a time for a hanging program's, and aborts; of jaxlib 0.7 nobody can ask for more."""
     (flags, _, _), _ = python(FLAGS_AND_DEVICES)
-    if "terminate_timeout" not in runtime._PATIENCE_FLAGS:
+    if "terminate_timeout" not in xla._PATIENCE_FLAGS:
         pytest.skip("this jaxlib has no such flag")
     year = 365 * 86400
     assert all(int(seconds) > year for seconds in re.findall(r"collective_call_\w+_timeout_seconds=(\d+)", flags))
@@ -146,7 +149,7 @@ def test_parts_of_a_kernel_may_end_long_after_each_other(python):
 
 UNEVEN = """
 import jax, jax.numpy as jnp
-from pathjax.compile.runtime import native_map
+from pathjax.compile import native_map
 
 def spin(item, times):
     def turn(state):
@@ -171,7 +174,7 @@ import os
 import jax, jax.numpy as jnp, numpy as np
 from functools import partial
 from jax.sharding import Mesh, PartitionSpec as P
-from pathjax.compile.runtime import native_map
+from pathjax.compile import native_map
 
 @jax.jit
 @partial(jax.shard_map, mesh=Mesh(np.array(jax.devices()), "d"), in_specs=(P("d"), P()), out_specs=P("d"))
@@ -197,7 +200,7 @@ def test_many_operations_may_wait_for_a_kernel_on_several_devices(python):
     of these rounds; XLA ends that after its limit on the time, here 20 seconds.
     """
     limits = "".join(f" --xla_cpu_collective_call_{what}_timeout_seconds=10" for what in ("warn_stuck", "terminate"))
-    python(AHEAD, JAX_NUM_CPU_DEVICES="2", XLA_FLAGS=limits if runtime._PATIENCE_FLAGS else "")
+    python(AHEAD, JAX_NUM_CPU_DEVICES="2", XLA_FLAGS=limits if xla._PATIENCE_FLAGS else "")
 
 
 def test_users_number_of_threads_is_kept(python):
@@ -229,109 +232,3 @@ def test_import_starts_no_backend(python):
         "import pathjax\nfrom jax._src import xla_bridge\nprint(json.dumps(xla_bridge.backends_are_initialized()))"
     )
     assert started is False
-
-
-# ---- native_map -----------------------------------------------------------------------------------------------------
-
-
-def collatz(n):
-    """Steps to 1: real control flow, of another length for every item."""
-
-    def step(state):
-        n, steps = state
-        return lax.cond(n % 2 == 0, lambda n: n // 2, lambda n: 3 * n + 1, n), steps + 1
-
-    return lax.while_loop(lambda state: state[0] > 1, step, (n, jnp.int32(0)))[1]
-
-
-def collatz_by_hand(n):
-    steps = 0
-    while n > 1:
-        n, steps = (n // 2 if n % 2 == 0 else 3 * n + 1), steps + 1
-    return steps
-
-
-MANY = len(jax.local_devices())
-
-
-@pytest.mark.parametrize("count", [1, 2, 3, 17])
-@pytest.mark.parametrize("form", ["loop", "vmap"])
-@pytest.mark.parametrize("devices", [1, None])
-def test_map_of_any_length_form_and_number_of_devices(count, form, devices):
-    mapped = jax.jit(lambda xs: native_map(collatz, xs, form=form, devices=devices))
-    xs = jnp.arange(1, count + 1, dtype=jnp.int32)
-    np.testing.assert_array_equal(mapped(xs), [collatz_by_hand(n) for n in range(1, count + 1)])
-
-
-@pytest.mark.parametrize("form", ["loop", "vmap"])
-def test_map_over_trees_with_shared_trees(form):
-    def f(item, table, number):
-        (a, b), index = item["pair"], item["index"]
-        return {"sum": a + b * number, "picked": (table["rows"][index],)}
-
-    xs = {"pair": (jnp.arange(5.0), jnp.ones(5)), "index": jnp.asarray([2, 0, 1, 1, 2])}
-    table = {"rows": jnp.arange(12.0).reshape(3, 4)}
-    out = native_map(f, xs, table, 3.0, form=form)
-    np.testing.assert_array_equal(out["sum"], np.arange(5) + 3)
-    np.testing.assert_array_equal(out["picked"][0], table["rows"][xs["index"]])
-
-
-@pytest.mark.skipif(MANY < 2, reason="needs two devices")
-def test_order_is_kept_for_every_number_of_devices():
-    xs = jnp.arange(101.0)
-    for devices in range(1, MANY + 1):
-        np.testing.assert_array_equal(native_map(lambda x: 2 * x, xs, devices=devices), 2 * xs)
-
-
-def test_chunks_of_the_vectorised_form_cover_all_items(monkeypatch):
-    """Chunks that do not divide the number of items, as an accelerator would have them."""
-    monkeypatch.setattr(runtime, "_CHUNK_BYTES", 7 * runtime._BYTES_PER_LANE)
-    xs = jnp.arange(1, 101, dtype=jnp.int32)
-    np.testing.assert_array_equal(
-        native_map(collatz, xs, form="vmap", devices=1), [collatz_by_hand(n) for n in range(1, 101)]
-    )
-
-
-def test_map_passes_tangents():
-    xs = jnp.linspace(0.1, 1, 7)
-    primal, tangent = jax.jvp(lambda s: native_map(lambda x, s: jnp.sin(s * x), xs, s), (2.0,), (1.0,))
-    np.testing.assert_allclose(primal, np.sin(2 * xs), rtol=1e-6)
-    np.testing.assert_allclose(tangent, xs * np.cos(2 * xs), rtol=1e-6)
-
-
-# ---- calls at a time ------------------------------------------------------------------------------------------------
-
-
-def test_concurrent_calls_overlap_and_keep_their_order():
-    together = threading.Barrier(runtime.calls_at_once())
-
-    def square(x):
-        together.wait(timeout=20)  # fails unless all threads are at it
-        time.sleep(0.01 * (x % 2))
-        return x * x
-
-    items = range(6 * runtime.calls_at_once())
-    assert list(runtime.concurrently(square, items)) == [(x, x * x) for x in items]
-
-
-def test_concurrent_calls_take_few_items_ahead_and_end_when_closed():
-    taken, begun, ended = [], [], []
-
-    def call(x):
-        begun.append(x)
-        time.sleep(0.02)
-        ended.append(x)
-
-    results = runtime.concurrently(call, (taken.append(x) or x for x in range(1000)))
-    next(results)
-    results.close()
-    assert len(taken) == 2 * runtime.calls_at_once() + 1
-    assert sorted(begun) == sorted(ended)
-
-
-def test_an_error_in_a_concurrent_call_is_raised_in_its_place():
-    done = []
-    with pytest.raises(ZeroDivisionError):
-        for item, _ in runtime.concurrently(lambda x: 1 / (x - 3), range(10)):
-            done.append(item)
-    assert done == [0, 1, 2]

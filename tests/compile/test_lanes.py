@@ -1,12 +1,15 @@
 """`lanes` against `jax.vmap`: the same results from programs of every structure that kernels are made of."""
 
+from __future__ import annotations
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax import lax
 
-from pathjax.compile.lanes import lanes, one_by_one
+from pathjax.compile import compute_once, one_by_one, persistent_loop
+from pathjax.compile.lanes import lanes
 
 WIDTH = 5
 TABLE = np.arange(24, dtype=np.float32).reshape(4, 2, 3) ** 1.5
@@ -178,32 +181,120 @@ def test_what_other_lanes_lack_keeps_no_loop_from_its_end():
     agrees(f, np.arange(2 * WIDTH, dtype=np.int32))
 
 
-def test_barriers_and_calls(vectors):
+def test_values_computed_once_and_calls(vectors):
     def f(a, b, table):
-        a, table = lax.optimization_barrier((a, table))
+        a, table = compute_once((a, table))
         return jax.jit(lambda x: x + table[0, 0])(a), jax.nn.relu(b), jnp.hypot(a, b)
 
     agrees(f, *vectors)
+
+
+def test_a_value_computed_once_is_not_computed_again():
+    """XLA computes it again for each consumer otherwise; and what keeps it from that copies no column."""
+
+    def f(how, x):
+        y = how(lax.population_count(x))
+        return lax.fori_loop(0, 2, lambda i, s: (s[1] + y, s[2] ^ y, s[0] * y), (y + 1, y * 3, y ^ 5))
+
+    def compiled(how):
+        items = jnp.arange(640, dtype=jnp.int32)
+        return jax.jit(lanes(lambda x: f(how, x), 64)).lower(items).compile().as_text()
+
+    once, again = compiled(compute_once), compiled(lambda y: y)
+    assert once.count(" popcnt(") == 2  # one more makes the end that no pass can see
+    assert again.count(" popcnt(") > 2
+    assert "s32[64]{0} dynamic-update-slice(" in once
 
 
 def test_no_tracer_outlives_its_function(vectors):
     def f(a, table):
         def step(state):
             k, x = state
-            return k + 1, lax.optimization_barrier(x * a)
+            return k + 1, compute_once(x * a)
 
-        return lax.while_loop(lambda s: s[0] < 3, step, (0, lax.optimization_barrier(a + 1)))[1]
+        return lax.while_loop(lambda s: s[0] < 3, step, (0, compute_once(a + 1)))[1]
 
     with jax.checking_leaks():
         agrees(f, vectors[0])
 
 
-def test_any_other_primitive(vectors, rows):
-    def f(a, row, table):
-        added = a.at[row].add(1.0, mode="drop")
-        return jnp.sort(a), jnp.cumsum(a), jnp.argmin(a), added, jnp.searchsorted(table[:, 0, 0], 3 * a)
+def test_arithmetic_of_every_kind(vectors):
+    def f(a, table):
+        positive, whole = jnp.abs(a) + 0.5, (10 * a).astype(jnp.int32)
+        of_any = (jnp.sin, jnp.tanh, jnp.exp, jnp.expm1, jnp.floor, jnp.round, jnp.sign, lax.logistic)
+        of_positive = (jnp.sqrt, lax.rsqrt, jnp.cbrt, jnp.log1p, lax.lgamma, lax.digamma, lax.erf)
+        of_two = (jnp.arctan2, jnp.power, lax.rem, lax.nextafter, jnp.maximum, jnp.less_equal)
+        reals = (
+            [g(a) for g in of_any],
+            [g(positive) for g in of_positive],
+            [g(positive, a) for g in of_two],
+            (a**3, lax.erf_inv(a / 9), lax.igamma(positive, positive), a.astype(jnp.int8), jnp.isfinite(a)),
+            (lax.clamp(a[0], a, positive), lax.clamp(jnp.float32(0), a, jnp.float32(1))),
+        )
+        integers = (
+            (lax.population_count(whole), lax.clz(whole), ~whole, lax.bitcast_convert_type(a, jnp.int32)),
+            (whole & 3, whole ^ 5, whole << 2, whole >> 1, lax.shift_right_logical(whole, 3)),
+        )
+        return reals, integers
 
-    agrees(f, vectors[0], rows)
+    agrees(f, vectors[0])
+
+
+def twice_product(x, y):
+    return 2 * x * y
+
+
+# Of the shape of their operand, some of them, and yet not component by component.
+OTHERS = {
+    "sort": jnp.sort,
+    "argsort": jnp.argsort,
+    "sort of pairs": lambda a: lax.sort((a, -a), num_keys=1),
+    "top_k": lambda a: lax.top_k(a, 2),
+    "cumsum": jnp.cumsum,
+    "cumprod": jnp.cumprod,
+    "cummax": lax.cummax,
+    "cumlogsumexp": lax.cumlogsumexp,
+    "argmin": jnp.argmin,
+    "prod": jnp.prod,
+    "reduce of any kind": lambda a: lax.reduce(a, np.float32(0), lambda x, y: x + 2 * y, (0,)),
+    "reduce_precision": lambda a: lax.reduce_precision(a, 5, 4),
+    "reduce_window": lambda a: lax.reduce_window(a, np.float32(0), lax.add, (2,), (1,), "SAME"),
+    "reduce_window of any kind": lambda a: lax.reduce_window(a, np.float32(1), twice_product, (2,), (1,), "SAME"),
+    "conv": lambda a: jnp.convolve(a, jnp.array([1.0, 2.0, 3.0]), mode="same"),
+    "fft": lambda a: jnp.abs(jnp.fft.fft(a)),
+    "rfft": lambda a: jnp.fft.rfft(a).real,
+    "fft of complex numbers": lambda a: jnp.fft.ifft(jnp.fft.fft(a)).imag,
+    "cholesky": lambda a: jnp.linalg.cholesky(jnp.outer(a, a) + 9 * jnp.eye(3)),
+    "triangular_solve": lambda a: jax.scipy.linalg.solve_triangular(jnp.tril(jnp.outer(a, a)) + 9 * jnp.eye(3), a),
+    "scatter": lambda a: a.at[(3 * a).astype(jnp.int32) % 3].set(7.0),
+    "scatter-add": lambda a: a.at[jnp.array([0, 0, 1])].add(a),
+    "gather": lambda a: a[(3 * a).astype(jnp.int32) % 3],
+    "pad": lambda a: jnp.pad(a, 1, constant_values=2.0),
+    "batched products": lambda a: jnp.einsum("ij,ijk->ik", jnp.outer(a, a), jnp.ones((3, 3, 3))),
+    "narrower numbers": lambda a: lax.bitcast_convert_type(a, jnp.uint8),
+    "wider numbers": lambda a: lax.bitcast_convert_type(lax.bitcast_convert_type(a, jnp.uint8), jnp.float32),
+    "random bits": lambda a: jax.random.uniform(jax.random.key(lax.bitcast_convert_type(a[0], jnp.int32)), (3,)),
+}
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_what_is_not_component_by_component_is_left_to_vmap(vectors, name):
+    agrees(lambda a, table: OTHERS[name](a), vectors[0])
+
+
+def test_functions_with_rules_of_their_own_are_called(vectors):
+    @jax.custom_jvp
+    def doubled(x):
+        return 2 * x
+
+    @jax.custom_vjp
+    def tripled(x):
+        return 3 * x
+
+    doubled.defjvp(lambda primals, tangents: (doubled(*primals), 5 * tangents[0]))
+    tripled.defvjp(lambda x: (3 * x, None), lambda _, ct: (7 * ct,))
+    agrees(lambda a, table: (doubled(a), tripled(a), jax.checkpoint(jnp.sin)(a)), vectors[0])
+    agrees(lambda a, table: (jax.jvp(doubled, (a,), (a,)), jax.grad(lambda x: tripled(x).sum())(a)), vectors[0])
 
 
 def test_derivatives_are_taken_before(vectors):
@@ -244,7 +335,7 @@ def test_a_lane_that_leaves_the_own_loop_of_an_item_takes_the_next(count):
             k, x, path = state
             return k + 1, x * 0.9 + row, path.at[k % 3].add(x[0])
 
-        k, x, path = lax.while_loop(lambda s: s[0] < n, step, (jnp.int32(0), row, jnp.zeros(3)))
+        k, x, path = persistent_loop(lambda s: s[0] < n, step, (jnp.int32(0), row, jnp.zeros(3)))
         return k, {"x": x - start, "path": path, "table": table[0], "none": jnp.zeros((0, 3))}
 
     rng = np.random.default_rng(count)
@@ -252,19 +343,50 @@ def test_a_lane_that_leaves_the_own_loop_of_an_item_takes_the_next(count):
     agrees(f, trips, rng.normal(size=(count, 3)).astype(np.float32))
 
 
-def test_the_last_of_two_loops_is_the_own_one():
+def test_a_loop_before_the_persistent_one_runs_when_an_item_begins():
     def f(n, table):
         first = lax.while_loop(lambda s: s[0] < n, lambda s: (s[0] + 1, s[1] + s[0]), (jnp.int32(0), jnp.int32(0)))
-        return lax.while_loop(lambda s: s[0] < first[1], lambda s: (s[0] + 2, s[1] + n), (jnp.int32(0), jnp.int32(1)))
+        return persistent_loop(lambda s: s[0] < first[1], lambda s: (s[0] + 2, s[1] + n), (jnp.int32(0), jnp.int32(1)))
 
     agrees(f, np.random.default_rng(1).integers(0, 9, 23).astype(np.int32))
+
+
+def test_a_persistent_loop_that_is_left_together_or_within_others_is_an_ordinary_one():
+    def count(n):
+        return persistent_loop(lambda k: k < n, lambda k: k + 1, jnp.int32(0))
+
+    trips = np.random.default_rng(2).integers(0, 9, 13).astype(np.int32)
+    agrees(lambda n, table: count(jnp.int32(table[0, 0, 2])) + n, trips)
+    agrees(lambda n, table: lax.map(count, jnp.stack([n, n + 1])), trips)
+    agrees(lambda n, table: lax.cond(n > 4, count, lambda n: -n, n), trips)
+
+
+def test_two_persistent_loops_are_refused():
+    def count(n):
+        return persistent_loop(lambda k: k < n, lambda k: k + 1, jnp.int32(0))
+
+    with pytest.raises(ValueError, match="one persistent_loop"):
+        lanes(lambda n: count(count(n)), WIDTH)(jnp.arange(3))
+
+
+def test_derivatives_of_a_persistent_loop():
+    """Of some of what it carries, several at a time; lanes leave it by the values."""
+
+    def f(n, x, table):
+        def power(x):
+            return persistent_loop(lambda s: s[0] < n, lambda s: (s[0] + 1, s[1] * x), (jnp.int32(0), jnp.ones(3)))[1]
+
+        return jax.vmap(lambda t: jax.jvp(power, (x,), (t,)))(jnp.eye(3))
+
+    rng = np.random.default_rng(3)
+    agrees(f, rng.integers(0, 9, 23).astype(np.int32), rng.normal(size=(23, 3)).astype(np.float32))
 
 
 @pytest.mark.parametrize("width", [1, 5, 32, 33, 64, 100])
 @pytest.mark.parametrize("count", [0, 1, 64, 300])
 def test_any_number_of_items_in_any_number_of_lanes(count, width):
     trips = jnp.asarray(np.random.default_rng(count).integers(0, 9, count, np.int32))
-    found = jax.jit(lanes(lambda n: lax.while_loop(lambda k: k < n, lambda k: k + 1, jnp.int32(0)), width))(trips)
+    found = jax.jit(lanes(lambda n: persistent_loop(lambda k: k < n, lambda k: k + 1, jnp.int32(0)), width))(trips)
     np.testing.assert_array_equal(found, trips)
 
 
@@ -282,7 +404,7 @@ def test_items_are_worked_on_without_waiting_for_the_slowest():
         def step(k):
             return k + 1 + one_by_one(lambda: jax.pure_callback(count, jax.ShapeDtypeStruct((), jnp.int32), k))()
 
-        return lax.while_loop(lambda k: k < n, step, jnp.int32(0))
+        return persistent_loop(lambda k: k < n, step, jnp.int32(0))
 
     np.testing.assert_array_equal(lanes(f, WIDTH)(jnp.asarray(trips), jnp.asarray(TABLE)), trips)
     ideal = trips.sum()  # the calls, one for each lane and trip, of lanes that never wait

@@ -1,0 +1,88 @@
+"""All that pathjax uses of JAX beyond its public interface, and what differs between JAX's versions.
+
+Tested with jax 0.7.2 to 0.12: a new version is met here.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+
+import jax
+from jax.custom_derivatives import SymbolicZero
+from jax.extend.core import ClosedJaxpr, Literal, Primitive, jaxpr_as_fun
+from jax.interpreters import ad, batching, mlir
+
+__all__ = [
+    "ClosedJaxpr",
+    "Literal",
+    "Primitive",
+    "ad",
+    "batching",
+    "called_program",
+    "is_symbolic_zero",
+    "is_traced",
+    "jaxpr_as_fun",
+    "mlir",
+    "program_of",
+    "scan_parts",
+    "while_parts",
+]
+
+# Primitives that only call a program of other primitives, and the parameter that holds it.
+_CALLS = {
+    "jit": "jaxpr",
+    "pjit": "jaxpr",  # until jax 0.8
+    "closed_call": "call_jaxpr",
+    "core_call": "call_jaxpr",
+    "checkpoint": "jaxpr",
+    "custom_jvp_call": "call_jaxpr",
+    "custom_vjp_call": "call_jaxpr",
+    "custom_vmap_call": "call",
+}
+
+
+def is_traced(x) -> bool:
+    """Whether x stands for a value that is not known yet, within `jax.jit` or a transformation."""
+    return isinstance(x, jax.core.Tracer)
+
+
+def is_symbolic_zero(x) -> bool:
+    """Whether x is what `custom_jvp(symbolic_zeros=True)` gives for a tangent that is zero."""
+    return isinstance(x, SymbolicZero)
+
+
+def program_of(f, *args) -> tuple[ClosedJaxpr, list]:
+    """A function of flat arguments as a program without constants, and what it closes over, its first inputs."""
+    traced = jax.make_jaxpr(f)(*args)
+    consts = traced.consts
+
+    def closed(*inputs):
+        return jax.core.eval_jaxpr(traced.jaxpr, inputs[: len(consts)], *inputs[len(consts) :])
+
+    return jax.make_jaxpr(closed)(*consts, *args) if consts else traced, consts
+
+
+def called_program(eqn) -> ClosedJaxpr | None:
+    """What an equation calls, if calling a program is all that it does."""
+    name = eqn.primitive.name
+    if name == "call_hi_primitive":  # jax 0.12: what it writes in other primitives
+        return jax.make_jaxpr(partial(eqn.primitive.to_lojax, **eqn.params))(*(v.aval for v in eqn.invars))
+    if name not in _CALLS:
+        return None
+    program = eqn.params[_CALLS[name]]
+    return program if hasattr(program, "consts") else ClosedJaxpr(program, ())
+
+
+def while_parts(eqn, values) -> tuple[list, list, list]:
+    """Values of a while loop: constants of the test, of the body, what is carried."""
+    n, m = eqn.params["cond_nconsts"], eqn.params["body_nconsts"]
+    return values[:n], values[n : n + m], values[n + m :]
+
+
+def scan_parts(eqn, values) -> tuple[list, list, list]:
+    """Values of a scan: constants, what is carried, what is taken row by row."""
+    if "num_consts" in eqn.params:
+        n, m = eqn.params["num_consts"], eqn.params["num_carry"]
+    else:  # jax 0.12
+        n, m, _ = (len(tree.vals) for tree in eqn.params["ft_in"].unpack())
+    return values[:n], values[n : n + m], values[n + m :]

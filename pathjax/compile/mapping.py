@@ -1,0 +1,119 @@
+"""A function of one item over millions of them: on CPUs one native loop a device, elsewhere chunks of `vmap`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.custom_batching import custom_vmap
+from jax.sharding import Mesh, PartitionSpec
+
+from pathjax.compile.lanes import lanes
+from pathjax.compile.promotion import usual_promotion
+from pathjax.compile.xla import native
+
+# Items that a native loop takes at once: enough that loops over them vectorise and their overheads vanish, few enough
+# that what they keep stays in the nearest caches. Few items would leave most of the lanes idle.
+_LANES, _FEW_LANES = 256, 64
+MANY_ITEMS = 2 * _LANES
+# Bytes of live values that one lane of a vmapped path keeps; sizes the chunks on an accelerator.
+_BYTES_PER_LANE = 4096
+_CHUNK_BYTES = 1 << 30
+
+
+@usual_promotion
+def native_map(f: Callable, xs, *shared, form: str | None = None, devices: int | None = None):
+    """`f(x, *shared)` for every x of `xs`, on all local devices.
+
+    Args:
+        f: pure function of one item, with real control flow.
+        xs: pytree of arrays (N, ...).
+        shared: pytrees that every item sees whole.
+        form: "lanes" (one native loop a device over groups of items, see `lanes`), "loop" (the same, item by item),
+            "vmap" (chunks of vectorised items), or None: what suits the backend. All give the same results up to
+            rounding.
+        devices: how many local devices to use; None: all.
+    Returns:
+        pytree of arrays (N, ...); bitwise the same for every number of devices.
+    Under `jax.vmap` each item loops over the batch, within the same kernel.
+    """
+
+    @custom_vmap
+    def run(xs, *shared):
+        return _map(f, xs, shared, form, devices)
+
+    @run.def_vmap
+    @usual_promotion
+    def run_batch(size, batched, xs, *shared):
+        xs_batched, *shared_batched = batched
+
+        def entries(x, *shared):
+            def entry(b):
+                def pick(leaf, is_batched):
+                    return lax.dynamic_index_in_dim(leaf, b, keepdims=False) if is_batched else leaf
+
+                picked = jax.tree.map(pick, (x, *shared), (xs_batched, *shared_batched))
+                return f(*picked)
+
+            return lax.map(entry, jnp.arange(size))
+
+        def swap(y):
+            return jnp.swapaxes(y, 0, 1)
+
+        xs = jax.tree.map(lambda x, is_batched: swap(x) if is_batched else x, xs, xs_batched)
+        ys = jax.tree.map(swap, native_map(entries, xs, *shared, form=form, devices=devices))
+        return ys, jax.tree.map(lambda _: True, ys)
+
+    return run(xs, *shared)
+
+
+def _map(f, xs, shared, form, devices):
+    count = jax.tree.leaves(xs)[0].shape[0]
+    form = form or ("lanes" if native() else "vmap")
+    devices = jax.local_devices()[:devices]
+    each = -(-count // len(devices))
+    run = {
+        # By the items of all devices, so that their number does not change the program.
+        "lanes": partial(_lanes, width=_LANES if count >= MANY_ITEMS else _FEW_LANES),
+        "loop": _loop,
+        "vmap": partial(_vmap_chunks, chunk=_CHUNK_BYTES // _BYTES_PER_LANE),
+    }[form]
+    if len(devices) == 1:
+        return run(f, xs, shared)
+
+    # Device i takes items i, i + D, i + 2 D, ...: each gets its share of the expensive part of an image.
+    def deal(x):
+        x = jnp.concatenate([x, jnp.broadcast_to(x[:1], (each * len(devices) - count, *x.shape[1:]))])
+        return x.reshape(each, len(devices), *x.shape[1:]).swapaxes(0, 1)
+
+    def gather(y):
+        return y.swapaxes(0, 1).reshape(each * len(devices), *y.shape[2:])[:count]
+
+    def on_one_device(xs, *shared):
+        return jax.tree.map(lambda y: y[None], run(f, jax.tree.map(lambda x: x[0], xs), shared))
+
+    spec = PartitionSpec("device")
+    mapped = jax.shard_map(
+        on_one_device,
+        mesh=Mesh(np.array(devices), ("device",)),
+        in_specs=(spec, *(PartitionSpec() for _ in shared)),
+        out_specs=spec,
+        check_vma=False,
+    )
+    return jax.tree.map(gather, mapped(jax.tree.map(deal, xs), *shared))
+
+
+def _loop(f, xs, shared):
+    return lax.map(lambda x: f(x, *shared), xs)
+
+
+def _lanes(f, xs, shared, width):
+    return lanes(f, width)(xs, *shared)
+
+
+def _vmap_chunks(f, xs, shared, chunk):
+    return lax.map(lambda x: f(x, *shared), xs, batch_size=min(chunk, jax.tree.leaves(xs)[0].shape[0]))

@@ -1,0 +1,151 @@
+"""What code of one item may say to `lanes`: three primitives, with all rules that JAX's transformations need.
+
+They change no result, and outside of lanes they do next to nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from pathjax.compile.jax_compat import Primitive, ad, batching, jaxpr_as_fun, mlir, program_of
+
+compute_once_p = Primitive("compute_once")
+compute_once_p.multiple_results = True
+one_by_one_p = Primitive("one_by_one")
+one_by_one_p.multiple_results = True
+persistent_test_p = Primitive("persistent_test")
+
+
+def compute_once(values):
+    """A pytree of arrays, whose consumers all read one result.
+
+    XLA fuses what is computed into each of its consumers, so a value that five results share is computed five times.
+    In lanes it is not; elsewhere this is `lax.optimization_barrier`. A value that is computed by few operations, or
+    that has one consumer, is better left to XLA: what is computed once is written to memory and read back.
+    """
+    leaves, structure = jax.tree.flatten(values)
+    return jax.tree.unflatten(structure, compute_once_p.bind(*leaves) if leaves else [])
+
+
+def one_by_one(f: Callable) -> Callable:
+    """f, which lanes run for one after another of those that are in the branch, or the loop, where it stands.
+
+    For a search whose lanes would go different ways. Within it, JAX's control flow is real control flow.
+    """
+
+    def called(*args):
+        leaves, structure = jax.tree.flatten(args)
+        results = None
+
+        def flat(*leaves):
+            nonlocal results
+            outputs, results = jax.tree.flatten(f(*jax.tree.unflatten(structure, leaves)))
+            return outputs
+
+        program, consts = program_of(flat, *leaves)
+        return jax.tree.unflatten(results, one_by_one_p.bind(*consts, *leaves, program=program))
+
+    return called
+
+
+def persistent_loop(test: Callable, body: Callable, state):
+    """`lax.while_loop`, from which each lane goes on to its next item, instead of waiting for the longest.
+
+    For the loop that most of an item's work consists of. Lanes do so where it stands in the item's function itself, not
+    within other control flow, and once; otherwise it is an ordinary loop. What stands before it is done when a lane
+    begins an item, what stands after it when the lane is done with it, both for one lane alone: so both are short.
+    """
+    return lax.while_loop(lambda state: persistent_test_p.bind(jnp.asarray(test(state))), body, state)
+
+
+# ---- compute_once ---------------------------------------------------------------------------------------------------
+
+
+def _once_each(values):
+    """The same of tangents or cotangents, of which some are known to be zero."""
+    there = [value for value in values if type(value) is not ad.Zero]
+    results = iter(compute_once_p.bind(*there) if there else ())
+    return [value if type(value) is ad.Zero else next(results) for value in values]
+
+
+compute_once_p.def_impl(lambda *values: list(map(jnp.asarray, values)))
+compute_once_p.def_abstract_eval(lambda *avals: avals)
+mlir.register_lowering(
+    compute_once_p, mlir.lower_fun(lambda *values: lax.optimization_barrier(values), multiple_results=True)
+)
+batching.primitive_batchers[compute_once_p] = lambda values, axes: (compute_once_p.bind(*values), axes)
+ad.primitive_jvps[compute_once_p] = lambda primals, tangents: (compute_once_p.bind(*primals), _once_each(tangents))
+ad.primitive_transposes[compute_once_p] = lambda cotangents, *primals: _once_each(cotangents)
+
+
+# ---- one_by_one -----------------------------------------------------------------------------------------------------
+
+
+def _one_by_one_batch(inputs, axes, *, program):
+    outputs = one_by_one(jax.vmap(jaxpr_as_fun(program), axes))(*inputs)
+    return outputs, [0] * len(outputs)
+
+
+def _one_by_one_jvp(primals, tangents, *, program):
+    """Tangents come from a program of their own, linear in those of the inputs, so that it transposes."""
+    moves = [type(tangent) is not ad.Zero for tangent in tangents]
+    smooth = [np.issubdtype(aval.dtype, np.inexact) for aval in program.out_avals]
+
+    def smooth_tangents(primals, tangents):
+        def of(*moving):
+            following = iter(moving)
+            inputs = [next(following) if m else primal for m, primal in zip(moves, primals, strict=True)]
+            return [y for y, s in zip(jaxpr_as_fun(program)(*inputs), smooth, strict=True) if s]
+
+        return jax.jvp(of, [primal for m, primal in zip(moves, primals, strict=True) if m], tangents)[1]
+
+    moving = [tangent for m, tangent in zip(moves, tangents, strict=True) if m]
+    following = iter(one_by_one(smooth_tangents)(list(primals), moving))
+    zeros = [ad.Zero(aval.to_tangent_aval()) for aval in program.out_avals]
+    results = [next(following) if s else zero for s, zero in zip(smooth, zeros, strict=True)]
+    return one_by_one_p.bind(*primals, program=program), results
+
+
+def _one_by_one_transpose(cotangents, *inputs, program):
+    linear = [ad.is_undefined_primal(x) for x in inputs]
+    there = [type(cotangent) is not ad.Zero for cotangent in cotangents]
+
+    def transposed(known, cotangents):
+        def of(*unknown):
+            rest, others = iter(known), iter(unknown)
+            outputs = jaxpr_as_fun(program)(*(next(others) if is_linear else next(rest) for is_linear in linear))
+            return [y for y, t in zip(outputs, there, strict=True) if t]
+
+        shapes = [jax.ShapeDtypeStruct(x.aval.shape, x.aval.dtype) for x in inputs if ad.is_undefined_primal(x)]
+        return jax.linear_transpose(of, *shapes)(cotangents)
+
+    known = [x for x, is_linear in zip(inputs, linear, strict=True) if not is_linear]
+    given = [cotangent for cotangent, t in zip(cotangents, there, strict=True) if t]
+    following = iter(one_by_one(transposed)(known, given))
+    return [next(following) if is_linear else None for is_linear in linear]
+
+
+def _one_by_one_inline(*inputs, program):
+    return jaxpr_as_fun(program)(*inputs)
+
+
+one_by_one_p.def_impl(_one_by_one_inline)
+one_by_one_p.def_abstract_eval(lambda *avals, program: program.out_avals)
+mlir.register_lowering(one_by_one_p, mlir.lower_fun(_one_by_one_inline, multiple_results=True))
+batching.primitive_batchers[one_by_one_p] = _one_by_one_batch
+ad.primitive_jvps[one_by_one_p] = _one_by_one_jvp
+ad.primitive_transposes[one_by_one_p] = _one_by_one_transpose
+
+
+# ---- persistent_loop ------------------------------------------------------------------------------------------------
+
+# Stands behind the test of the loop, a bool: so JAX's own rules of loops transform it, and it has no derivative.
+persistent_test_p.def_impl(jnp.asarray)
+persistent_test_p.def_abstract_eval(lambda goes_on: goes_on)
+mlir.register_lowering(persistent_test_p, lambda context, goes_on: [goes_on])
+batching.primitive_batchers[persistent_test_p] = lambda values, axes: (persistent_test_p.bind(*values), *axes)

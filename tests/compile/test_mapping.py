@@ -1,0 +1,76 @@
+"""`native_map` in its forms, on any number of devices."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import lax
+
+from pathjax.compile import mapping, native_map
+
+
+def collatz(n):
+    """Steps to 1: real control flow, of another length for every item."""
+
+    def step(state):
+        n, steps = state
+        return lax.cond(n % 2 == 0, lambda n: n // 2, lambda n: 3 * n + 1, n), steps + 1
+
+    return lax.while_loop(lambda state: state[0] > 1, step, (n, jnp.int32(0)))[1]
+
+
+def collatz_by_hand(n):
+    steps = 0
+    while n > 1:
+        n, steps = (n // 2 if n % 2 == 0 else 3 * n + 1), steps + 1
+    return steps
+
+
+MANY = len(jax.local_devices())
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 17])
+@pytest.mark.parametrize("form", ["loop", "vmap"])
+@pytest.mark.parametrize("devices", [1, None])
+def test_map_of_any_length_form_and_number_of_devices(count, form, devices):
+    mapped = jax.jit(lambda xs: native_map(collatz, xs, form=form, devices=devices))
+    xs = jnp.arange(1, count + 1, dtype=jnp.int32)
+    np.testing.assert_array_equal(mapped(xs), [collatz_by_hand(n) for n in range(1, count + 1)])
+
+
+@pytest.mark.parametrize("form", ["loop", "vmap"])
+def test_map_over_trees_with_shared_trees(form):
+    def f(item, table, number):
+        (a, b), index = item["pair"], item["index"]
+        return {"sum": a + b * number, "picked": (table["rows"][index],)}
+
+    xs = {"pair": (jnp.arange(5.0), jnp.ones(5)), "index": jnp.asarray([2, 0, 1, 1, 2])}
+    table = {"rows": jnp.arange(12.0).reshape(3, 4)}
+    out = native_map(f, xs, table, 3.0, form=form)
+    np.testing.assert_array_equal(out["sum"], np.arange(5) + 3)
+    np.testing.assert_array_equal(out["picked"][0], table["rows"][xs["index"]])
+
+
+@pytest.mark.skipif(MANY < 2, reason="needs two devices")
+def test_order_is_kept_for_every_number_of_devices():
+    xs = jnp.arange(101.0)
+    for devices in range(1, MANY + 1):
+        np.testing.assert_array_equal(native_map(lambda x: 2 * x, xs, devices=devices), 2 * xs)
+
+
+def test_chunks_of_the_vectorised_form_cover_all_items(monkeypatch):
+    """Chunks that do not divide the number of items, as an accelerator would have them."""
+    monkeypatch.setattr(mapping, "_CHUNK_BYTES", 7 * mapping._BYTES_PER_LANE)
+    xs = jnp.arange(1, 101, dtype=jnp.int32)
+    np.testing.assert_array_equal(
+        native_map(collatz, xs, form="vmap", devices=1), [collatz_by_hand(n) for n in range(1, 101)]
+    )
+
+
+def test_map_passes_tangents():
+    xs = jnp.linspace(0.1, 1, 7)
+    primal, tangent = jax.jvp(lambda s: native_map(lambda x, s: jnp.sin(s * x), xs, s), (2.0,), (1.0,))
+    np.testing.assert_allclose(primal, np.sin(2 * xs), rtol=1e-6)
+    np.testing.assert_allclose(tangent, xs * np.cos(2 * xs), rtol=1e-6)

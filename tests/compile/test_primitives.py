@@ -1,0 +1,118 @@
+"""`compute_once`, `one_by_one` and `persistent_loop` under JAX's transformations, outside of lanes and within."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import lax
+
+from pathjax.compile import compute_once, one_by_one, persistent_loop
+from pathjax.compile.lanes import lanes
+
+
+def once(x, n):
+    x, n = compute_once((x, n))
+    return x * x[::-1] * n
+
+
+@one_by_one
+def search(x, n):
+    """Nonlinear in x, linear nowhere; with a loop of fixed length, so that it has every derivative."""
+    return {"y": lax.fori_loop(0, 3, lambda i, y: y * x + n, jnp.sin(x)), "n": n + 1}
+
+
+def plain(x, n):
+    return {"y": lax.fori_loop(0, 3, lambda i, y: y * x + n, jnp.sin(x)), "n": n + 1}
+
+
+PAIRS = {"compute_once": (once, lambda x, n: x * x[::-1] * n), "one_by_one": (search, plain)}
+X, N = jnp.array([0.3, -1.2, 2.0]), jnp.int32(2)
+
+
+@pytest.fixture(params=PAIRS)
+def pair(request):
+    """The function that says it, and the same one without."""
+    return PAIRS[request.param]
+
+
+def same(found, expected):
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5), found, expected)
+    jax.tree.map(lambda a, b: np.testing.assert_equal(np.asarray(a).dtype, np.asarray(b).dtype), found, expected)
+
+
+def of_x(f):
+    """Its real result as a function of x."""
+
+    def result(x):
+        y = f(x, N)
+        return y["y"] if isinstance(y, dict) else y
+
+    return result
+
+
+@pytest.mark.parametrize("transform", [lambda f: f, jax.jit], ids=["eager", "jit"])
+def test_values(pair, transform):
+    said, plain = pair
+    same(transform(said)(X, N), plain(X, N))
+
+
+@pytest.mark.parametrize("axes", [(0, None), (None, 0), (0, 0)])
+def test_vmap(pair, axes):
+    said, plain = pair
+    xs = X * jnp.arange(1.0, 5)[:, None] if axes[0] == 0 else X
+    ns = jnp.arange(4, dtype=jnp.int32) if axes[1] == 0 else N
+    same(jax.jit(jax.vmap(said, axes))(xs, ns), jax.vmap(plain, axes)(xs, ns))
+
+
+def test_forward_derivatives(pair):
+    same(*(jax.jvp(f, (X,), (X + 1,)) for f in map(of_x, pair)))
+    same(*(jax.jacfwd(f)(X) for f in map(of_x, pair)))
+
+
+def test_reverse_derivatives(pair):
+    same(*(jax.jit(jax.jacrev(f))(X) for f in map(of_x, pair)))
+    same(*(jax.jvp(jax.jacrev(f), (X,), (X,)) for f in map(of_x, pair)))
+
+
+def test_derivatives_within_lanes(pair):
+    xs = jnp.asarray(np.random.default_rng(0).normal(size=(7, 3)), jnp.float32)
+    said, plain = (lambda x, f=f: (jax.jacfwd(f)(x), jax.jacrev(f)(x)) for f in map(of_x, pair))
+    same(jax.jit(lanes(said, 4))(xs), jax.vmap(plain)(xs))
+
+
+def test_what_has_no_tangent_gets_none():
+    """Or kernels of derivatives would carry zeros along."""
+    program = jax.make_jaxpr(lambda t: jax.jvp(lambda x: compute_once((x, X))[0], (X,), (t,)))(X)
+    tangents = [e for e in program.eqns if e.primitive.name == "compute_once"][-1]
+    assert len(tangents.invars) == 1
+
+
+def test_a_value_computed_once_is_an_optimization_barrier_outside_of_lanes():
+    assert "optimization_barrier" in jax.jit(once).lower(X, N).as_text()
+
+
+def test_values_computed_once_may_be_any_tree():
+    assert compute_once(()) == () and compute_once({"a": None}) == {"a": None}
+    np.testing.assert_array_equal(compute_once([np.ones(2), 3])[1], 3)
+
+
+def test_a_search_may_close_over_what_is_traced():
+    def f(x, table):
+        return one_by_one(lambda k: table[k] * x)(jnp.int32(1)) + one_by_one(lambda: x + 1)()
+
+    np.testing.assert_allclose(jax.jit(f)(2.0, X), 2 * X[1] + 3)
+    np.testing.assert_allclose(jax.vmap(f, (0, None))(X, X), X[1] * X + X + 1, rtol=1e-6)
+    np.testing.assert_allclose(jax.grad(f)(2.0, X), X[1] + 1)
+
+
+def test_a_persistent_loop_is_a_loop():
+    def power(loop):
+        return lambda x, n: loop(lambda s: s[0] < n, lambda s: (s[0] + 1, s[1] * x), (jnp.int32(0), x))[1]
+
+    said, plain = power(persistent_loop), power(lax.while_loop)
+    same(said(X, N), plain(X, N))
+    ns = jnp.arange(4, dtype=jnp.int32)
+    same(jax.jit(jax.vmap(said, (None, 0)))(X, ns), jax.vmap(plain, (None, 0))(X, ns))
+    same(*(jax.jacfwd(f)(X, N) for f in (said, plain)))
