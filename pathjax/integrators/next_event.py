@@ -6,7 +6,6 @@ import jax.numpy as jnp
 from jax import lax
 
 from pathjax import bsdfs, emitters
-from pathjax.compile import compute_once
 from pathjax.core.math import spawn_ray, to_local
 from pathjax.integrators.options import Options
 from pathjax.integrators.random_numbers import Bounce
@@ -31,17 +30,15 @@ def light_sample(scene, choice, vertex: Vertex, u: Bounce, goes_on, options: Opt
 
     def sample():
         drawn = emitters.sample(scene.emitters, scene.geometry, choice, vertex.surface.p, u.light, u.triangle)
-        drawn = compute_once(drawn)
         wo = to_local(vertex.frame, drawn.d)
         f, pdf_bsdf = bsdfs.evaluate(materials, vertex.kind, vertex.row, vertex.surface, vertex.wi, wo)
         possible = (drawn.pdf > 0) & (pdf_bsdf > 0)
-        scale = compute_once(_weight(drawn, pdf_bsdf, options) / jnp.where(possible, drawn.pdf, 1))
+        scale = _weight(drawn, pdf_bsdf, options) / jnp.where(possible, drawn.pdf, 1)
         contribution = f * drawn.Le * scale
         # A shadow ray of negative length is not traced.
         useful = goes_on & smooth & possible & (options.derivative | jnp.any(contribution > 0))
         reach = jnp.where(useful, drawn.distance, -1)
         shadow_ray = spawn_ray(vertex.surface, drawn.d, vertex.hit.primitive)._replace(t_max=reach)
-        shadow_ray, contribution = compute_once((shadow_ray, contribution))
         visible = useful & ~geometry.occluded(scene.geometry, shadow_ray, drawn.primitive)
         return jnp.where(visible, contribution, 0)
 

@@ -53,8 +53,8 @@ def closest_hit(geometry: Geometry, ray: Ray) -> Hit:
 
         def update():
             # Positive floats order as integers, and integer minima vectorise.
-            bits = compute_once(jnp.where(hit, _bits(distances), beyond))
-            nearest = compute_once(_least(bits))
+            bits = jnp.where(hit, _bits(distances), beyond)
+            nearest = _least(bits)
             found = lax.bitcast_convert_type(nearest, distances.dtype)
             # The lowest of those that tie is the first: primitives ascend with the lanes.
             lanes = jnp.left_shift(jnp.int32(1), jnp.arange(len(bits), dtype=jnp.int32))
@@ -174,7 +174,7 @@ def _visit_table(table: Searched, first, ray, leaf_test, t, primitive):
     # A search goes its own way for each ray; what it starts from is made for all of them.
     @one_by_one
     def search(slabs, entry, prepared, exclude, t, primitive):
-        of_ray = partial(leaf, compute_once(prepared), exclude)
+        of_ray = partial(leaf, prepared, exclude)
         return bvh.traverse(table.tree, of_ray, slabs, entry, t, primitive)
 
     prepared = compute_once(table.prepare(ray.o, ray.d))

@@ -9,7 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from pathjax.compile import compute_once
 from pathjax.core.math import at, integer_like, larger, smaller
 
 WIDTH = 8
@@ -72,7 +71,7 @@ def traverse(tree: Tree, leaf, prepared, entry, t, primitive):
     of ray traversal on GPUs"), which carries less than that over leaves.
     """
     ray, octant = prepared
-    ray, octant, weights = compute_once((ray, octant, _weights(octant)))
+    weights = _weights(octant)
 
     def first_child(entry):
         """The one to visit next: < 0 the leaf ~child, > 0 a node."""
