@@ -21,7 +21,7 @@ import numpy as np
 
 from pathjax import bsdfs, textures
 from pathjax.bsdfs import BSDF, Materials
-from pathjax.emitters import Background, DiracEmitter, Emitter
+from pathjax.emitters import Emitter
 from pathjax.emitters.selection import AllRows
 from pathjax.kinds import Parameters, Row, Table
 from pathjax.textures import Texture, Textures
@@ -283,14 +283,14 @@ def check_emitter(kind: type[Emitter], samples: int = 200_000, false_alarm: floa
     power = np.asarray(kind.power(AllRows(table)))
     assert power.shape == (1,) and np.isfinite(power).all() and (power >= 0).all(), f"the power is {power}, not (1,)"
     p, rng = Row(table, 0), np.random.default_rng(1)
-    if issubclass(kind, DiracEmitter):
+    if kind.dirac:
         refs = jnp.asarray(rng.normal(size=(200, 3)), jnp.float32)
         d, distance, arriving = jax.vmap(lambda ref: kind.sample(p, ref))(refs)
         _check_light(arriving, np.zeros(len(refs)))
         assert (np.asarray(distance) > 0).all() and np.isfinite(distance).any() != kind.distant, (
             "distances are positive, inf of what is `distant` and of nothing else"
         )
-    elif issubclass(kind, Background):
+    elif not kind.on_surfaces:
         u = jnp.asarray(rng.integers(0, 1 << 24, (samples, 3)) * 2.0**-24, jnp.float32)
         d = jax.jit(jax.vmap(lambda u: kind.sample(p, u[:2], u[2])))(u)
         middles, share = _midpoints()

@@ -14,7 +14,7 @@ from pathjax.bsdfs.ior import IOR
 from pathjax.core.math import larger, smaller
 from pathjax.core.types import BSDFSample
 from pathjax.description.elements import nearest
-from pathjax.kinds import Choice, Internal, Number, Table
+from pathjax.kinds import Internal, Number, Setting, Table
 
 REFLECTANCES = {"exact": fresnel.dielectric, "schlick": fresnel.schlick}
 # Least probability of either branch where the choice is by another IOR: with one that vanishes as Fresnel's terms do,
@@ -46,7 +46,7 @@ class Dielectric(BSDF):
     # int_ior / ext_ior by which rows choose between reflection and refraction while their own IOR varies, for
     # derivatives; 0: this row chooses by its own. None, outside derivatives: all do.
     choose_by = Internal()
-    fresnel = Choice("exact", options=tuple(REFLECTANCES))
+    fresnel = Setting("exact", options=tuple(REFLECTANCES))
     delta = transmissive = sided = branches = True
 
     @classmethod

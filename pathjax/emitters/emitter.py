@@ -18,6 +18,7 @@ class Emitter(Kind):
 
     on_surfaces: ClassVar[bool] = False  # stands inside a shape
     distant: ClassVar[bool] = False  # infinitely far
+    dirac: ClassVar[bool] = False  # shines from one direction at each point
 
     @staticmethod
     @abstractmethod
@@ -66,6 +67,8 @@ class Background(Emitter):
 
 class DiracEmitter(Emitter):
     """What shines from one direction at each point: no ray hits it, and no bsdf finds it."""
+
+    dirac = True
 
     @staticmethod
     @abstractmethod

@@ -77,7 +77,7 @@ class Transform2(Declared):
 
 
 @dataclass(frozen=True)
-class Choice(Declared):
+class Setting(Declared):
     """One of some words, the same for all rows: part of the program, not of its data."""
 
     options: tuple[str, ...] = ()

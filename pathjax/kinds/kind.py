@@ -9,7 +9,7 @@ from typing import ClassVar
 import numpy as np
 
 from pathjax.errors import InputError
-from pathjax.kinds.declared import Choice, Declared
+from pathjax.kinds.declared import Declared, Setting
 from pathjax.kinds.parameter import Parameter, Parameters
 from pathjax.kinds.table import Column, Table
 
@@ -69,7 +69,7 @@ class Kind:
         for key, declared in cls.declared.items():
             values = [instance.values[key] for instance in instances]
             textured = [isinstance(value, Instance) for value in values]
-            if all(value is None for value in values) or isinstance(declared, Choice):
+            if all(value is None for value in values) or isinstance(declared, Setting):
                 columns.append(None)
                 continue
             for row, value in enumerate(values):
@@ -89,7 +89,7 @@ class Kind:
             if any(textured):
                 codes = np.array([code(v) if t else (-1, 0) for v, t in zip(values, textured, strict=True)], np.int32)
             columns.append(Column(np.asarray(np.stack(constants), declared.dtype or dtype), codes))
-        choices = tuple((key, d.default) for key, d in cls.declared.items() if isinstance(d, Choice))
+        choices = tuple((key, d.default) for key, d in cls.declared.items() if isinstance(d, Setting))
         return Table(tuple(columns), cls, choices)
 
 
