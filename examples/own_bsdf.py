@@ -1,6 +1,11 @@
-"""A bsdf of one's own: declared, checked, used in a scene, rendered, and its parameter fitted."""
+"""A bsdf of one's own: registered, checked, used in a scene, and its roughness recovered from an image."""
 
+from __future__ import annotations
+
+import argparse
 import math
+import tempfile
+from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
@@ -9,12 +14,13 @@ import pathjax as pj
 from pathjax import bsdfs, testing
 from pathjax.core.types import BSDFSample
 from pathjax.core.warp import square_to_cosine_hemisphere, square_to_cosine_hemisphere_pdf
+from pathjax.images import write_png
 from pathjax.kinds import Color, Number
 
 
 @bsdfs.register("oren_nayar")
 class OrenNayar(bsdfs.BSDF):
-    """Rough clay (Oren and Nayar 1994, in the form of Fujii 2020, which loses less light)."""
+    """Rough clay (Oren and Nayar 1994), in Fujii's form, which loses less light."""
 
     reflectance = Color(0.5)
     sigma = Number(0.5, bounds=(0, 1))
@@ -24,10 +30,9 @@ class OrenNayar(bsdfs.BSDF):
     def evaluate(p, wi, wo):
         cos_i, cos_o = wi[2], jnp.maximum(wo[2], 0)
         s = wi[0] * wo[0] + wi[1] * wo[1]
-        t = jnp.where(s > 0, jnp.maximum(jnp.maximum(cos_i, cos_o), 1e-7), 1)
-        a = 1 / (math.pi + (math.pi / 2 - 2 / 3) * p.sigma)
-        f = p.reflectance * a * (1 + p.sigma * s / t)
-        return f * cos_o, square_to_cosine_hemisphere_pdf(wo)
+        t = jnp.where(s > 0, jnp.maximum(jnp.maximum(cos_i, cos_o), jnp.finfo(s.dtype).tiny), 1)
+        scale = 1 / (math.pi + (math.pi / 2 - 2 / 3) * p.sigma)
+        return p.reflectance * (scale * (1 + p.sigma * s / t) * cos_o), square_to_cosine_hemisphere_pdf(wo)
 
     @staticmethod
     def sample(p, wi, u):
@@ -38,32 +43,40 @@ class OrenNayar(bsdfs.BSDF):
 
 
 SCENE = """<scene version="3.0.0">
+  <default name="res" value="64"/>
   <sensor type="perspective">
     <transform name="to_world"><lookat origin="0, 0, 4" target="0, 0, 0" up="0, 1, 0"/></transform>
     <float name="fov" value="40"/>
-    <film type="hdrfilm"><integer name="width" value="32"/><integer name="height" value="32"/></film>
+    <film type="hdrfilm"><integer name="width" value="$res"/><integer name="height" value="$res"/></film>
   </sensor>
   <shape type="sphere">
     <bsdf type="oren_nayar" id="clay"><rgb name="reflectance" value="0.8, 0.5, 0.3"/></bsdf>
   </shape>
   <shape type="sphere">
-    <float name="radius" value="0.5"/><point name="center" value="0, 0, 6"/>
-    <emitter type="area"><rgb name="radiance" value="20"/></emitter>
+    <point name="center" x="3" y="2" z="6"/><emitter type="area"><rgb name="radiance" value="20"/></emitter>
   </shape>
 </scene>"""
+TRUTH = 0.35
 
 
-def main(folder="."):
+def main():
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--res", type=int, default=64)
+    parser.add_argument("--target-spp", type=int, default=4096)
+    parser.add_argument("--spp", type=int, default=64)
+    parser.add_argument("-o", "--output", default="own_bsdf.png")
+    options = parser.parse_args()
+
     testing.check_bsdf(OrenNayar, sigma=0.7)
-    file = f"{folder}/clay.xml"
-    with open(file, "w") as f:
-        f.write(SCENE)
-    scene = pj.load_scene(file)
-    truth = 0.35
-    target = np.asarray(pj.render(pj.with_parameters(scene, {"clay.sigma": truth}), spp=4096, seed=1))
-    fit = pj.fit(scene, target, ["clay.sigma"], seed=2)
-    print(f"sigma = {fit.values['clay.sigma']:.4f} +- {fit.standard_errors['clay.sigma']:.4f}, rendered with {truth}")
-    return fit
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "clay.xml"
+        file.write_text(SCENE)
+        scene = pj.load_scene(file, res=options.res)
+    target = pj.render(pj.with_parameters(scene, {"clay.sigma": TRUTH}), options.target_spp, seed=1)
+    fit = pj.fit(scene, np.asarray(target), ["clay.sigma"], spp=options.spp, seed=2)
+    value, error = fit.values["clay.sigma"], fit.standard_errors["clay.sigma"]
+    print(f"sigma: {TRUTH} in the target, fitted {value:.4f} +- {error:.4f}; {fit.message}")
+    write_png(options.output, np.concatenate([target, fit.images[0]], axis=1))
 
 
 if __name__ == "__main__":

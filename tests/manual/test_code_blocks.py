@@ -16,6 +16,7 @@ import shlex
 import jax
 import pytest
 
+from pathjax import bsdfs, emitters, textures
 from pathjax.cli import main
 
 BLOCK = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
@@ -26,6 +27,8 @@ def folder(root, tmp_path, monkeypatch):
     """The current folder, as a reader's in the checkout, but empty."""
     (tmp_path / "scenes").symlink_to(root / "scenes")
     monkeypatch.chdir(tmp_path)
+    for room in (bsdfs, textures, emitters):
+        monkeypatch.setattr(room, "KINDS", dict(room.KINDS))
     x64 = jax.config.jax_enable_x64
     yield tmp_path
     jax.config.update("jax_enable_x64", x64)
