@@ -707,10 +707,11 @@ def test_a_table_set_by_hand_has_its_derivative_too(dim_plane):
     """Beside parameters set by name: a table without any is refused, one that holds some is differentiated in all."""
     sky = pj.parameters(dim_plane)["sky.radiance"]
 
+    place = named.find(dim_plane, "sky.radiance")
+
     def image(albedo, radiance):
-        emitters = dim_plane.emitters
-        by_hand = replace(emitters, constant=replace(emitters.constant, radiance=radiance))
-        return pj.render(pj.with_parameters(replace(dim_plane, emitters=by_hand), {PLATE: albedo}), 2)
+        table = named.get(dim_plane, place.path).at[place.index].set(radiance)
+        return pj.render(pj.with_parameters(named.put(dim_plane, place.path, table), {PLATE: albedo}), 2)
 
     at = pj.parameters(dim_plane)[PLATE], sky
     direction = jnp.asarray([0.3, -0.2, 0.5]), jnp.asarray([1.0, 2.0, -1.0])

@@ -69,7 +69,6 @@ def _motion(pixel_number, scene, row):
         """Where the ray ends that refracts wherever it can: a point, or a direction if it hits nothing."""
         varied = ior.with_table(scene, dielectric.with_relative_ior(table, x[0], jnp.arange(len(ratios)) == row))
         ray = scene.camera.sample_ray(middle + x[1:] / size, half)
-
         refracts = jnp.full((bsdf_dimensions(scene.materials),), 1 - 2**-24, ratio.dtype)
 
         def extend(state):

@@ -62,8 +62,8 @@ def radiance(scene, choice, ray: Ray, numbers):
             shadow_ray = spawn_ray(here.surface, light.d, hit.primitive)._replace(t_max=light.distance)
             lit = goes_on & bsdfs.has(materials, here.kind, "smooth") & (light.pdf > 0) & (pdf_bsdf > 0)
             lit &= ~geometry.occluded(shapes, shadow_ray, light.primitive)
-            pdf_light = jnp.where(lit, light.pdf, 1)
-            L = L + jnp.where(lit, throughput * f * light.Le / pdf_light * share(pdf_light, pdf_bsdf), 0)
+            direct = f * light.Le / jnp.where(lit, light.pdf, 1) * share(jnp.where(lit, light.density, 1), pdf_bsdf)
+            L = L + jnp.where(lit, throughput * direct, 0)
 
         # Bsdf sample.
         drawn = bsdfs.sample(materials, *bsdf, u.bsdf)

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 import pathjax as pj
+from pathjax.integrators.options import DEFAULTS
 from pathjax.rendering.progressive import checkpoint, passes
 
 HOW = {"target_error": 0.015, "seed": 3}
@@ -318,7 +319,7 @@ def test_a_state_saved_after_any_call_comes_back_as_it_was(cornell, tmp_path, mo
     store, state = checkpoint.Checkpoint(tmp_path / "run.npz", {}), passes.start(cornell)
     for spp in (16, 40):
         passes.plan(state, spp)
-        for _ in passes.extend(cornell, state, 5, "mis"):
+        for _ in passes.extend(cornell, state, 5, DEFAULTS):
             store.save(state)
             loaded = store.load(passes.start(cornell))
             for name in ("means", "count", "goal", "weights"):

@@ -11,6 +11,7 @@ import pytest
 import pathjax as pj
 from pathjax.compile import calls_at_once
 from pathjax.images import relative_error
+from pathjax.integrators.options import DEFAULTS
 from pathjax.rendering.progressive import error_estimate, passes, until
 from pathjax.system.interrupts import SIGNALS
 
@@ -225,7 +226,7 @@ def test_a_state_left_after_any_call_leads_to_the_same_bits(cornell, monkeypatch
             passes.plan(state, spp)
             left = leave_after
             while (state.count < state.goal).any():
-                for _ in passes.extend(cornell, state, 5, "mis"):
+                for _ in passes.extend(cornell, state, 5, DEFAULTS):
                     left -= 1
                     if left % leave_after == 0:
                         break
@@ -259,7 +260,7 @@ def test_no_call_begins_once_it_is_stopped(cornell, monkeypatch):
     state, whole = passes.start(cornell), passes.start(cornell)
     for one in (state, whole):
         passes.plan(one, 1000)
-    calls = passes.extend(cornell, state, 5, "mis", stopped.is_set)
+    calls = passes.extend(cornell, state, 5, DEFAULTS, stopped.is_set)
     next(calls)
     stopped.set()
     list(calls)
@@ -268,7 +269,7 @@ def test_no_call_begins_once_it_is_stopped(cornell, monkeypatch):
     assert (state.count < state.goal).any()
     # What is left leads on to the same bits.
     for one in (state, whole):
-        list(passes.extend(cornell, one, 5, "mis"))
+        list(passes.extend(cornell, one, 5, DEFAULTS))
     np.testing.assert_array_equal(state.means, whole.means)
 
 
