@@ -105,6 +105,20 @@ def test_loops_run_until_their_last_lane_is_done(rows):
     agrees(lambda n, table: collatz(n, table)[1], rows)
 
 
+@pytest.mark.parametrize("kept", [0, 1, 2])
+def test_a_lane_that_is_done_stays_so_where_the_test_is_a_carried_value_itself(rows, kept):
+    """It would begin again: in the lanes that go on, and so in its own, the number turns to 0 again and again."""
+
+    def f(n, table):
+        def step(state):
+            _, k, total = state
+            return (k * 3 + n) % 7 != 0, k + 1, total + k
+
+        return lax.while_loop(lambda state: state[0], step, (n >= 0, n, jnp.int32(0)))[kept]
+
+    agrees(f, rows)
+
+
 def test_loops_with_a_shared_counter(vectors):
     def f(a, table):
         def add(i, state):

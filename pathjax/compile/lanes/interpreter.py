@@ -194,7 +194,7 @@ class Interpreter:
         differing = equation_outputs_differ(eqn, list(map(differs, inputs)))
         shapes = [v.aval.shape for v in eqn.outvars]
         # A lane that is done stays as it is in what is read later; the rest of it may go on.
-        tested = variables_read_by(test.jaxpr.eqns)
+        tested = variables_read_by(test.jaxpr.eqns) | variables(test.jaxpr.outvars)
         kept = [u or v in tested for u, v in zip(used, test.jaxpr.invars[len(test_consts) :], strict=True)]
 
         def goes_on(packed):
