@@ -40,8 +40,8 @@ class BSDF(Kind):
         Returns:
             The sample; `weight` is f |cos theta_o| / pdf per channel. Where nothing can be drawn pdf and weight are 0,
             never NaN.
-        Gradient: the weight carries the derivative in the parameters, `wo` and `pdf` none: put `lax.stop_gradient` around
-            the parameters that they depend on (but for those that are declared to move paths).
+        Gradient: the weight carries the derivative in the parameters, `wo` and `pdf` none: put `lax.stop_gradient`
+            around the parameters that they depend on (but for those that are declared to move paths).
         """
 
     @staticmethod

@@ -44,7 +44,17 @@ KINDS: dict[str, type[Emitter]] = {"area": Area, "constant": Constant}
 
 def register(name: str):
     """A decorator that makes a subclass of `SurfaceEmitter`, `Background` or `DiracEmitter` a kind named `name`."""
-    return register_kind(KINDS, Emitter, name, "emitters")
+    enter = register_kind(KINDS, Emitter, name, "emitters")
+
+    def checked(kind):
+        declared = enter(kind).declared.values()
+        if not declared or any(parameter.textured for parameter in declared):
+            del KINDS[name]
+            why = "declares a textured parameter, which lights cannot have" if declared else "declares nothing"
+            raise InputError(f"emitters.register({name!r}): {kind!r} {why}; declare a Color(..., textured=False)")
+        return kind
+
+    return checked
 
 
 def build(

@@ -173,3 +173,15 @@ def test_a_name_is_taken_once():
 def test_transport_refuses_lights_that_are_not_even(make_scene):
     with pytest.raises(pj.InputError, match="tinted emitter"):
         transport.operator(make_scene(LAMP.format("", emitter("tinted"))))
+
+
+def test_lights_without_parameters_or_with_textures_are_refused():
+    class Nothing(emitters.Background):
+        pass
+
+    class Textured(emitters.Background):
+        radiance = Color(1.0)
+
+    for kind, complaint in ((Nothing, "declares nothing"), (Textured, "textured parameter")):
+        with pytest.raises(pj.InputError, match=complaint):
+            emitters.register("mine")(kind)
