@@ -106,7 +106,7 @@ def reflectances(materials: Materials) -> tuple[int, Column] | None:
 
 def with_fresnel(materials: Materials, fresnel: str) -> Materials:
     """The same, whose kinds that have a choice of `fresnel` reflect by that of FRESNEL."""
-    tables = (t.with_choice("fresnel", fresnel) if "fresnel" in dict(t.choices) else t for t in materials.tables)
+    tables = (t.with_setting("fresnel", fresnel) if "fresnel" in dict(t.settings) else t for t in materials.tables)
     return replace(materials, tables=tuple(tables))
 
 

@@ -65,32 +65,36 @@ class Kind:
             path: where the table will be in the scene; parameters: to enter those of the rows.
             code: instance of a texture -> its kind and row among the textures.
         """
-        columns = []
-        for key, declared in cls.declared.items():
-            values = [instance.values[key] for instance in instances]
-            textured = [isinstance(value, Instance) for value in values]
-            if all(value is None for value in values) or isinstance(declared, Setting):
-                columns.append(None)
-                continue
-            for row, value in enumerate(values):
-                name = f"{instances[row].name}.{key}"
-                if textured[row]:
+        columns = [
+            _column(declared, [instance.values[key] for instance in instances], dtype, code)
+            for key, declared in cls.declared.items()
+        ]
+        for row, instance in enumerate(instances):
+            for place, (key, declared) in enumerate(cls.declared.items()):
+                name, value = f"{instance.name}.{key}", instance.values[key]
+                if isinstance(value, Instance):
                     parameters.refused.update(value.kind.refused(name))
                 elif value is not None and declared.listed:
-                    place = (*path, "columns", len(columns), "values")
-                    parameters.known[name] = Parameter(
-                        place, (row,), declared.shape, declared.bounds, key, declared.moves_paths
-                    )
-            constants = [
-                np.broadcast_to(declared.standing_in() if missing or value is None else value, declared.shape)
-                for value, missing in zip(values, textured, strict=True)
-            ]
-            codes = None
-            if any(textured):
-                codes = np.array([code(v) if t else (-1, 0) for v, t in zip(values, textured, strict=True)], np.int32)
-            columns.append(Column(np.asarray(np.stack(constants), declared.dtype or dtype), codes))
-        choices = tuple((key, d.default) for key, d in cls.declared.items() if isinstance(d, Setting))
-        return Table(tuple(columns), cls, choices)
+                    where = (*path, "columns", place, "values"), (row,)
+                    moves = declared.moves_paths
+                    parameters.known[name] = Parameter(*where, declared.shape, declared.bounds, key, moves)
+        settings = tuple((key, d.default) for key, d in cls.declared.items() if isinstance(d, Setting))
+        return Table(tuple(columns), cls, settings)
+
+
+def _column(declared: Declared, values: list, dtype, code: Callable) -> Column | None:
+    """Of one parameter, by row: None where no row has it."""
+    if isinstance(declared, Setting) or all(value is None for value in values):
+        return None
+    textured = [isinstance(value, Instance) for value in values]
+    missing = [value is None or is_texture for value, is_texture in zip(values, textured, strict=True)]
+    constants = [
+        np.broadcast_to(declared.standing_in() if is_missing else value, declared.shape)
+        for value, is_missing in zip(values, missing, strict=True)
+    ]
+    codes = [code(value) if is_texture else (-1, 0) for value, is_texture in zip(values, textured, strict=True)]
+    stacked = np.asarray(np.stack(constants), declared.dtype or dtype)
+    return Column(stacked, np.array(codes, np.int32) if any(textured) else None)
 
 
 def ordered(instances, kinds: Mapping[str, type]) -> dict[type, list[Instance]]:

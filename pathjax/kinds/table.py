@@ -24,7 +24,7 @@ class Table:
 
     columns: tuple[Column | None, ...]  # one for each declared parameter; None: no row has it
     kind: type = field(metadata={"static": True})
-    choices: tuple[tuple[str, str], ...] = field(default=(), metadata={"static": True})
+    settings: tuple[tuple[str, str], ...] = field(default=(), metadata={"static": True})
 
     def column(self, name: str) -> Column | None:
         return self.columns[self.kind.place(name)]
@@ -35,10 +35,10 @@ class Table:
         old = columns[self.kind.place(name)]
         texture = None if old is None else old.texture
         columns[self.kind.place(name)] = None if values is None else Column(values, texture)
-        return Table(tuple(columns), self.kind, self.choices)
+        return Table(tuple(columns), self.kind, self.settings)
 
-    def with_choice(self, name: str, value: str) -> Table:
-        return Table(self.columns, self.kind, tuple((dict(self.choices) | {name: value}).items()))
+    def with_setting(self, name: str, value: str) -> Table:
+        return Table(self.columns, self.kind, tuple((dict(self.settings) | {name: value}).items()))
 
 
 class Row:
@@ -52,8 +52,8 @@ class Row:
         kind = self._table.kind
         if name not in kind.declared:
             raise AttributeError(f"{kind.__name__} declares no {name}; it has {', '.join(kind.declared)}")
-        if name in dict(self._table.choices):
-            return dict(self._table.choices)[name]
+        if name in dict(self._table.settings):
+            return dict(self._table.settings)[name]
         column = self._table.column(name)
         if column is None or kind.declared[name].shared:
             return column and column.values

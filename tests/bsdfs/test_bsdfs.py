@@ -252,7 +252,7 @@ def test_dielectric_returns_all_energy():
 @pytest.mark.parametrize("row", [0, 1, 2])
 def test_dielectric_and_its_other_branch_share_the_light(row, fresnel):
     """One reflects and one refracts; what cannot be drawn has pdf 0."""
-    glass, n = GLASS.with_choice("fresnel", fresnel), 10_000
+    glass, n = GLASS.with_setting("fresnel", fresnel), 10_000
     wi, u = directions(n, upper=False), uniform(n, 2)
     drawn = draw(glass, wi, u, row)
     other = draw(glass, wi, u, row, other=True)
