@@ -1,5 +1,7 @@
 """pathjax: a differentiable Monte Carlo path tracer in pure JAX."""
 
+from typing import TYPE_CHECKING
+
 import pathjax.compile  # noqa: F401  first: sets XLA up before a backend starts
 from pathjax.derivatives.jacobian import Jacobian, jacobian
 from pathjax.errors import InputError, InputWarning
@@ -39,14 +41,19 @@ __all__ = [
 ]
 
 
-def __getattr__(name):
-    # What needs optimistix or scipy.stats, half a second of imports, is loaded when it is asked for.
-    if name in ("Fit", "Target", "fit", "read_target"):
-        from pathjax import inverse
+if TYPE_CHECKING:
+    from pathjax.inverse import Fit, Target, fit, read_target
+    from pathjax.rendering.check import GradientCheck, check_gradient
+else:
 
-        return getattr(inverse, name)
-    if name in ("GradientCheck", "check_gradient"):
-        from pathjax.rendering import check
+    def __getattr__(name):
+        # What needs optimistix or scipy.stats, half a second of imports, is loaded when it is asked for.
+        if name in ("Fit", "Target", "fit", "read_target"):
+            from pathjax import inverse
 
-        return getattr(check, name)
-    raise AttributeError(f"module 'pathjax' has no attribute {name!r}")
+            return getattr(inverse, name)
+        if name in ("GradientCheck", "check_gradient"):
+            from pathjax.rendering import check
+
+            return getattr(check, name)
+        raise AttributeError(f"module 'pathjax' has no attribute {name!r}")

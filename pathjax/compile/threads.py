@@ -28,7 +28,7 @@ def concurrently(f: Callable, items: Iterable) -> Iterator[tuple]:
     results are given. Closed early, it waits for the calls that run.
     """
     workers = calls_at_once()
-    waiting = deque()
+    waiting: deque[tuple] = deque()
     with ThreadPoolExecutor(workers) as pool:
         try:
             for item in items:

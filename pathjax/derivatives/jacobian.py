@@ -7,17 +7,19 @@ takes differences (`ior_difference`). No general derivative exists here for movi
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jaxtyping import Array, Float
 
 from pathjax import emitters
 from pathjax.bsdfs import dielectric
 from pathjax.compile import is_traced, native_map, usual_promotion
+from pathjax.core.types import Number
 from pathjax.derivatives import ior, ior_difference, ior_step, rules, tangents
 from pathjax.errors import InputError
 from pathjax.integrators import pixel
@@ -32,7 +34,7 @@ METHODS = ("difference", "attached")
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True, eq=False)
-class Jacobian(Mapping):
+class Jacobian(Mapping[str, Array]):
     """Derivatives of an image by the names of parameters: `J[name]` is (H, W, 3, *shape of the parameter).
 
     bias: of those that are differences, an estimate of derivative minus truth (H, W, 3) from a second step; noisy in a
@@ -44,13 +46,13 @@ class Jacobian(Mapping):
     bias: dict[str, jax.Array]
     step: dict[str, jax.Array]
 
-    def __getitem__(self, name):
+    def __getitem__(self, name: str) -> Array:
         return self.derivatives[name]
 
-    def __iter__(self):
+    def __iter__(self) -> Iterator[str]:
         return iter(self.derivatives)
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self.derivatives)
 
 
@@ -63,7 +65,16 @@ class Wanted:
 
 
 @usual_promotion
-def jacobian(scene: Scene, names, spp: int = 64, seed: int = 0, *, strategy="mis", method="difference", step=None):
+def jacobian(
+    scene: Scene,
+    names: Sequence[str],
+    spp: Number = 64,
+    seed: Number = 0,
+    *,
+    strategy: str = "mis",
+    method: str = "difference",
+    step: float | Float[Array, ""] | None = None,
+) -> tuple[Float[Array, "height width 3"], Jacobian]:
     """Image and its derivative with respect to named parameters, from the same paths, in one kernel.
 
     Pure; may be called inside `jax.jit`, and under `jax.vmap` over scenes that differ in parameters or cameras.
@@ -76,7 +87,7 @@ def jacobian(scene: Scene, names, spp: int = 64, seed: int = 0, *, strategy="mis
             attached image chooses its branches otherwise than `render`, without bias.
         step: of differences, in relative IOR; None: what moves the image by about a third of a pixel.
     Returns:
-        image (H, W, 3), and a Jacobian.
+        image and Jacobian.
     Raises:
         InputError: unknown name, method or strategy; spp, seed or step out of range.
     """

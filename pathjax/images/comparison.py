@@ -55,7 +55,8 @@ def compare(image_file: str, reference_file: str, errors: bool = False) -> Compa
     a, b = image[compared], reference[compared]
     hdr = all(file_format(file) == "OpenEXR" for file in files)
     peak = max(float(b.max()), 0.0) if hdr else 1.0
-    differences = flip(*(np.where(compared[..., None], x, 0) for x in (image, reference)), hdr)
+    shown = compared[..., None]
+    differences = flip(np.where(shown, image, 0), np.where(shown, reference, 0), hdr)
     z, p, exact = None, None, None
     if errors:
         z = np.full(image.shape, np.nan)
@@ -74,8 +75,9 @@ def _read_errors(files, shape) -> list[np.ndarray | None]:
         channels = read_exr(file)[0] if file_format(file) == "OpenEXR" else {}
         missing = [name for name in ERROR_CHANNELS if name not in channels]
         held.append(f"{file} holds {', '.join(sorted(channels)) or 'no named channels'}")
-        errors.append(None if missing else np.stack([channels[name] for name in ERROR_CHANNELS], -1))
-        if 0 < len(missing) < len(ERROR_CHANNELS) or not missing and errors[-1].shape != shape:
+        error = None if missing else np.stack([channels[name] for name in ERROR_CHANNELS], -1)
+        errors.append(error)
+        if 0 < len(missing) < len(ERROR_CHANNELS) or error is not None and error.shape != shape:
             raise InputError(f"{file}: {', '.join(ERROR_CHANNELS)} must be there, all three, at the image's size")
     if all(e is None for e in errors):
         raise InputError(

@@ -122,8 +122,8 @@ def _find_colors(parts) -> tuple[int, str, list[int]]:
         names = sorted(_full_name(parts, part, name) for part, spec in enumerate(parts) for name in spec.channelnames)
         raise Unreadable(f"it has no channels R, G, B or X, Y, Z and no channel Y; it has: {', '.join(names)}")
     if len(candidates) > 1:
-        names = ", ".join(_full_name(parts, part, layer) for part, layer in candidates)
-        raise Unreadable(f"it holds several images: {names}; write the one that is meant with channels R, G, B")
+        images = ", ".join(_full_name(parts, part, layer) for part, layer in candidates)
+        raise Unreadable(f"it holds several images: {images}; write the one that is meant with channels R, G, B")
     part, layer = candidates[0]
     kind = found[part, layer]
     return part, kind, [layers[part, layer][name] for name in kind]
@@ -135,14 +135,14 @@ def _full_name(parts, part: int, name: str) -> str:
     return f"{parts[part].getattribute('name')}.{name}".rstrip(".")
 
 
-def _primaries(spec) -> Sequence[Sequence[float]]:
-    """The file's chromaticities; those of Rec. 709 if it states none."""
+def _primaries(spec) -> np.ndarray:
+    """(4, 2), the file's chromaticities; those of Rec. 709 if it states none."""
     stated = spec.getattribute("chromaticities")
     space = spec.getattribute("colorInteropID") or "unknown"
     linear = space == "lin_rec709_scene" or space.startswith("lin_") and stated is not None
     if not linear and space not in ("unknown", "data"):
         raise Unreadable(f'its colours are "{space}"; convert them to "lin_rec709_scene"')
-    return _REC709 if stated is None else np.reshape(stated, (4, 2))
+    return np.reshape(_REC709 if stated is None else stated, (4, 2))
 
 
 def _to_rec709(primaries) -> np.ndarray:

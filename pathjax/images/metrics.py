@@ -75,10 +75,10 @@ def flip(image, reference, hdr: bool) -> np.ndarray | None:
         import flip_evaluator
     except ImportError:
         return None
-    top, exposures = 1, {}
+    top, exposures = 1.0, {}
     if hdr:
         # FLIP exposes the reference well in any unit of radiance, if the program does not take it for black.
-        top, brightest = np.finfo(np.float32).max, np.max(np.asarray(reference, float) @ _LUMINANCE)
+        top, brightest = float(np.finfo(np.float32).max), np.max(np.asarray(reference, float) @ _LUMINANCE)
         _, exponent = np.frexp(np.nanmax([brightest, level(image)]))
         image, reference = (np.ldexp(np.asarray(x, float), -exponent) for x in (image, reference))
         if np.ldexp(brightest, -exponent) < _FLIP_LEAST_LUMINANCE:

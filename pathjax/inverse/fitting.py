@@ -20,6 +20,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import optimistix as optx
+from jax.typing import ArrayLike
+from jaxtyping import Array, Real
 
 from pathjax.compile import usual_promotion
 from pathjax.errors import InputError
@@ -29,8 +31,11 @@ from pathjax.inverse.approach import approach
 from pathjax.inverse.refine import refine
 from pathjax.inverse.scan import scan as scanned
 from pathjax.inverse.state import State
+from pathjax.inverse.target import Target
 from pathjax.scene.scene import Scene
 from pathjax.system.interrupts import Interrupts
+
+Seen = Target | Real[Array | np.ndarray, "height width 3"]
 
 
 @dataclass
@@ -71,13 +76,13 @@ class Fit:
 @usual_promotion
 def fit(
     scene: Scene | Sequence[Scene],
-    target,
+    target: Seen | Sequence[Seen],
     names: Sequence[str],
     *,
-    start: Mapping | None = None,
+    start: Mapping[str, ArrayLike | Sequence[float]] | None = None,
     spp: int = 128,
     seed: int = 0,
-    solver=None,
+    solver: object = None,
     scan: bool = True,
     progress: bool | Callable[[dict], None] = False,
 ) -> Fit:
@@ -85,7 +90,7 @@ def fit(
 
     Args:
         scene: a scene, or a list of views; views share parameters by name.
-        target: linear RGB (H, W, 3) or a `Target`, as `read_target` returns it; or a list of them, one for each view.
+        target: linear RGB or a `Target`, as `read_target` returns it; or a list of them, one for each view.
             Its noise must be independent from pixel to pixel; the fit finds out how large it is.
         names: of parameters to recover, as `parameters` lists them.
         start: values to begin with, by name; default: the scene's.

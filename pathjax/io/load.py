@@ -7,6 +7,7 @@ import warnings
 from collections.abc import Mapping
 
 import jax.numpy as jnp
+from jax.typing import DTypeLike
 
 from pathjax import emitters
 from pathjax.errors import InputError, InputWarning
@@ -18,7 +19,7 @@ from pathjax.scene.scene import Scene
 def load_scene(
     file: str | os.PathLike,
     *,
-    dtype=jnp.float32,
+    dtype: DTypeLike = jnp.float32,
     split_rule: str = "sah",
     parameters: Mapping[str, object] | None = None,
     **keywords: object,

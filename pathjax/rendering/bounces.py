@@ -9,9 +9,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jaxtyping import Array, Integer
 
 from pathjax import emitters
 from pathjax.compile import is_traced, native_map, usual_promotion
+from pathjax.core.types import Number
 from pathjax.derivatives import rules, tangents
 from pathjax.errors import InputError
 from pathjax.integrators import pixel, terms
@@ -67,7 +69,13 @@ class Bounces:
 
 @usual_promotion
 def render_bounces(
-    scene: Scene, depth: int, spp=64, seed: int = 0, strategy: str = "mis", *, errors: bool = True
+    scene: Scene,
+    depth: int,
+    spp: Number | Integer[Array | np.ndarray, "height width"] = 64,
+    seed: Number = 0,
+    strategy: str = "mis",
+    *,
+    errors: bool = True,
 ) -> Bounces:
     """Render an image of each of the first `depth` terms of L = Le + T Le + T^2 Le + ..., from the same paths.
 
@@ -81,7 +89,7 @@ def render_bounces(
 
     Args:
         depth: how many terms, 1 to 64; 1 is emission alone. Static.
-        spp: samples per pixel; or (H, W) int32, `samples` of a `RenderResult`, whose image is then the sum.
+        spp: samples per pixel; or `samples` of a `RenderResult`, whose image is then the sum.
         seed: of `render`.
         strategy: of `render`.
         errors: whether to estimate the variance.

@@ -40,7 +40,9 @@ class GradientCheck:
 
 
 @usual_promotion
-def check_gradient(scene: Scene, name: str, spp: int = 64, seed: int = 0, *, seeds: int = 16, block: int = 8):
+def check_gradient(
+    scene: Scene, name: str, spp: int = 64, seed: int = 0, *, seeds: int = 16, block: int = 8
+) -> GradientCheck:
     """Compare `jacobian` with differences of `render` at other values of one parameter, with common random numbers.
 
     The values lie around the present one, within the bounds: five of them for what images depend on smoothly. For the

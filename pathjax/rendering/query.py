@@ -6,6 +6,8 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Real
 
 from pathjax.compile import native_map, usual_promotion
 from pathjax.core.math import normalize, rescale
@@ -13,14 +15,13 @@ from pathjax.core.types import Hit, Ray
 from pathjax.scene.scene import Scene
 from pathjax.shapes import geometry
 
+Vectors = Real[Array | np.ndarray, "N 3"]
+
 
 @usual_promotion
-def closest_hit(scene: Scene, origins, directions) -> Hit:
-    """Return the first primitive that each ray meets.
+def closest_hit(scene: Scene, origins: Vectors, directions: Vectors) -> Hit:
+    """Return the first primitive that each ray meets; directions are of any positive length.
 
-    Args:
-        origins: (N, 3).
-        directions: (N, 3), of any positive length.
     Returns:
         Hit of arrays (N,). `t` is the distance, inf where the ray meets nothing; `primitive` and `shape` are then -1.
         `shape` counts the shapes of the file; `primitive` counts spheres, rectangles (six of each cube), disks and

@@ -7,9 +7,11 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 from pathjax import emitters
 from pathjax.compile import native_map, usual_promotion
+from pathjax.core.types import Number
 from pathjax.derivatives.jacobian import pixel_jacobians
 from pathjax.derivatives.rules import estimate
 from pathjax.errors import InputError
@@ -22,16 +24,16 @@ from pathjax.sensors import film
 @usual_promotion
 def render(
     scene: Scene,
-    spp: int = 64,
-    seed: int = 0,
+    spp: Number = 64,
+    seed: Number = 0,
     strategy: str = "mis",
     *,
     fresnel: str = "exact",
     split_depth: int = 0,
     sampler: str = "lattice",
-    control=None,
-):
-    """Render a scene: (H, W, 3), linear RGB, unbiased up to the scene's max_depth (except with `fresnel="schlick"`).
+    control: object = None,
+) -> Float[Array, "height width 3"]:
+    """Render a scene: linear RGB, unbiased up to the scene's max_depth (except with `fresnel="schlick"`).
 
     Pure. It may be called inside `jax.jit`, under `jax.vmap` over scenes that differ in parameters or cameras, and be
     differentiated in what `parameters` lists, forwards or backwards. The derivative is that of `jacobian`, which says

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.typing import ArrayLike
 
 from pathjax.compile import is_traced, usual_promotion
 from pathjax.errors import InputError
@@ -26,7 +27,7 @@ def parameters(scene: Scene) -> dict[str, jax.Array]:
 
 
 @usual_promotion
-def with_parameters(scene: Scene, values: Mapping) -> Scene:
+def with_parameters(scene: Scene, values: Mapping[str, ArrayLike | Sequence[float]]) -> Scene:
     """Return the scene with other values for some of its parameters; nothing is compiled again.
 
     Args:

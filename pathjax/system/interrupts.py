@@ -13,7 +13,10 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from types import FrameType
+from typing import Any, TypeVar
 
+R = TypeVar("R")
 # Not every system has the one of a closed terminal.
 SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
 
@@ -31,8 +34,8 @@ class Interrupts:
     heard = False  # whether a signal came, also to an `Interrupts` around or within this one
     _raises = False
 
-    def __enter__(self):
-        self._earlier = {}
+    def __enter__(self) -> Interrupts:
+        self._earlier: dict[int, Callable | int | None] = {}
         if threading.current_thread() is threading.main_thread():
             for number in SIGNALS:
                 if signal.getsignal(number) != signal.SIG_IGN:
@@ -42,7 +45,7 @@ class Interrupts:
         self.heard = any(around.heard for around in self._around)
         return self
 
-    def __exit__(self, *_):
+    def __exit__(self, *_: object) -> None:
         for number, handler in self._earlier.items():
             signal.signal(number, signal.SIG_DFL if handler is None else handler)
         for around in self._around:
@@ -59,20 +62,21 @@ class Interrupts:
         finally:
             self._raises = False
 
-    def _note(self, number, frame):
+    def _note(self, number: int, frame: FrameType | None) -> None:
         self.heard = True
         if self._raises:
             raise KeyboardInterrupt
 
 
-def wait_for(call: Callable):
+def wait_for(call: Callable[[], R]) -> R:
     """Return the call's result, or raise KeyboardInterrupt as soon as a signal does, while the call itself goes on.
 
     It goes on in a thread of its own, so the program must end by `leave`.
     """
-    outcome, end = [], threading.Event()
+    outcome: list[tuple[bool, Any]] = []
+    end = threading.Event()
 
-    def work():
+    def work() -> None:
         try:
             outcome.append((True, call()))
         except BaseException as error:

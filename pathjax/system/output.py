@@ -10,6 +10,7 @@ import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import TextIO
 
 from pathjax.system.files import encodable
 
@@ -18,14 +19,14 @@ def say(message: str) -> None:
     print(_encodable_on(sys.stderr, f"pathjax: {message}"), file=sys.stderr)
 
 
-def _encodable_on(stream, text: str) -> str:
+def _encodable_on(stream: TextIO | None, text: str) -> str:
     return encodable(text, getattr(stream, "encoding", None) or "utf-8")
 
 
 class Output:
     """Of one command; `written` is true once a file is, `failed` once something could not go where it was asked for."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         self.failed = self.written = False
         self._moved: dict[Path, Path] = {}
 

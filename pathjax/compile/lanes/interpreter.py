@@ -36,7 +36,7 @@ class Interpreter:
     def __init__(self, width: int, never):
         self.width, self.never = width, never
         # By id: what has been made to be computed once. JAX wants no tracer to outlive its function.
-        self.computed = WeakValueDictionary()
+        self.computed: WeakValueDictionary = WeakValueDictionary()
         self.active = None  # (W,) bool lanes whose results are read; None: all. In the others they may be anything.
 
     def run(self, program: ClosedJaxpr, inputs) -> list:
