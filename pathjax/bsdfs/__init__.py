@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jaxtyping import Array, Bool, Float, Int
 
 from pathjax import textures
 from pathjax.bsdfs.bsdf import BSDF
@@ -20,7 +21,7 @@ from pathjax.bsdfs.dielectric import Dielectric
 from pathjax.bsdfs.diffuse import Diffuse
 from pathjax.bsdfs.twosided import TwoSided
 from pathjax.core.math import at
-from pathjax.core.types import BSDFSample
+from pathjax.core.types import BSDFSample, Surface
 from pathjax.kinds import Column, Instance, Parameters, Row, Table, ordered
 from pathjax.kinds import register as register_kind
 from pathjax.textures import Textures
@@ -34,6 +35,8 @@ KINDS: dict[str, type[BSDF]] = {
     "dielectric": Dielectric,
     "twosided": TwoSided,
 }
+# Place of the table of a kind, row in it, or place of a shape; -1: none.
+Index = Int[Array, ""]
 FRESNEL = Dielectric.fresnel.options
 
 
@@ -46,7 +49,7 @@ def register(name: str):
 @dataclass(frozen=True)
 class Materials:
     tables: tuple[Table, ...]  # one for each kind of bsdf present
-    sides: jax.Array  # (S, 2, 2) int32 of each shape: front and back; kind (-1: absorbs), row
+    sides: Int[Array, "S 2 2"]  # of each shape: front and back; kind (-1: absorbs), row
     textures: Textures | None  # in the place of parameters; None: there are none
 
 
@@ -72,8 +75,8 @@ def occurs(materials: Materials, capability: str) -> bool:
     return any(_is(table.kind, capability) for table in materials.tables)
 
 
-def has(materials: Materials, kind, capability: str):
-    """() bool: whether this kind is capable of it, as in `occurs`; where there is no bsdf nothing is."""
+def has(materials: Materials, kind: Index, capability: str) -> Bool[Array, ""]:
+    """Whether this kind is capable of it, as in `occurs`; where there is no bsdf nothing is."""
     flags = [_is(table.kind, capability) for table in materials.tables]
     if not any(flags):
         return jnp.bool_(False)
@@ -88,8 +91,8 @@ def _is(kind: type[BSDF], capability: str) -> bool:
     return getattr(kind, capability)
 
 
-def moving_bit(materials: Materials, kind, row):
-    """() int32: bit row % 31 where parameters of the bsdf move paths, else 0."""
+def moving_bit(materials: Materials, kind: Index, row: Index) -> Index:
+    """Bit row % 31 where parameters of the bsdf move paths, else 0."""
     return jnp.where(has(materials, kind, "moves_paths"), jnp.left_shift(jnp.int32(1), row % 31), 0)
 
 
@@ -110,14 +113,16 @@ def with_fresnel(materials: Materials, fresnel: str) -> Materials:
     return replace(materials, tables=tuple(tables))
 
 
-def select(materials: Materials, shape, front):
-    """Kind and row, () int32 each, of the side of a shape; where there is none, -1, those of some shape."""
+def select(materials: Materials, shape: Index, front: Bool[Array, ""]) -> tuple[Index, Index]:
+    """Kind and row of the side of a shape; where there is none, -1, those of some shape."""
     kind, row = at(materials.sides, jnp.maximum(shape, 0), jnp.where(front, 0, 1))
     return kind, row
 
 
-def evaluate(materials: Materials, kind, row, surface, wi, wo):
-    """f |cos theta_o| (3,) and pdf () of a smooth bsdf; 0 for the others."""
+def evaluate(
+    materials: Materials, kind: Index, row: Index, surface: Surface, wi: Float[Array, "3"], wo: Float[Array, "3"]
+) -> tuple[Float[Array, "3"], Float[Array, ""]]:
+    """f |cos theta_o| and pdf of a smooth bsdf; 0 for the others."""
     smooth = [(i, table) for i, table in enumerate(materials.tables) if table.kind.smooth]
 
     def of(table):
@@ -131,8 +136,10 @@ def evaluate(materials: Materials, kind, row, surface, wi, wo):
     return lax.switch(index, [of(table) for _, table in smooth])
 
 
-def sample(materials: Materials, kind, row, surface, wi, u) -> BSDFSample:
-    """Draw `wo` and its weight from the bsdf. u: (2,), or (3,) where a kind with `lobes` is present."""
+def sample(
+    materials: Materials, kind: Index, row: Index, surface: Surface, wi: Float[Array, "3"], u: Float[Array, " numbers"]
+) -> BSDFSample:
+    """Draw `wo` and its weight from the bsdf. u: 2 numbers, or 3 where a kind with `lobes` is present."""
 
     def of(table):
         return lambda: table.kind.sample(Row(table, row, surface, materials.textures), wi, u)
@@ -142,7 +149,9 @@ def sample(materials: Materials, kind, row, surface, wi, u) -> BSDFSample:
     return lax.switch(jnp.maximum(kind, 0), [of(table) for table in materials.tables])
 
 
-def sample_other(materials: Materials, row, surface, wi, u) -> BSDFSample:
+def sample_other(
+    materials: Materials, row: Index, surface: Surface, wi: Float[Array, "3"], u: Float[Array, " numbers"]
+) -> BSDFSample:
     """The branch that `sample` leaves out, of a kind that `branches`."""
     table = next(table for table in materials.tables if table.kind.branches)
     return table.kind.sample(Row(table, row, surface, materials.textures), wi, u, other=True)

@@ -6,6 +6,7 @@ from abc import abstractmethod
 from typing import ClassVar
 
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 from pathjax.core.types import BSDFSample
 from pathjax.kinds import Instance, Kind, Row
@@ -30,13 +31,12 @@ class BSDF(Kind):
 
     @staticmethod
     @abstractmethod
-    def sample(p: Row, wi, u) -> BSDFSample:
+    def sample(p: Row, wi: Float[Array, "3"], u: Float[Array, " numbers"]) -> BSDFSample:
         """Draw `wo`, in proportion to f |cos theta_o| as well as may be.
 
         Args:
             p: the parameters of one bsdf at the point.
-            wi: (3,).
-            u: (2,) uniform in [0, 1); (3,) where the kind has `lobes`.
+            u: uniform in [0, 1); 2 numbers, or 3 where the kind has `lobes`.
         Returns:
             The sample; `weight` is f |cos theta_o| / pdf per channel. Where nothing can be drawn pdf and weight are 0,
             never NaN.
@@ -45,8 +45,8 @@ class BSDF(Kind):
         """
 
     @staticmethod
-    def evaluate(p: Row, wi, wo):
-        """f |cos theta_o| (3,) and the density () [1/sr] with which `sample` draws `wo`, without Dirac lobes.
+    def evaluate(p: Row, wi: Float[Array, "3"], wo: Float[Array, "3"]) -> tuple[Float[Array, "3"], Float[Array, ""]]:
+        """f |cos theta_o| and the density [1/sr] with which `sample` draws `wo`, without Dirac lobes.
 
         Both are 0 where `sample` never goes. wi.z > 0 is the caller's to see to, unless the kind is `sided`.
         """

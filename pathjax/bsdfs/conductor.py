@@ -6,11 +6,12 @@ import math
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from pathjax.bsdfs import fresnel
 from pathjax.bsdfs.bsdf import BSDF
 from pathjax.core.types import BSDFSample
-from pathjax.kinds import Color
+from pathjax.kinds import Color, Row
 
 
 class Conductor(BSDF):
@@ -42,7 +43,7 @@ class Conductor(BSDF):
         return table.with_column("k", np.where(ideal, np.ones(1, k.values.dtype), k.values))
 
     @staticmethod
-    def sample(p, wi, u) -> BSDFSample:
+    def sample(p: Row, wi: Float[Array, "3"], u: Float[Array, " numbers"]) -> BSDFSample:
         """Mirror direction; the weight is the Fresnel reflectance times `specular_reflectance`."""
         weight = p.specular_reflectance
         if (eta := p.eta) is not None:

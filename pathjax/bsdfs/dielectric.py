@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jaxtyping import Array, Bool, Float
 
 from pathjax.bsdfs import fresnel
 from pathjax.bsdfs.bsdf import BSDF
@@ -14,7 +15,7 @@ from pathjax.bsdfs.ior import IOR
 from pathjax.core.math import larger, smaller
 from pathjax.core.types import BSDFSample
 from pathjax.description.elements import nearest
-from pathjax.kinds import Internal, Number, Setting, Table
+from pathjax.kinds import Internal, Number, Row, Setting, Table
 
 REFLECTANCES = {"exact": fresnel.dielectric, "schlick": fresnel.schlick}
 # Least probability of either branch where the choice is by another IOR: with one that vanishes as Fresnel's terms do,
@@ -57,7 +58,7 @@ class Dielectric(BSDF):
         return super().read(loader, fields, name)
 
     @staticmethod
-    def sample(p, wi, u, other: bool = False) -> BSDFSample:
+    def sample(p: Row, wi: Float[Array, "3"], u: Float[Array, " numbers"], other: bool = False) -> BSDFSample:
         """Reflect with probability R, else refract; by the probabilities of `choose_by` where a row has it.
 
         other: what would not have been drawn, of pdf 0 where it cannot be. For both, pdf * weight is the share of
@@ -102,35 +103,35 @@ def place(materials) -> int:
     return next(i for i, table in enumerate(materials.tables) if table.kind is Dielectric)
 
 
-def iors(table: Table):
-    """(R,) int_ior, (R,) ext_ior."""
+def iors(table: Table) -> tuple[Float[Array, " R"], Float[Array, " R"]]:
+    """int_ior, ext_ior."""
     return table.column("int_ior").values, table.column("ext_ior").values
 
 
-def relative_ior(table: Table):
-    """(R,) int_ior / ext_ior."""
+def relative_ior(table: Table) -> Float[Array, " R"]:
+    """int_ior / ext_ior."""
     inside, outside = iors(table)
     return inside / outside
 
 
-def with_relative_ior(table: Table, ratio, rows):
-    """The table with `ratio`, (R,) or (), in some rows, (R,) bool."""
+def with_relative_ior(table: Table, ratio: Float[Array, "*#R"], rows: Bool[Array, " R"]) -> Table:
+    """The table with `ratio`, one or one of each row, in some rows."""
     inside, outside = iors(table)
     return table.with_column("int_ior", jnp.where(rows, ratio * outside, inside))
 
 
-def choosing_by(table: Table, ratio, rows):
-    """The table of which some rows, (R,) bool, choose their branches as if their relative IOR were `ratio` (R,)."""
+def choosing_by(table: Table, ratio: Float[Array, " R"], rows: Bool[Array, " R"]) -> Table:
+    """The table of which some rows choose their branches as if their relative IOR were `ratio`."""
     return table.with_column("choose_by", jnp.where(rows, ratio, 0))
 
 
-def relative_ior_by(table: Table, row, field: str):
-    """Derivative () of the relative IOR of a row in one of its parameters."""
+def relative_ior_by(table: Table, row: int, field: str) -> Float[Array, ""]:
+    """Derivative of the relative IOR of a row in one of its parameters."""
     inside, outside = (values[row] for values in iors(table))
     return 1 / outside if field == "int_ior" else -inside / (outside * outside)
 
 
-def ior_at(table: Table, row, field: str, ratio):
-    """Value () of one of the parameters of a row at which its relative IOR is `ratio`."""
+def ior_at(table: Table, row: int, field: str, ratio: float) -> Float[Array, ""]:
+    """Value of one of the parameters of a row at which its relative IOR is `ratio`."""
     inside, outside = (values[row] for values in iors(table))
     return ratio * outside if field == "int_ior" else inside / ratio

@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 from pathjax.core.math import safe_sqrt, smaller
 
 
-def dielectric(cos_i, eta):
+def dielectric(cos_i: Float[Array, ""], eta: Float[Array, ""]) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Exact reflectance and the cosine of refraction.
 
     Args:
-        cos_i: () in [0, 1].
-        eta: () > 0, IOR of the far side over that of the near side.
+        cos_i: in [0, 1].
+        eta: > 0, IOR of the far side over that of the near side.
     Returns:
-        R (), in [0, 1]; cos_t () >= 0, 0 under total internal reflection, where R = 1.
+        R, in [0, 1]; cos_t >= 0, 0 under total internal reflection, where R = 1.
     Derivatives are finite everywhere: at and beyond the critical angle they are those of the constant 1.
     """
     contrast, refracts, cos_t = _refraction(cos_i, eta)
@@ -25,7 +26,7 @@ def dielectric(cos_i, eta):
     return jnp.where(refracts, smaller((r_s * r_s + r_p * r_p) / 2, jnp.ones_like(cos_t)), 1), cos_t
 
 
-def schlick(cos_i, eta):
+def schlick(cos_i: Float[Array, ""], eta: Float[Array, ""]) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Schlick's approximation of `dielectric` (1994, Computer Graphics Forum 13(3)); exact are normal incidence, total
     internal reflection and the cosine of refraction.
 
@@ -48,17 +49,14 @@ def _refraction(cos_i, eta):
 
 
 @jax.custom_jvp
-def conductor(cos_i, eta, k):
+def conductor(cos_i: Float[Array, ""], eta: Float[Array, "3"], k: Float[Array, "3"]) -> Float[Array, "3"]:
     """Reflectance of a metal of complex IOR eta + i k, per channel (Born and Wolf; PBRT 4 ed., 9.3.6).
 
     With a + i b = sqrt((eta + i k)^2 - sin^2), of one polarisation 4 a cos / |a + i b + cos|^2 is not reflected, and of
     the other (a^2 + b^2 + sin^2) / |(a + i b) cos + sin^2|^2 times that: sums of positive terms, so that it keeps its
     digits where nearly all is reflected.
 
-    Args:
-        cos_i: () in [0, 1]; eta, k: (3,) in [0, 1e6].
-    Returns:
-        (3,) in [0, 1].
+    For cos_i in [0, 1] and eta, k in [0, 1e6]; the result lies in [0, 1].
     Derivatives are right to rounding, at eta = 0 and k = 0 too, but for points where they are infinite and 0 stands:
     the critical angle of a medium that does not absorb.
     """

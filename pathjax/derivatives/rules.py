@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import partial
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -25,6 +25,7 @@ from pathjax.scene import parameters as named
 from pathjax.scene.scene import Scene
 
 
+@runtime_checkable
 class Estimator(Protocol):
     """Something that is estimated of a scene."""
 

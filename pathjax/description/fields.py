@@ -108,7 +108,7 @@ class Fields:
             raise self.error(name, f'cannot be "{text[:40]}"; use {" or ".join(choices)}{nearest(text, choices)}')
         return text.lower()
 
-    def float_or_name(self, name: str, default: str):
+    def float_or_name(self, name: str, default: str | float):
         """A number, or the text of a <string>."""
         if self.has(name) and self._values[name].tag == "string":
             return self.string(name)

@@ -58,12 +58,14 @@ class Kind:
         return Instance(cls, name, {key: values.get(key, d.default) for key, d in cls.declared.items()})
 
     @classmethod
-    def build(cls, instances: list[Instance], dtype, path: tuple, parameters: Parameters, code: Callable) -> Table:
+    def build(
+        cls, instances: list[Instance], dtype, path: tuple, parameters: Parameters, code: Callable | None
+    ) -> Table:
         """The table of all rows.
 
         Args:
             path: where the table will be in the scene; parameters: to enter those of the rows.
-            code: instance of a texture -> its kind and row among the textures.
+            code: instance of a texture -> its kind and row among the textures; None: nothing is textured.
         """
         columns = [
             _column(declared, [instance.values[key] for instance in instances], dtype, code)

@@ -5,16 +5,19 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import jax
+import numpy as np
 from jax import lax
+from jaxtyping import Array, Int, Shaped
 
 from pathjax.core.math import at, luminance
+from pathjax.core.types import Number, Surface
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Column:
-    values: jax.Array  # (R, *shape); of a row with a texture: not read
-    texture: jax.Array | None = None  # (R, 2) int32 kind, -1 for none, and row of the texture; None: no row has one
+    values: Shaped[Array, "R ..."]  # of a row with a texture: not read
+    texture: Int[Array, "R 2"] | None = None  # kind, -1 for none, and row of the texture; None: no row has one
 
 
 @jax.tree_util.register_dataclass
@@ -29,8 +32,8 @@ class Table:
     def column(self, name: str) -> Column | None:
         return self.columns[self.kind.place(name)]
 
-    def with_column(self, name: str, values) -> Table:
-        """The table with other values (R, *shape) of a parameter, or None."""
+    def with_column(self, name: str, values: Shaped[Array | np.ndarray, "R ..."] | None) -> Table:
+        """The table with other values of a parameter."""
         columns = list(self.columns)
         old = columns[self.kind.place(name)]
         texture = None if old is None else old.texture
@@ -44,8 +47,8 @@ class Table:
 class Row:
     """Parameters of one row as attributes, looked up as they are asked for: at a point of the surface if textured."""
 
-    def __init__(self, table: Table, row, surface=None, textures=None):
-        """row: () int32. surface, textures: what `look_up` of a texture takes; not used where no row has one."""
+    def __init__(self, table: Table, row: Number, surface: Surface | None = None, textures=None):
+        """surface, textures: what `look_up` of a texture takes; not used where no row has one."""
         self._table, self._row, self._surface, self._textures = table, row, surface, textures
 
     def __getattr__(self, name: str):

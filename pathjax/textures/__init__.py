@@ -10,7 +10,9 @@ from dataclasses import dataclass
 
 import jax
 from jax import lax
+from jaxtyping import Array, Float, Int
 
+from pathjax.core.types import Surface
 from pathjax.kinds import Instance, Parameters, Row, Table, ordered
 from pathjax.kinds import register as register_kind
 from pathjax.textures.bitmap import Bitmap
@@ -36,8 +38,8 @@ def register(name: str):
 class Textures:
     tables: tuple[Table, ...]  # one for each kind present
 
-    def look_up(self, code, surface):
-        """Colour (3,) of a texture at a point of a surface. code: (2,) int32 kind and row, or below 0: any."""
+    def look_up(self, code: Int[Array, "2"], surface: Surface) -> Float[Array, "3"]:
+        """Colour of a texture at a point of a surface. code: kind and row, or below 0: any."""
 
         def of(table):
             def look_up():
@@ -54,7 +56,7 @@ class Textures:
         return lax.switch(lax.max(code[0], 0), [of(table) for table in self.tables])
 
 
-def build(instances: list[Instance], dtype, path: tuple, parameters: Parameters):
+def build(instances: list[Instance], dtype, path: tuple, parameters: Parameters) -> tuple[Textures | None, dict]:
     """Textures, or None where there are none, and the code (kind, row) of each instance."""
     tables, codes = [], {}
     for kind, rows in ordered(instances, KINDS).items():

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from pathjax.core.math import at
+from pathjax.core.types import Surface
 from pathjax.images import read_rgb
-from pathjax.kinds import Column, Instance, PerRow, Shared, Table
+from pathjax.kinds import Column, Instance, PerRow, Row, Shared, Table
 from pathjax.textures.texture import Texture
 
 WRAPS = ("repeat", "mirror", "clamp")
@@ -49,7 +51,7 @@ class Bitmap(Texture):
         return Table(tuple(Column(columns[key]) for key in cls.declared), cls)
 
     @staticmethod
-    def look_up(p, uv, surface):
+    def look_up(p: Row, uv: Float[Array, "2"], surface: Surface) -> Float[Array, "3"]:
         size = p.size
         vu = jnp.stack([uv[1], uv[0]])
         # Texel centres lie at (i + 1/2) / size.

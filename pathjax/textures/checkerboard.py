@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
-from pathjax.kinds import Color
+from pathjax.core.types import Surface
+from pathjax.kinds import Color, Row
 from pathjax.textures.texture import Texture
 
 
@@ -15,6 +17,6 @@ class Checkerboard(Texture):
     color1 = Color(0.2, textured=False)
 
     @staticmethod
-    def look_up(p, uv, surface):
+    def look_up(p: Row, uv: Float[Array, "2"], surface: Surface) -> Float[Array, "3"]:
         odd = uv - jnp.floor(uv) > 0.5
         return jnp.where(odd[0] == odd[1], p.color0, p.color1)

@@ -5,7 +5,9 @@ from __future__ import annotations
 from abc import abstractmethod
 
 import numpy as np
+from jaxtyping import Array, Float
 
+from pathjax.core.types import Surface
 from pathjax.kinds import Color, Instance, Kind, Row, Transform2
 
 
@@ -20,14 +22,8 @@ class Texture(Kind):
 
     @staticmethod
     @abstractmethod
-    def look_up(p: Row, uv, surface):
-        """Colour (3,) at a point.
-
-        Args:
-            p: the parameters of one texture.
-            uv: (2,) of the surface, with `to_uv` applied.
-            surface: `core.types.Surface`.
-        """
+    def look_up(p: Row, uv: Float[Array, "2"], surface: Surface) -> Float[Array, "3"]:
+        """Colour at a point, whose uv is that of the surface with `to_uv` applied."""
 
     @classmethod
     def span(cls, texture: Instance) -> tuple[float, float]:
