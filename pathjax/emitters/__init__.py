@@ -12,6 +12,7 @@ from functools import reduce
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jaxtyping import Array, Float
 
 from pathjax.core.math import at, dot, larger
 from pathjax.core.types import EmitterSample, Hit, Ray, Surface
@@ -117,12 +118,19 @@ def even_lights(emitters: tuple[Lights, ...]) -> Lights | None:
     return emitters[0] if emitters else None
 
 
-def sample(emitters: tuple[Lights, ...], shapes: Geometry, chosen: Choice, ref, u, u_part) -> EmitterSample:
+def sample(
+    emitters: tuple[Lights, ...],
+    shapes: Geometry,
+    chosen: Choice,
+    ref: Float[Array, "3"],
+    u: Float[Array, "2"],
+    u_part: Float[Array, ""],
+) -> EmitterSample:
     """Choose a light and a direction towards it.
 
     Args:
-        ref: (3,) the shaded point.
-        u: (2,) uniform in [0, 1), whose first number also chooses the light; u_part: () chooses within it.
+        ref: the shaded point.
+        u: uniform in [0, 1), whose first number also chooses the light; u_part: chooses within it.
     Returns:
         EmitterSample; pdf and Le are 0 where nothing arrives from there.
     """
@@ -154,8 +162,10 @@ def sample(emitters: tuple[Lights, ...], shapes: Geometry, chosen: Choice, ref, 
     return geometry.switch_by_range(number, [first for _, first in sampled], [of(*each) for each in sampled])
 
 
-def hit(emitters: tuple[Lights, ...], shapes: Geometry, chosen: Choice | None, ray: Ray, hit: Hit, surface: Surface):
-    """Radiance (3,) received from the surface that was hit and the density [1/sr] of `sample` for it; 0, 0 if dark."""
+def hit(
+    emitters: tuple[Lights, ...], shapes: Geometry, chosen: Choice | None, ray: Ray, hit: Hit, surface: Surface
+) -> tuple[Float[Array, "3"], Float[Array, ""]]:
+    """Radiance received from the surface that was hit and the density [1/sr] of `sample` for it; 0, 0 if dark."""
     zero = jnp.zeros_like(ray.o)
     on_surfaces = [lights for lights in emitters if lights.lamps is not None]
     if not on_surfaces:
@@ -179,8 +189,10 @@ def hit(emitters: tuple[Lights, ...], shapes: Geometry, chosen: Choice | None, r
     return lax.cond((number >= 0) & (hit.primitive >= 0), lit, lambda: (zero, zero[0]))
 
 
-def background(emitters: tuple[Lights, ...], chosen: Choice | None, d):
-    """Radiance (3,) from direction d (3,) where nothing is hit, and the density [1/sr] of `sample` for it.
+def background(
+    emitters: tuple[Lights, ...], chosen: Choice | None, d: Float[Array, "3"]
+) -> tuple[Float[Array, "3"], Float[Array, ""]]:
+    """Radiance from direction d where nothing is hit, and the density [1/sr] of `sample` for it.
 
     Of all backgrounds together: light may come from several of them, and any of them may have drawn d.
     """

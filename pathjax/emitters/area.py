@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 
+from jaxtyping import Array, Float
+
 from pathjax.core.math import luminance
 from pathjax.emitters.emitter import SurfaceEmitter
-from pathjax.kinds import Color
+from pathjax.kinds import Color, Row
 
 
 class Area(SurfaceEmitter):
@@ -14,9 +16,9 @@ class Area(SurfaceEmitter):
     even = True
 
     @staticmethod
-    def power(p):
+    def power(p) -> Float[Array, " R"]:
         return luminance(p.radiance)
 
     @staticmethod
-    def emitted(p, d):
+    def emitted(p: Row, d: Float[Array, "3"]) -> Float[Array, "3"]:
         return p.radiance

@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 from pathjax.core.math import luminance
 from pathjax.core.warp import SPHERE_PDF, square_to_sphere
 from pathjax.emitters.emitter import Background
-from pathjax.kinds import Color
+from pathjax.kinds import Color, Row
 
 
 class Constant(Background):
@@ -17,17 +18,17 @@ class Constant(Background):
     left_to_bsdfs = True
 
     @staticmethod
-    def power(p):
+    def power(p) -> Float[Array, " R"]:
         return luminance(p.radiance)
 
     @staticmethod
-    def sample(p, u, u_part):
+    def sample(p: Row, u: Float[Array, "2"], u_part: Float[Array, ""]) -> Float[Array, "3"]:
         return square_to_sphere(u)
 
     @staticmethod
-    def emitted(p, d):
+    def emitted(p: Row, d: Float[Array, "3"]) -> Float[Array, "3"]:
         return p.radiance
 
     @staticmethod
-    def density(p, d):
+    def density(p: Row, d: Float[Array, "3"]) -> Float[Array, ""]:
         return jnp.full_like(d[0], SPHERE_PDF)

@@ -5,6 +5,8 @@ from __future__ import annotations
 from abc import abstractmethod
 from typing import ClassVar
 
+from jaxtyping import Array, Float
+
 from pathjax.kinds import Kind, Row
 
 
@@ -22,8 +24,8 @@ class Emitter(Kind):
 
     @staticmethod
     @abstractmethod
-    def power(p):
-        """How bright lights are, by which one of them is chosen: (R,), relative to others that are distant or not.
+    def power(p) -> Float[Array, " R"]:
+        """How bright lights are, by which one of them is chosen: relative to others that are distant or not.
 
         Of a surface its power for each area, of other lights their power, of distant ones the irradiance; each over pi.
 
@@ -39,8 +41,8 @@ class SurfaceEmitter(Emitter):
 
     @staticmethod
     @abstractmethod
-    def emitted(p: Row, d):
-        """Radiance (3,) that leaves the front of the surface in the direction -d; d: (3,)."""
+    def emitted(p: Row, d: Float[Array, "3"]) -> Float[Array, "3"]:
+        """Radiance that leaves the front of the surface in the direction -d."""
 
 
 class Background(Emitter):
@@ -51,18 +53,18 @@ class Background(Emitter):
 
     @staticmethod
     @abstractmethod
-    def sample(p: Row, u, u_part):
-        """Draw a direction (3,) by its `density`. u: (2,) uniform in [0, 1); u_part: () another number."""
+    def sample(p: Row, u: Float[Array, "2"], u_part: Float[Array, ""]) -> Float[Array, "3"]:
+        """Draw a direction by its `density`. u, u_part: uniform in [0, 1)."""
 
     @staticmethod
     @abstractmethod
-    def emitted(p: Row, d):
-        """Radiance (3,) that comes from the direction d (3,)."""
+    def emitted(p: Row, d: Float[Array, "3"]) -> Float[Array, "3"]:
+        """Radiance that comes from the direction d."""
 
     @staticmethod
     @abstractmethod
-    def density(p: Row, d):
-        """() [1/sr] with which `sample` draws d."""
+    def density(p: Row, d: Float[Array, "3"]) -> Float[Array, ""]:
+        """1/sr, with which `sample` draws d."""
 
 
 class DiracEmitter(Emitter):
@@ -72,10 +74,9 @@ class DiracEmitter(Emitter):
 
     @staticmethod
     @abstractmethod
-    def sample(p: Row, ref):
-        """What arrives at the point ref (3,).
+    def sample(p: Row, ref: Float[Array, "3"]) -> tuple[Float[Array, "3"], Float[Array, ""], Float[Array, "3"]]:
+        """What arrives at the point ref.
 
         Returns:
-            direction (3,) towards the light, distance (), inf if it is distant, and irradiance (3,) of a surface that
-            faces it.
+            direction towards the light, distance, inf if it is distant, and irradiance of a surface that faces it.
         """

@@ -8,8 +8,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jaxtyping import Array, Float, Int
 
 from pathjax.core.math import at
+from pathjax.core.types import Number
 from pathjax.emitters.emitter import Background, Emitter
 from pathjax.kinds import Color, Row, Table
 from pathjax.shapes import Lamps
@@ -22,7 +24,7 @@ class Lights:
 
     table: Table  # a row for each emitter of the file
     lamps: Lamps | None  # what shines, of kinds that stand inside shapes; None: each row is one light
-    row: jax.Array | None  # (R,) int32 row of the table, of each lamp
+    row: Int[Array, " R"] | None  # row of the table, of each lamp
 
     @property
     def kind(self) -> type[Emitter]:
@@ -38,12 +40,12 @@ class Lights:
     def left_to_bsdfs(self) -> bool:
         return issubclass(self.kind, Background) and self.kind.left_to_bsdfs
 
-    def parameters(self, light) -> Row:
-        """Of the light () int32 of this kind."""
+    def parameters(self, light: Number) -> Row:
+        """Of the light of this number among those of this kind."""
         return Row(self.table, light if self.row is None else at(self.row, light))
 
-    def power(self):
-        """(R,) of `Emitter.power`, of surfaces times their area."""
+    def power(self) -> Float[Array, " R"]:
+        """`Emitter.power`, of surfaces times their area."""
         power = self.kind.power(AllRows(self.table))
         return power if self.lamps is None else self.lamps.area * power[self.row]
 
@@ -68,8 +70,8 @@ class AllRows:
 class Choice:
     """Probability of each light, numbered through the tables that are sampled; made once per render."""
 
-    pdf: jax.Array  # (R,)
-    cdf: jax.Array  # (R,) ends at 1
+    pdf: Float[Array, " R"]
+    cdf: Float[Array, " R"]  # ends at 1
     first: tuple[int | None, ...] = field(metadata={"static": True})  # by table, its first number; None: not sampled
 
 
@@ -100,8 +102,8 @@ def _over(power, total, otherwise):
     return jnp.where(total > 0, power / jnp.where(total > 0, total, 1), otherwise)
 
 
-def choose(chosen: Choice, u):
-    """Choose a light: its number () int32, the probability (), and u (2,), of which the first number is used anew."""
+def choose(chosen: Choice, u: Float[Array, "2"]) -> tuple[Int[Array, ""], Float[Array, ""], Float[Array, "2"]]:
+    """Choose a light: its number, the probability, and u, of which the first number is used anew."""
     count = chosen.pdf.shape[0]
     if count == 1:
         return jnp.int32(0), jnp.ones_like(u[0]), u

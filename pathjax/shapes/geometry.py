@@ -5,6 +5,7 @@ Hits are found on detached rays; `surface` then computes the point again from th
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 
@@ -12,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jaxtyping import Array, Bool, Float, Int
 
 from pathjax.compile import compute_once, one_by_one
 from pathjax.core.math import at, dot, frame_from_normal, integer_like, smaller
@@ -27,8 +29,8 @@ NO_HIT = np.int32(0x7FFFFFFF)
 @dataclass(frozen=True)
 class Geometry:
     tables: tuple[Table, ...]  # one for each kind of primitive present, through which these are numbered in this order
-    shape: jax.Array  # (P,) int32 of each primitive, its place in the scene file
-    light: jax.Array | None  # (P,) int32 number of its light; -1: emits nothing. None: lights are not built yet
+    shape: Int[Array, " P"]  # of each primitive, its place in the scene file
+    light: Int[Array, " P"] | None  # number of its light; -1: emits nothing. None: lights are not built yet
     tangents: bool = field(default=False, metadata={"static": True})  # whether `surface` tells them
 
 
@@ -73,8 +75,8 @@ def closest_hit(geometry: Geometry, ray: Ray) -> Hit:
     return Hit(jnp.where(found, t, jnp.inf), jnp.where(found, primitive, -1), jnp.where(found, shape, -1))
 
 
-def occluded(geometry: Geometry, ray: Ray, target):
-    """() bool: whether anything but the primitive `target` lies at 0 < t < ray.t_max."""
+def occluded(geometry: Geometry, ray: Ray, target: Int[Array, ""]) -> Bool[Array, ""]:
+    """Whether anything but the primitive `target` lies at 0 < t < ray.t_max."""
 
     def leaf_test(distances, rows, first, t, primitive):
         blocked = jnp.any((distances > 0) & (distances < t) & (rows != target - first))
@@ -111,16 +113,22 @@ def _tangent(along_u, n):
     return jnp.where(found, across * lax.rsqrt(jnp.where(found, squared, 1)), frame_from_normal(n).s)
 
 
-def emits(geometry: Geometry, hit: Hit):
-    """() bool: whether what was hit is a light."""
+def emits(geometry: Geometry, hit: Hit) -> Bool[Array, ""]:
+    """Whether what was hit is a light."""
     return (hit.primitive >= 0) & (at(geometry.light, jnp.maximum(hit.primitive, 0)) >= 0)
 
 
-def sample_lamp(geometry: Geometry, lamps: Lamps, lamp, ref, u, u_part) -> LampSample:
-    """A point of a lamp as seen from `ref` (3,): uniform in area, for spheres in the cone that they fill.
+def sample_lamp(
+    geometry: Geometry,
+    lamps: Lamps,
+    lamp: Int[Array, ""],
+    ref: Float[Array, "3"],
+    u: Float[Array, "2"],
+    u_part: Float[Array, ""],
+) -> LampSample:
+    """A point of a lamp as seen from `ref`: uniform in area, for spheres in the cone that they fill.
 
-    Args:
-        lamp: () int32 row of `lamps`; u: (2,); u_part: () chooses the triangle of a mesh.
+    lamp: row of `lamps`; u_part: chooses the triangle of a mesh.
     """
     first = firsts(geometry)
 
@@ -134,8 +142,10 @@ def sample_lamp(geometry: Geometry, lamps: Lamps, lamp, ref, u, u_part) -> LampS
     return _switch_by_lamp(lamps, lamp, of)
 
 
-def lamp_density(geometry: Geometry, lamps: Lamps, lamp, ray: Ray, hit: Hit, surface: Surface):
-    """Density () [1/sr] with which `sample_lamp`, seen from ray.o, finds what the ray hit, a point of this lamp."""
+def lamp_density(
+    geometry: Geometry, lamps: Lamps, lamp: Int[Array, ""], ray: Ray, hit: Hit, surface: Surface
+) -> Float[Array, ""]:
+    """Density [1/sr] with which `sample_lamp`, seen from ray.o, finds what the ray hit, a point of this lamp."""
     first = firsts(geometry)
 
     def of(index):
@@ -149,7 +159,7 @@ def _switch_by_lamp(lamps, lamp, of):
     return branches[0]() if len(branches) == 1 else lax.switch(at(lamps.table, lamp), branches)
 
 
-def switch_by_range(number, first: list[int], branches):
+def switch_by_range(number: Int[Array, ""], first: list[int], branches: list[Callable]):
     """Call the branch whose range, starting at first[i], holds the number. One branch is called without a test."""
     if len(branches) == 1:
         return branches[0]()

@@ -13,6 +13,7 @@ from typing import ClassVar, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float, Int
 
 from pathjax.compile import compute_once
 from pathjax.core.math import at, dot, safe_divide, safe_sqrt
@@ -79,43 +80,49 @@ class Primitives(ABC):
 class Lamps:
     """Shapes that emit: a row for each rectangle, disk, sphere and face of a cube, and one for each whole mesh."""
 
-    table: jax.Array  # (R,) int32 into `tables`
-    first: jax.Array  # (R,) int32 first row in that table
-    count: jax.Array  # (R,) int32 rows: 1 but for meshes
-    area: jax.Array  # (R,)
+    table: Int[Array, " R"]  # into `tables`
+    first: Int[Array, " R"]  # first row in that table
+    count: Int[Array, " R"]  # rows: 1 but for meshes
+    area: Float[Array, " R"]
     tables: tuple[int, ...] = field(metadata={"static": True})  # which tables of the geometry hold lamps
 
 
 class LampSample(NamedTuple):
     """A point of a lamp as seen from another point."""
 
-    d: jax.Array  # (3,) unit, towards it
-    distance: jax.Array  # ()
-    n: jax.Array  # (3,) unit geometric normal there
-    pdf: jax.Array  # () 1/sr; 0 edge-on
-    primitive: jax.Array  # () int32; of a table's own function: the row
+    d: Float[Array, "3"]  # unit, towards it
+    distance: Float[Array, ""]
+    n: Float[Array, "3"]  # unit geometric normal there
+    pdf: Float[Array, ""]  # 1/sr; 0 edge-on
+    primitive: Int[Array, ""]  # of a table's own function: the row
+
+
+# A point of a primitive, its unit normal, and the rounding error of the point along that.
+SurfacePoint = tuple[Float[Array, "3"], Float[Array, "3"], Float[Array, ""]]
 
 
 class Searched(ABC):
     """Primitives that rays search: one by one, or by a tree."""
 
     kind: ClassVar[str]  # what reports call one of them
-    leaves: jax.Array  # (L, K + 1, W) of `accel.leaves`: bits of K numbers, NaN in empty lanes; row of each lane
+    leaves: Float[Array, "L K+1 W"]  # of `accel.leaves`: bits of K numbers, NaN in empty lanes; row of each lane
     tree: Tree | None  # None: every ray tests all leaves
 
-    def prepare(self, o, d):
-        """Constants of a ray from o (3,) in the unit direction d (3,), for `intersect`."""
+    def prepare(self, o: Float[Array, "3"], d: Float[Array, "3"]):
+        """Constants of a ray from o in the unit direction d, for `intersect`."""
         return o, d
 
     @abstractmethod
-    def intersect(self, leaf, prepared, start):
+    def intersect(
+        self, leaf: Int[Array, ""], prepared, start: Int[Array, ""]
+    ) -> tuple[Float[Array, " W"], Int[Array, " W"]]:
         """Intersect the W primitives of a leaf.
 
         Args:
-            leaf: () int32; prepared: of `prepare`.
-            start: () int32 row of the primitive that the ray starts on, which it leaves for good, or of nothing here.
+            prepared: of `prepare`.
+            start: row of the primitive that the ray starts on, which it leaves for good, or of nothing here.
         Returns:
-            distances (W,), inf or NaN where missed, possibly negative where behind; rows (W,).
+            distances, inf or NaN where missed, possibly negative where behind; rows.
         """
 
 
@@ -153,29 +160,31 @@ class Table(Searched):
         return [self] if len(self.leaves) else []
 
     @abstractmethod
-    def surface(self, row, o, d, t) -> Surface:
+    def surface(self, row: Int[Array, ""], o: Float[Array, "3"], d: Float[Array, "3"], t: Float[Array, ""]) -> Surface:
         """What a ray sees on the primitive that it meets at the distance t; the point lies on it to the last bits.
 
         Differentiable in the ray o, d; t tells apart points, and is not differentiated.
         """
 
     @abstractmethod
-    def along_u(self, row, surface: Surface):
-        """The way (3,), of any length, in which u of `surface`, a point of this primitive, grows and v does not."""
+    def along_u(self, row: Int[Array, ""], surface: Surface) -> Float[Array, "3"]:
+        """The way, of any length, in which u of `surface`, a point of this primitive, grows and v does not."""
 
     # ---- light
 
-    def sample(self, row, u):
-        """Draw a point uniformly in area: u (2,) -> point (3,), unit normal (3,), rounding error along it ().
+    def sample(self, row: Int[Array, ""], u: Float[Array, "2"]) -> SurfacePoint:
+        """Draw a point uniformly in area.
 
         Of kinds that keep the `sample_lamp` of this class.
         """
         raise NotImplementedError
 
-    def sample_lamp(self, lamps: Lamps, lamp, ref, u, u_part) -> LampSample:
-        """Draw a point of the lamp of this row of `lamps`, as seen from `ref` (3,).
+    def sample_lamp(
+        self, lamps: Lamps, lamp: Int[Array, ""], ref: Float[Array, "3"], u: Float[Array, "2"], u_part: Float[Array, ""]
+    ) -> LampSample:
+        """Draw a point of the lamp of this row of `lamps`, as seen from `ref`.
 
-        u: (2,) uniform in [0, 1); u_part: () chooses within a lamp of many primitives.
+        u: uniform in [0, 1); u_part: chooses within a lamp of many primitives.
         """
         row, area = self.row_of_lamp(lamps, lamp, u_part), at(lamps.area, lamp)
         p, n, margin = self.sample(row, u)
@@ -188,12 +197,14 @@ class Table(Searched):
         d, distance = compute_once((d, distance))
         return LampSample(d, distance, n, safe_divide(squared, jnp.abs(dot(n, d)) * area), row)
 
-    def row_of_lamp(self, lamps: Lamps, lamp, u_part):
-        """() int32, the row of the primitive that a sample lies on."""
+    def row_of_lamp(self, lamps: Lamps, lamp: Int[Array, ""], u_part: Float[Array, ""]) -> Int[Array, ""]:
+        """The row of the primitive that a sample lies on."""
         return at(lamps.first, lamp)
 
-    def lamp_density(self, lamps: Lamps, lamp, first: int, ray: Ray, hit: Hit, surface: Surface):
-        """Density () [1/sr] with which `sample_lamp`, seen from ray.o, finds the point that a ray hit.
+    def lamp_density(
+        self, lamps: Lamps, lamp: Int[Array, ""], first: int, ray: Ray, hit: Hit, surface: Surface
+    ) -> Float[Array, ""]:
+        """Density [1/sr] with which `sample_lamp`, seen from ray.o, finds the point that a ray hit.
 
         first: number of the first primitive of this table.
         """
@@ -211,12 +222,12 @@ class Table(Searched):
         """(P, 2) lengths along the two coordinates of `to_square`, cells being about `size` long."""
 
     @abstractmethod
-    def to_square(self, row, p):
-        """Coordinates (2,) in [0, 1], in which equal areas are equal, of a point; of triangles two barycentric ones."""
+    def to_square(self, row: Int[Array, ""], p: Float[Array, "3"]) -> Float[Array, "2"]:
+        """Coordinates in [0, 1], in which equal areas are equal, of a point; of triangles two barycentric ones."""
 
     @abstractmethod
-    def from_square(self, row, xy):
-        """The inverse: point (3,), unit normal (3,), rounding error of the point along it ()."""
+    def from_square(self, row: Int[Array, ""], xy: Float[Array, "2"]) -> SurfacePoint:
+        """The inverse."""
 
     def edges_and_normals(self) -> tuple[np.ndarray, np.ndarray]:
         """Of polygons a corner and the two edges from there (P, 3, 3), and normals (P, 3) of any length; float64."""
