@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from pathjax.compile import compute_once
 from pathjax.core.math import dot
@@ -21,13 +22,13 @@ from pathjax.sensors.sensor import Camera, Sensor
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class PerspectiveCamera(Camera):
-    axes: jax.Array  # (3, 3) rows: unit right, up, forward in world space
-    corner: jax.Array  # (2,) x, y at distance 1 of the film's upper left corner
-    extent: jax.Array  # (2,) x, y at distance 1 from that corner to the opposite one
-    near: jax.Array  # () clip distances along the optical axis
-    far: jax.Array  # ()
+    axes: Float[Array, "3 3"]  # rows: unit right, up, forward in world space
+    corner: Float[Array, "2"]  # x, y at distance 1 of the film's upper left corner
+    extent: Float[Array, "2"]  # x, y at distance 1 from that corner to the opposite one
+    near: Float[Array, ""]  # clip distances along the optical axis
+    far: Float[Array, ""]
 
-    def sample_ray(self, position, u_lens) -> Ray:
+    def sample_ray(self, position: Float[Array, "2"], u_lens: Float[Array, "2"]) -> Ray:
         xy = self.corner + position * self.extent
         start, local = self.through_lens(jnp.stack([xy[0], xy[1], jnp.ones_like(xy[0])]), u_lens)
         right, up, forward = self.axes
@@ -42,10 +43,12 @@ class PerspectiveCamera(Camera):
         o = self.origin + to_world(start) + d * (self.near * along)
         return Ray(o, d, (self.far - self.near) * along, jnp.int32(-1))
 
-    def through_lens(self, local, u_lens):
-        """Where on the lens a ray starts (3,), and its direction (3,) of any length; both in the camera's axes.
+    def through_lens(
+        self, local: Float[Array, "3"], u_lens: Float[Array, "2"]
+    ) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
+        """Where on the lens a ray starts, and its direction, of any length; both in the camera's axes.
 
-        local: (3,) the direction through the middle of the lens, 1 along the optical axis.
+        local: the direction through the middle of the lens, 1 along the optical axis.
         """
         return jnp.zeros_like(local), local
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
-import jax
+from jaxtyping import Array, Float
 
 from pathjax.core.types import Ray
 from pathjax.description.fields import Fields
@@ -16,15 +16,15 @@ from pathjax.sensors.film import HDRFilm
 class Camera(ABC):
     """A sensor in a scene: arrays, of the dtype of the scene. A pytree."""
 
-    origin: jax.Array  # (3,) in world space
+    origin: Float[Array, "3"]  # in world space
 
     @abstractmethod
-    def sample_ray(self, position, u_lens) -> Ray:
+    def sample_ray(self, position: Float[Array, "2"], u_lens: Float[Array, "2"]) -> Ray:
         """Return the ray through a point of the film; it starts on no primitive.
 
         Args:
-            position: (2,) in [0, 1]^2 over the whole film, from the upper left corner; a wide filter reaches beyond.
-            u_lens: (2,) uniform in [0, 1), for sensors with an aperture.
+            position: in [0, 1]^2 over the whole film, from the upper left corner; a wide filter reaches beyond.
+            u_lens: uniform in [0, 1), for sensors with an aperture.
         Differentiable in position and in the arrays.
         """
 

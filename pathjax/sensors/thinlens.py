@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from pathjax.compile import compute_once
 from pathjax.core.warp import square_to_disk
@@ -18,10 +19,12 @@ from pathjax.sensors.perspective import Perspective, PerspectiveCamera
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class ThinLensCamera(PerspectiveCamera):
-    aperture_radius: jax.Array  # ()
-    focus_distance: jax.Array  # () along the optical axis
+    aperture_radius: Float[Array, ""]
+    focus_distance: Float[Array, ""]  # along the optical axis
 
-    def through_lens(self, local, u_lens):
+    def through_lens(
+        self, local: Float[Array, "3"], u_lens: Float[Array, "2"]
+    ) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
         aperture = self.aperture_radius * square_to_disk(u_lens)
         start = jnp.stack([aperture[0], aperture[1], jnp.zeros_like(local[0])])
         return compute_once((start, local * self.focus_distance - start))

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 from pathjax.sensors.filters.filter import Filter
 
@@ -19,5 +20,5 @@ class Box(Filter):
     def read(cls, loader, fields) -> Box:
         return cls()
 
-    def sample(self, u):
+    def sample(self, u: Float[Array, "2"]) -> tuple[Float[Array, "2"], Float[Array, ""]]:
         return (2 * u - 1) * self.radius, jnp.ones_like(u[0])

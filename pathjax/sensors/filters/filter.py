@@ -6,6 +6,7 @@ from abc import ABC, abstractmethod
 
 import jax
 import numpy as np
+from jaxtyping import Array, Float
 
 from pathjax.description.fields import Fields
 
@@ -23,12 +24,10 @@ class Filter(ABC):
         return jax.tree.map(lambda x: np.asarray(x, dtype), self)
 
     @abstractmethod
-    def sample(self, u):
-        """Draw where a sample of a pixel looks.
+    def sample(self, u: Float[Array, "2"]) -> tuple[Float[Array, "2"], Float[Array, ""]]:
+        """Draw where a sample of a pixel looks, from u uniform in [0, 1).
 
-        Args:
-            u: (2,) uniform in [0, 1).
         Returns:
-            offset (2,) from the middle of the pixel, in pixels, and weight () of mean 1: weighted samples have the
-            filter for their density.
+            offset from the middle of the pixel, in pixels, and weight of mean 1: weighted samples have the filter for
+            their density.
         """

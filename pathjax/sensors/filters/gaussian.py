@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from pathjax.core.math import at
 from pathjax.sensors.filters.filter import Filter
@@ -35,7 +36,7 @@ class Gaussian(Filter):
         knots = np.interp(np.linspace(0, running[-1], _STEPS + 1), running, x)
         return Gaussian(*(np.asarray(x, dtype) for x in (self.stddev, self.radius, knots, 1 / running[-1])))
 
-    def sample(self, u):
+    def sample(self, u: Float[Array, "2"]) -> tuple[Float[Array, "2"], Float[Array, ""]]:
         step = jnp.minimum((u * _STEPS).astype(jnp.int32), _STEPS - 1)
         low = jnp.stack([at(self.knots, step[0]), at(self.knots, step[1])])
         high = jnp.stack([at(self.knots, step[0] + 1), at(self.knots, step[1] + 1)])

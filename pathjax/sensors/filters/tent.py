@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 from pathjax.core.warp import tent
 from pathjax.sensors.filters.filter import Filter
@@ -20,5 +21,5 @@ class Tent(Filter):
     def read(cls, loader, fields) -> Tent:
         return cls(fields.float("radius", 1.0, above=0, below=100))
 
-    def sample(self, u):
+    def sample(self, u: Float[Array, "2"]) -> tuple[Float[Array, "2"], Float[Array, ""]]:
         return tent(u) * self.radius, jnp.ones_like(u[0])
