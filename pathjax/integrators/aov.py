@@ -7,27 +7,29 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jaxtyping import Array, Float, Int
 
 from pathjax import bsdfs
 from pathjax.core import sampler
 from pathjax.core.math import dot, spawn_ray
 from pathjax.integrators import path
-from pathjax.integrators.pixel import camera_ray
+from pathjax.integrators.pixel import Work, camera_ray
 from pathjax.integrators.random_numbers import bounce_numbers
 from pathjax.integrators.vertex import vertex
+from pathjax.scene.scene import Scene
 from pathjax.shapes import geometry
 
 
 class FirstHit(NamedTuple):
     """All 0 where nothing is met, as Mitsuba's `aov` has it."""
 
-    depth: jax.Array  # (1,) distance along the ray, from the near clip plane on
-    normal: jax.Array  # (3,) shading normal in world space, on the side that the shape's normals point to
-    albedo: jax.Array  # (3,) share of light that a reflector sends back; 1 for glass, 0 for a side that absorbs
+    depth: Float[Array, "1"]  # distance along the ray, from the near clip plane on
+    normal: Float[Array, "3"]  # shading normal in world space, on the side that the shape's normals point to
+    albedo: Float[Array, "3"]  # share of light that a reflector sends back; 1 for glass, 0 for a side that absorbs
 
 
-def mean(work, scene) -> FirstHit:
-    """Over a pixel's samples. work: the pixel () int32, and its `pixel.numbers`."""
+def mean(work: Work, scene: Scene) -> FirstHit:
+    """Over a pixel's samples."""
     pixel, first_sample, spp, seed = work
     stream = sampler.pixel_stream(seed, pixel)
 
@@ -39,7 +41,7 @@ def mean(work, scene) -> FirstHit:
     return jax.tree.map(lambda x: x / spp.astype(x.dtype), total)
 
 
-def sample(scene, pixel, stream, number) -> FirstHit:
+def sample(scene: Scene, pixel: Int[Array, ""], stream: sampler.Word, number: sampler.Word) -> FirstHit:
     """One sample, at the film position of `pixel.camera_ray`."""
     ray, weight = camera_ray(scene, pixel, stream, number)
     if not scene.geometry.tables:

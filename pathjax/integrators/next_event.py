@@ -4,26 +4,32 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 from jax import lax
+from jaxtyping import Array, Bool, Float, Real
 
 from pathjax import bsdfs, emitters
 from pathjax.core.math import spawn_ray, to_local
+from pathjax.core.types import EmitterSample
+from pathjax.emitters import Choice
 from pathjax.integrators.options import Options
 from pathjax.integrators.random_numbers import Bounce
 from pathjax.integrators.vertex import Vertex
+from pathjax.scene.scene import Scene
 from pathjax.shapes import geometry
 
 
-def occurs(scene, choice, options: Options) -> bool:
+def occurs(scene: Scene, choice: Choice | None, options: Options) -> bool:
     """Whether any light is sampled: not where all bsdfs are Dirac's, whose directions no light sample has."""
     return options.strategy != "bsdf" and choice is not None and bsdfs.occurs(scene.materials, "smooth")
 
 
-def light_sample(scene, choice, vertex: Vertex, u: Bounce, goes_on, options: Options):
-    """One sample (3,) of what a vertex reflects of direct light: the integral over all lights of f Le |cos theta| V.
+def light_sample(
+    scene: Scene, choice: Choice, vertex: Vertex, u: Bounce, goes_on: Bool[Array, ""], options: Options
+) -> Float[Array, "3"]:
+    """One sample of what a vertex reflects of direct light: the integral over all lights of f Le |cos theta| V.
 
     Args:
         choice: how lights are chosen, of `emitters.choice`.
-        goes_on: () bool, else the sample is of no use, and its shadow ray not traced.
+        goes_on: else the sample is of no use, and its shadow ray not traced.
     """
     materials = scene.materials
     smooth = bsdfs.has(materials, vertex.kind, "smooth")
@@ -45,13 +51,15 @@ def light_sample(scene, choice, vertex: Vertex, u: Bounce, goes_on, options: Opt
     return lax.cond(smooth, sample, lambda: jnp.zeros_like(vertex.wi))
 
 
-def _weight(drawn, pdf_bsdf, options: Options):
-    """Share () of a light sample in the light that bsdf sampling finds too."""
+def _weight(drawn: EmitterSample, pdf_bsdf: Float[Array, ""], options: Options) -> Float[Array, ""] | int:
+    """Share of a light sample in the light that bsdf sampling finds too."""
     return mis_weight(drawn.density, pdf_bsdf) if options.strategy == "mis" else 1
 
 
-def share_of_bsdf_sampling(scene, choice, pdf, pdf_light, options: Options):
-    """Share () of bsdf sampling in light that it found with density `pdf` and a light sample with `pdf_light`."""
+def share_of_bsdf_sampling(
+    scene: Scene, choice: Choice | None, pdf: Float[Array, ""], pdf_light: Float[Array, ""], options: Options
+) -> Real[Array, ""] | int:
+    """Share of bsdf sampling in light that it found with density `pdf` and a light sample with `pdf_light`."""
     if options.strategy == "mis":
         return mis_weight(pdf, pdf_light)
     if occurs(scene, choice, options):
@@ -59,7 +67,7 @@ def share_of_bsdf_sampling(scene, choice, pdf, pdf_light, options: Options):
     return 1
 
 
-def mis_weight(pdf, other_pdf):
+def mis_weight(pdf: Float[Array, ""], other_pdf: Float[Array, ""]) -> Float[Array, ""]:
     """Power heuristic for a sample of density `pdf` > 0 that the other technique finds with `other_pdf`.
 
     1 for an infinite `pdf`, what cannot be found otherwise, even where a grazing light makes the other one overflow.

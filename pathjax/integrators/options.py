@@ -10,16 +10,20 @@ from dataclasses import dataclass, replace
 
 import jax
 import numpy as np
+from jaxtyping import Array, Integer
 
 from pathjax import bsdfs
 from pathjax.compile import is_traced
 from pathjax.core import sampler
 from pathjax.errors import InputError
+from pathjax.scene.scene import Scene
 
 STRATEGIES = ("mis", "light", "bsdf")
 SAMPLERS = tuple(sampler.POINTS)
 # Branches double with each.
 MOST_SPLITS = 8
+# Of samples, or a seed: one number or one of each pixel or replicate.
+Counts = int | np.integer | Integer[Array | np.ndarray, "..."]
 
 
 @dataclass(frozen=True)
@@ -49,7 +53,7 @@ class Options:
         if not isinstance(self.split_depth, int) or not 0 <= self.split_depth <= MOST_SPLITS:
             raise InputError(f"split_depth = {self.split_depth!r}; it must be an integer in [0, {MOST_SPLITS}]")
 
-    def check_counts(self, spp, seed) -> None:
+    def check_counts(self, spp: Counts, seed: Counts) -> None:
         """Refuse, with an InputError, numbers of samples and seeds out of range; see `check_counts`."""
         check_counts(spp, seed)
         if self.sampler == "subpixel" and not is_traced(spp):
@@ -66,7 +70,7 @@ class Options:
         if self.controlled:
             raise InputError("derivatives are not made with a control; without one the image has the same expectation")
 
-    def applied(self, scene):
+    def applied(self, scene: Scene) -> Scene:
         """The scene whose dielectrics reflect as chosen."""
         return replace(scene, materials=bsdfs.with_fresnel(scene.materials, self.fresnel))
 
@@ -74,7 +78,7 @@ class Options:
 DEFAULTS = Options()
 
 
-def check_counts(spp, seed, name: str = "spp") -> None:
+def check_counts(spp: Counts, seed: Counts, name: str = "spp") -> None:
     """Refuse, with an InputError, a number of samples below 1 and a seed below 0; arrays, traced ones too, pass.
 
     name: what the samples are called.

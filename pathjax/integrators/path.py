@@ -17,47 +17,48 @@ from __future__ import annotations
 from functools import partial
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jax import lax
+from jaxtyping import Array, Bool, Float, Int
 
 from pathjax import bsdfs, emitters
 from pathjax.compile import compute_once
 from pathjax.core.math import dot, spawn_ray, to_world
-from pathjax.core.types import Ray
+from pathjax.core.types import BSDFSample, Hit, Ray
 from pathjax.emitters import Choice
 from pathjax.integrators import next_event, roulette, splitting
 from pathjax.integrators.options import Options
 from pathjax.integrators.random_numbers import Bounce
 from pathjax.integrators.vertex import Vertex, vertex
+from pathjax.scene.scene import Scene
 from pathjax.shapes import geometry
 
 
 class Gain(NamedTuple):
     """Radiance that a path gathers at one vertex, by the term of L = Le + T Le + T^2 Le + ... that it belongs to."""
 
-    emission: jax.Array  # (3,) of the term T^depth Le, depth being that of the path before the vertex
-    light: jax.Array  # (3,) of the next one: the light sample
+    emission: Float[Array, "3"]  # of the term T^depth Le, depth being that of the path before the vertex
+    light: Float[Array, "3"]  # of the next one: the light sample
 
 
 class Path(NamedTuple):
     """What a path carries from one vertex to the next: the state of the loop."""
 
     ray: Ray  # from the last vertex to the next
-    L: jax.Array | Gain  # (3,) radiance gathered so far; a Gain: at the last vertex alone
-    throughput: jax.Array  # (3,) product of the weights so far
-    pdf: jax.Array  # () density [1/sr] of ray.d by bsdf sampling; inf from a camera or a Dirac lobe
-    depth: jax.Array  # () int32 vertices so far
-    alive: jax.Array  # () bool; once it is not, L is whole
+    L: Float[Array, "3"] | Gain  # radiance gathered so far; a Gain: at the last vertex alone
+    throughput: Float[Array, "3"]  # product of the weights so far
+    pdf: Float[Array, ""]  # density [1/sr] of ray.d by bsdf sampling; inf from a camera or a Dirac lobe
+    depth: Int[Array, ""]  # vertices so far
+    alive: Bool[Array, ""]  # once it is not, L is whole
     # None where nothing asks for it, so that nothing of it is compiled:
-    passive: jax.Array | None = None  # () what refraction did to the throughput, which roulette takes out
-    moving: jax.Array | None = None  # () int32 bit r % 31 is set once it met row r of the bsdfs that move paths
-    expected: jax.Array | None = None  # () what a control expects of it, all channels
-    splits: jax.Array | None = None  # () int32 how many dielectrics may still split it
+    passive: Float[Array, ""] | None = None  # what refraction did to the throughput, which roulette takes out
+    moving: Int[Array, ""] | None = None  # bit r % 31 is set once it met row r of the bsdfs that move paths
+    expected: Float[Array, ""] | None = None  # what a control expects of it, all channels
+    splits: Int[Array, ""] | None = None  # how many dielectrics may still split it
     pending: Path | None = None  # (split_depth, ...) branches that wait, those alive; see `splitting`
 
 
-def start(scene, ray: Ray, options: Options) -> Path:
+def start(scene: Scene, ray: Ray, options: Options) -> Path:
     """A path that has its camera ray."""
     one, zero3 = jnp.ones_like(ray.t_max), jnp.zeros_like(ray.o)
     branches = bsdfs.occurs(scene.materials, "transmissive")
@@ -75,16 +76,15 @@ def start(scene, ray: Ray, options: Options) -> Path:
     return splitting.start(path, options.split_depth) if options.split_depth and branches else path
 
 
-def extend(scene, choice: Choice | None, path: Path, u: Bounce, options: Options, control=None) -> Path:
+def extend(scene: Scene, choice: Choice | None, path: Path, u: Bounce, options: Options, control=None) -> Path:
     """Follow a path to its next vertex.
 
     Args:
         choice: how lights are chosen, of `emitters.choice`.
-        path: Path, alive.
-        u: Bounce, the vertex's own.
+        path: alive; u: the vertex's own.
         control: `transport.Control`, for options that are controlled.
     Returns:
-        Path; once it is not alive, `L` is the radiance that arrives, unbiased up to max_depth.
+        The path; once it is not alive, `L` is the radiance that arrives, unbiased up to max_depth.
     Gradient: what is drawn is detached from albedos and radiances, so weights carry the derivative, unbiased. Where the
     IOR of glass moves the path, the derivative is that of the moving points (attached), and edges are missing from it.
     """
@@ -117,11 +117,12 @@ def extend(scene, choice: Choice | None, path: Path, u: Bounce, options: Options
     return path if path.pending is None else splitting.resume(path)
 
 
-def emission(scene, choice, path: Path, hit, here: Vertex | None, options: Options):
-    """Le (3,) of what a path ends on, times its throughput and the share of bsdf sampling in finding that light.
+def emission(
+    scene: Scene, choice: Choice | None, path: Path, hit: Hit, here: Vertex | None, options: Options
+) -> Float[Array, "3"]:
+    """Le of what a path ends on, times its throughput and the share of bsdf sampling in finding that light.
 
-    Args:
-        path: before the vertex `here`, which its ray meets at `hit`.
+    path: before the vertex `here`, which its ray meets at `hit`.
     """
     shapes, found = scene.geometry, hit.primitive >= 0
 
@@ -146,7 +147,9 @@ def emission(scene, choice, path: Path, hit, here: Vertex | None, options: Optio
     return lax.cond(bright, received, lambda: jnp.zeros_like(path.throughput))
 
 
-def scatter(scene, choice, here: Vertex, u: Bounce, goes_on, options: Options, path: Path) -> Path:
+def scatter(
+    scene: Scene, choice: Choice | None, here: Vertex, u: Bounce, goes_on: Bool[Array, ""], options: Options, path: Path
+) -> Path:
     """T L at a vertex: a light sample, and a direction in which the path goes on if roulette lets it."""
     L = path.L
     if next_event.occurs(scene, choice, options):
@@ -176,8 +179,8 @@ def scatter(scene, choice, here: Vertex, u: Bounce, goes_on, options: Options, p
     return on if path.pending is None else splitting.split(scene, here, u.bsdf, splits, path, on)
 
 
-def bsdf_sample(scene, here: Vertex, u):
-    """A `BSDFSample`, whose weight estimates the integral of f |cos theta|, and its direction (3,) in world space.
+def bsdf_sample(scene: Scene, here: Vertex, u: Float[Array, " numbers"]) -> tuple[BSDFSample, Float[Array, "3"]]:
+    """A sample, whose weight estimates the integral of f |cos theta|, and its direction in world space.
 
     u: of `Bounce.bsdf`.
     """

@@ -2,53 +2,65 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
+from jaxtyping import Array, Float, Int, Integer, UInt
 
 from pathjax.compile import compute_once, persistent_loop
 from pathjax.core import sampler
+from pathjax.core.types import Ray
+from pathjax.emitters import Choice
 from pathjax.integrators import path
-from pathjax.integrators.options import Options
+from pathjax.integrators.options import Counts, Options
 from pathjax.integrators.random_numbers import bounce_numbers, camera_numbers
+from pathjax.scene.scene import Scene
 from pathjax.sensors import film
 
+# The pixel, and its `numbers`.
+Work = tuple[Int[Array, ""], sampler.Word, sampler.Word, sampler.Word]
 
-def numbers(pixels, first_sample, spp, seed):
-    """What to sample of each pixel: (N,) uint32 each, of numbers or arrays (N,)."""
+
+def numbers(
+    pixels: Integer[Array | np.ndarray, " N"], first_sample: Counts, spp: Counts, seed: Counts
+) -> tuple[UInt[Array, " N"], ...]:
+    """What to sample of each pixel, of what is one number or one of each."""
     return tuple(jnp.broadcast_to(jnp.asarray(x, jnp.uint32), pixels.shape) for x in (first_sample, spp, seed))
 
 
-def camera_ray(scene, pixel, stream, number, points="lattice"):
-    """Ray of one sample at the camera, and the sample's weight ().
+def camera_ray(
+    scene: Scene, pixel: Int[Array, ""], stream: sampler.Word, number: sampler.Word, points: str = "lattice"
+) -> tuple[Ray, Float[Array, ""]]:
+    """Ray of one sample at the camera, and the sample's weight.
 
-    Args:
-        pixel: () int32; stream: () uint32, its `sampler.pixel_stream`; number: () uint32; points: of
-            `options.SAMPLERS`.
+    stream: the pixel's `sampler.pixel_stream`; points: of `options.SAMPLERS`.
     """
     u_film, u_lens = compute_once(camera_numbers(scene, stream, number, points))
     position, weight = film.sample_position(scene.film, pixel, u_film)
     return compute_once((scene.camera.sample_ray(position, u_lens), weight))
 
 
-def camera_path(scene, pixel, stream, number, options: Options):
-    """Path of one sample at the camera, and the sample's weight (); arguments as for `camera_ray`."""
+def camera_path(
+    scene: Scene, pixel: Int[Array, ""], stream: sampler.Word, number: sampler.Word, options: Options
+) -> tuple[path.Path, Float[Array, ""]]:
+    """Path of one sample at the camera, and the sample's weight; arguments as for `camera_ray`."""
     ray, weight = camera_ray(scene, pixel, stream, number, options.sampler)
     return path.start(scene, ray, options), weight
 
 
-def no_path(scene, options: Options):
+def no_path(scene: Scene, options: Options) -> tuple[path.Path, Float[Array, ""]]:
     """What stands where a `camera_path` is to be put."""
     nothing = jax.eval_shape(lambda x: camera_path(scene, jnp.int32(0), x, x, options), jnp.uint32(0))
     return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), nothing)
 
 
-def mean(work, scene, choice, control=None, *, options: Options):
-    """(3,) mean of a pixel's samples; 0 of none.
+def mean(work: Work, scene: Scene, choice: Choice | None, control=None, *, options: Options) -> Float[Array, "3"]:
+    """Mean of a pixel's samples; 0 of none.
 
-    Args:
-        work: the pixel () int32, and its `numbers`.
-        choice, control: of `path.extend`.
+    choice, control: of `path.extend`.
     """
 
     def add(sums, depth, now, weight):
@@ -61,12 +73,11 @@ def mean(work, scene, choice, control=None, *, options: Options):
     return total / jnp.maximum(spp, 1).astype(total.dtype)
 
 
-def over_vertices(work, scene, choice, add, sums, options: Options, control=None):
+def over_vertices(work: Work, scene: Scene, choice: Choice | None, add: Callable, sums, options: Options, control=None):
     """Sums over all vertices of a pixel's samples: one loop, so that no lane waits for the longest path of another.
 
     Args:
-        work: the pixel () int32, and its `numbers`.
-        add: (sums, depth () int32 of the path before the vertex, Path after it, weight () of the sample) -> sums.
+        add: (sums, depth of the path before the vertex, Path after it, weight of the sample) -> sums.
         choice, control: of `path.extend`.
     """
     pixel, first_sample, spp, seed = work
@@ -85,7 +96,15 @@ def over_vertices(work, scene, choice, add, sums, options: Options, control=None
     return persistent_loop(lambda state: state[0] != first_sample + spp, step, state)[-1]
 
 
-def begun(scene, pixel, stream, number, now, weight, options: Options):
+def begun(
+    scene: Scene,
+    pixel: Int[Array, ""],
+    stream: sampler.Word,
+    number: sampler.Word,
+    now: path.Path,
+    weight: Float[Array, ""],
+    options: Options,
+) -> tuple[path.Path, Float[Array, ""]]:
     """Path and weight of a sample; where the path has ended, those of `camera_path` for the sample `number`."""
 
     def begin():

@@ -7,11 +7,12 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
 
 from pathjax import bsdfs
 from pathjax.core import sampler
+from pathjax.scene.scene import Scene
 
 # Hashed numbers of lobes begin here: the others are two for each depth, and depths end at `scene.UNBOUNDED`, 2^30.
 _LOBES = 1 << 31
@@ -20,24 +21,23 @@ _LOBES = 1 << 31
 class Bounce(NamedTuple):
     """Random numbers of one vertex, uniform in [0, 1)."""
 
-    light: jax.Array  # (2,)
-    bsdf: jax.Array  # (2,) or (3,), `bsdf_dimensions`
-    triangle: jax.Array  # () chooses within a mesh that emits
-    roulette: jax.Array  # ()
+    light: Float[Array, "2"]
+    bsdf: Float[Array, " numbers"]  # 2 or 3, `bsdf_dimensions`
+    triangle: Float[Array, ""]  # chooses within a mesh that emits
+    roulette: Float[Array, ""]
 
 
-def camera_numbers(scene, stream, sample, points="lattice"):
-    """Film (2,) and lens (2,).
-
-    Args:
-        stream: () uint32 of `sampler.pixel_stream`; sample: () uint32 number of the sample; points: of
-            `options.SAMPLERS`.
-    """
+def camera_numbers(
+    scene: Scene, stream: sampler.Word, sample: sampler.Word, points: str = "lattice"
+) -> tuple[Float[Array, "2"], Float[Array, "2"]]:
+    """Film and lens, of a `sampler.pixel_stream` and the number of a sample. points: of `options.SAMPLERS`."""
     u = sampler.POINTS[points](stream, sample, 0).astype(scene.camera.origin.dtype)
     return u[:2], u[2:]
 
 
-def bounce_numbers(scene, stream, sample, depth, points="lattice") -> Bounce:
+def bounce_numbers(
+    scene: Scene, stream: sampler.Word, sample: sampler.Word, depth: Int[Array, ""], points: str = "lattice"
+) -> Bounce:
     """Random numbers of the vertex number depth."""
     dtype = scene.camera.origin.dtype
     u = sampler.POINTS[points](stream, sample, depth + 1).astype(dtype)

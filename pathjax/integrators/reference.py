@@ -13,30 +13,34 @@ numbers a sample of `path` is the same to rounding.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jaxtyping import Array, Float
 
 from pathjax import bsdfs, emitters
 from pathjax.compile import native_map
 from pathjax.core import sampler
 from pathjax.core.math import spawn_ray, to_local, to_world
-from pathjax.core.types import Ray
+from pathjax.core.types import Number, Ray
+from pathjax.emitters import Choice
 from pathjax.integrators.pixel import camera_ray
 from pathjax.integrators.random_numbers import bounce_numbers
 from pathjax.integrators.vertex import vertex
+from pathjax.scene.scene import Scene
 from pathjax.sensors import film
 from pathjax.shapes import geometry
 
 
-def radiance(scene, choice, ray: Ray, numbers):
-    """One estimate (3,) of the radiance that arrives along a ray, unbiased up to the scene's max_depth.
+def radiance(scene: Scene, choice: Choice | None, ray: Ray, numbers: Callable) -> Float[Array, "3"]:
+    """One estimate of the radiance that arrives along a ray, unbiased up to the scene's max_depth.
 
     Args:
         choice: how lights are chosen, of `emitters.choice`.
-        numbers: depth () int32 -> Bounce.
+        numbers: depth -> Bounce.
     """
     shapes, materials = scene.geometry, scene.materials
 
@@ -81,14 +85,14 @@ def radiance(scene, choice, ray: Ray, numbers):
     return lax.while_loop(lambda state: state[-1], bounce, state)[1]
 
 
-def share(pdf, other_pdf):
+def share(pdf: Float[Array, ""], other_pdf: Float[Array, ""]) -> Float[Array, ""]:
     """Power heuristic for what was drawn with density `pdf` and might have been with `other_pdf`; inf: Dirac's."""
     return jnp.where(jnp.isinf(pdf), 1, 1 / (1 + (other_pdf / pdf) ** 2))
 
 
 @partial(jax.jit, static_argnames="spp")
-def samples(scene, spp: int, seed):
-    """(spp, H, W, 3) samples of an image of a scene without names; their mean is that of `pathjax.render`."""
+def samples(scene: Scene, spp: int, seed: Number) -> Float[Array, "{spp} height width 3"]:
+    """Samples of an image of a scene without names; their mean is that of `pathjax.render`."""
     pixels = jnp.arange(film.pixel_count(scene.film), dtype=jnp.int32)
     choice = emitters.choice(scene.emitters, "mis")
 

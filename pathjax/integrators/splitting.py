@@ -10,10 +10,12 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jaxtyping import Array, Bool, Float
 
 from pathjax import bsdfs
 from pathjax.core.math import at, spawn_ray, to_world
 from pathjax.integrators.vertex import Vertex
+from pathjax.scene.scene import Scene
 
 
 def start(path, depth: int):
@@ -23,12 +25,12 @@ def start(path, depth: int):
     return path._replace(pending=nothing)
 
 
-def takes_place(scene, here: Vertex, path):
-    """() bool: whether both branches are followed at a vertex."""
+def takes_place(scene: Scene, here: Vertex, path) -> Bool[Array, ""]:
+    """Whether both branches are followed at a vertex."""
     return bsdfs.has(scene.materials, here.kind, "branches") & (path.splits > 0)
 
 
-def split(scene, here: Vertex, u, splits, path, on):
+def split(scene: Scene, here: Vertex, u: Float[Array, " numbers"], splits: Bool[Array, ""], path, on):
     """The path behind a vertex, `on`, which has taken one branch there; where it `splits`, the other one waits.
 
     Args:

@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 from pathjax.compile import compute_once
+from pathjax.emitters import Choice
 from pathjax.integrators.options import Options
-from pathjax.integrators.pixel import over_vertices
+from pathjax.integrators.pixel import Work, over_vertices
+from pathjax.scene.scene import Scene
 
 
-def sums(work, scene, choice, depth, options: Options):
-    """(depth, 3) sums over a pixel's samples, the paths of `pixel.mean`: row k is T^k Le.
+def sums(work: Work, scene: Scene, choice: Choice | None, depth: int, options: Options) -> Float[Array, "{depth} 3"]:
+    """Sums over a pixel's samples, the paths of `pixel.mean`: row k is T^k Le.
 
-    Args:
-        work: the pixel () int32, and its `pixel.numbers`. Sums are plain, so for some thousand samples at most.
-        depth: number of terms, max_depth of the scene.
-        options: by vertex.
+    The sums are plain, so for some thousand samples at most. depth: max_depth of the scene; options: by vertex.
     """
     rows = jnp.arange(depth)[:, None]
 

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
 
 from pathjax import bsdfs
 from pathjax.core.math import shading_frame, to_local
 from pathjax.core.types import Frame, Hit, Ray, Surface
+from pathjax.scene.scene import Scene
 from pathjax.shapes import geometry
 
 
@@ -17,12 +18,12 @@ class Vertex(NamedTuple):
     hit: Hit
     surface: Surface
     frame: Frame  # around the shading normal; of reflectors, turned towards the ray
-    wi: jax.Array  # (3,) unit, in the frame, where the ray came from
-    kind: jax.Array  # () int32 of the bsdf; -1: none, which absorbs
-    row: jax.Array  # () int32
+    wi: Float[Array, "3"]  # unit, in the frame, where the ray came from
+    kind: Int[Array, ""]  # of the bsdf; -1: none, which absorbs
+    row: Int[Array, ""]
 
 
-def vertex(scene, ray: Ray, hit: Hit) -> Vertex:
+def vertex(scene: Scene, ray: Ray, hit: Hit) -> Vertex:
     """What a ray meets at its hit; of a miss, some surface. The scene holds a shape.
 
     Reflectors see either side as their front, so their frame is turned towards the ray; glass tells its sides apart.

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import jax
+from jaxtyping import Array, Int
 
 from pathjax.bsdfs import Materials
 from pathjax.emitters import Lights
@@ -27,10 +28,10 @@ class Scene:
     geometry: Geometry
     materials: Materials
     emitters: tuple[Lights, ...]  # one for each kind present
-    max_depth: jax.Array  # () int32 vertices of the longest path; 1: emission only
-    rr_depth: jax.Array  # () int32 vertices before roulette begins
+    max_depth: Int[Array, ""]  # vertices of the longest path; 1: emission only
+    rr_depth: Int[Array, ""]  # vertices before roulette begins
     hide_emitters: bool = field(metadata={"static": True})  # from the camera
     about: About | None = field(metadata={"static": True})  # None: within kernels
     # Parameters that `with_parameters` set to traced values, by name. They carry the derivative, and tables hold the
     # same numbers detached: so a derivative that comes by a table is one that was asked for by other means.
-    varied: dict[str, jax.Array] = field(default_factory=dict)
+    varied: dict[str, Array] = field(default_factory=dict)
