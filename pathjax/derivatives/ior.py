@@ -2,27 +2,30 @@
 
 from __future__ import annotations
 
+from jaxtyping import Array, Float
+
 from pathjax.bsdfs import dielectric
+from pathjax.kinds import Table
 from pathjax.kinds.parameter import Parameter
 from pathjax.scene import parameters as named
 from pathjax.scene.scene import Scene
 
 
-def table(scene: Scene):
+def table(scene: Scene) -> Table:
     """The table of dielectrics, of a scene that has some."""
     return scene.materials.tables[dielectric.place(scene.materials)]
 
 
-def with_table(scene: Scene, table) -> Scene:
+def with_table(scene: Scene, table: Table) -> Scene:
     return named.put(scene, ("materials", "tables", dielectric.place(scene.materials)), table)
 
 
-def ratio_by(scene: Scene, parameter: Parameter):
-    """Derivative () of the relative IOR int_ior / ext_ior in one of the two."""
+def ratio_by(scene: Scene, parameter: Parameter) -> Float[Array, ""]:
+    """Derivative of the relative IOR int_ior / ext_ior in one of the two."""
     return dielectric.relative_ior_by(table(scene), parameter.index[0], parameter.field)
 
 
-def at_ratio(scene: Scene, name: str, ratio):
-    """Value () of the parameter `name`, an IOR, at which int_ior / ext_ior of its glass is `ratio`."""
+def at_ratio(scene: Scene, name: str, ratio: float) -> Float[Array, ""]:
+    """Value of the parameter `name`, an IOR, at which int_ior / ext_ior of its glass is `ratio`."""
     parameter = named.find(scene, name)
     return dielectric.ior_at(table(scene), parameter.index[0], parameter.field, ratio)

@@ -13,15 +13,18 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 from jax import lax
+from jaxtyping import Array, Float
 
 from pathjax.bsdfs import dielectric
 from pathjax.compile import compute_once, persistent_loop
 from pathjax.core import sampler
 from pathjax.core.math import at
 from pathjax.derivatives import ior
+from pathjax.emitters import Choice
 from pathjax.integrators import path, pixel
 from pathjax.integrators.options import Options
 from pathjax.integrators.random_numbers import bounce_numbers
+from pathjax.scene.scene import Scene
 
 # One path in so many is also traced at twice the step, to estimate the bias.
 RICHARDSON_EVERY = 16
@@ -29,16 +32,22 @@ RICHARDSON_EVERY = 16
 MOST_GLASS = 7
 
 
-def mean_and_differences(work, scene, choice, steps, rows: tuple[int, ...], options: Options):
-    """Mean of a pixel (3,), and of its central differences in the IOR of some dielectrics (G, 3), with biases (G, 3).
+def mean_and_differences(
+    work: pixel.Work,
+    scene: Scene,
+    choice: Choice | None,
+    steps: Float[Array, " G"],
+    rows: tuple[int, ...],
+    options: Options,
+) -> tuple[Float[Array, "3"], tuple[Float[Array, "G 3"], Float[Array, "G 3"]]]:
+    """Mean of a pixel, and of its central differences in the IOR of G dielectrics, with their biases.
 
     A sample is a path at the IORs of the scene, then four for each of the dielectrics that it met: at + h, - h, and now
     and then at + 2 h, - 2 h. A path that never met a glass is the same at every IOR of it.
 
     Args:
-        work: the pixel () int32, and its `pixel.numbers`.
-        steps: (G,) h, in relative IOR.
-        rows: of the dielectrics, G, at most MOST_GLASS.
+        steps: h, in relative IOR.
+        rows: of the dielectrics, at most MOST_GLASS.
         options: that watch what moves.
     """
     pixel_number, first_sample, spp, seed = work

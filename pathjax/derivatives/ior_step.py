@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jaxtyping import Array, Float, Int
 
 from pathjax import bsdfs
 from pathjax.bsdfs import dielectric
@@ -15,6 +16,7 @@ from pathjax.derivatives import ior
 from pathjax.integrators import path
 from pathjax.integrators.random_numbers import bsdf_dimensions
 from pathjax.integrators.vertex import vertex
+from pathjax.scene.scene import Scene
 from pathjax.sensors import film
 from pathjax.shapes import geometry
 
@@ -26,8 +28,8 @@ MIN_STEP, MAX_STEP = 2e-4, 0.03
 _PILOTS, _PILOT_DEPTH = 1024, 12
 
 
-def steps(scene, rows, step):
-    """(G,) steps of the relative IOR of some dielectrics; `step`, if that is not None."""
+def steps(scene: Scene, rows: tuple[int, ...], step: float | Float[Array, ""] | None) -> Float[Array, " G"]:
+    """Steps of the relative IOR of some dielectrics; `step`, if that is not None."""
     dtype = scene.camera.origin.dtype
     if not rows:
         return jnp.zeros((0,), dtype)
@@ -44,8 +46,8 @@ def steps(scene, rows, step):
 
 
 @jax.jit
-def motions(scene, rows):
-    """(G,) median number of pixels by which what is seen through glass moves per unit of relative IOR; 0: not seen."""
+def motions(scene: Scene, rows: Int[Array, " G"]) -> Float[Array, " G"]:
+    """Median number of pixels by which what is seen through glass moves per unit of relative IOR; 0: not seen."""
     count = film.pixel_count(scene.film)
     pilots = jnp.asarray(np.unique(np.linspace(0, count - 1, min(_PILOTS, count)).astype(np.int32)))
     return jax.vmap(lambda row: _median(native_map(_motion, pilots, scene, row)))(rows)

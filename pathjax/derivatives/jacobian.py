@@ -14,7 +14,7 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from pathjax import emitters
 from pathjax.bsdfs import dielectric
@@ -23,12 +23,13 @@ from pathjax.core.types import Number
 from pathjax.derivatives import ior, ior_difference, ior_step, rules, tangents
 from pathjax.errors import InputError
 from pathjax.integrators import pixel
-from pathjax.integrators.options import Options
+from pathjax.integrators.options import Counts, Options
 from pathjax.kinds.parameter import Parameter
 from pathjax.scene import parameters as named
 from pathjax.scene.scene import Scene
 from pathjax.sensors import film
 
+Slopes = dict[str, Float[Array, "..."]]
 METHODS = ("difference", "attached")
 
 
@@ -116,21 +117,21 @@ def jacobian(
 def pixel_jacobians(
     scene: Scene,
     wanted: dict[str, Parameter],
-    pixels,
-    first_sample,
-    spp,
-    seed,
+    pixels: Int[Array, " N"],
+    first_sample: Counts,
+    spp: Counts,
+    seed: Counts,
     options: Options,
     *,
     method: str = "difference",
-    step=None,
+    step: float | Float[Array, ""] | None = None,
     **how,
-):
-    """Means (N, 3), and by name: derivatives (N, 3, *shape), biases (N, 3), steps ().
+) -> tuple[Float[Array, "N 3"], Slopes, Slopes, Slopes]:
+    """Means, and by name: derivatives (N, 3, *shape), biases (N, 3), steps ().
 
     Args:
         scene: without names.
-        first_sample, spp, seed: each one number, or (N,) of the pixels.
+        first_sample, spp, seed: each one number, or one of each pixel.
         how: `form` and `devices` of `native_map`.
     """
     attached = method == "attached"
@@ -166,7 +167,7 @@ def pixel_jacobians(
     return image, derivatives, biases, used
 
 
-def choosing_by_present_iors(scene: Scene, rows) -> Scene:
+def choosing_by_present_iors(scene: Scene, rows: tuple[int, ...]) -> Scene:
     """The scene whose dielectrics of some rows choose their branches by the IOR that they have now, detached."""
     table = ior.table(scene)
     ratio = lax.stop_gradient(dielectric.relative_ior(table))
@@ -185,11 +186,8 @@ def _jacobians(scene, pixels, first_sample, spp, seed, steps, *, wanted, options
     return native_map(one_pixel, work, *shared, form=form, devices=devices)
 
 
-def _pixel_jacobian(work, scene, choice, unit_tangents, steps, wanted: Wanted, options: Options):
-    """Means of a pixel: radiance (3,), tangents (T, 3), differences (G, 3) and their biases (G, 3).
-
-    work: the pixel () int32, and its `pixel.numbers`.
-    """
+def _pixel_jacobian(work: pixel.Work, scene, choice, unit_tangents, steps, wanted: Wanted, options: Options):
+    """Means of a pixel: radiance (3,), tangents (T, 3), differences (G, 3) and their biases (G, 3)."""
 
     def of(scene):
         if wanted.glass:

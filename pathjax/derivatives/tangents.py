@@ -5,26 +5,31 @@ Light does not change its channel on the way, so one tangent stands for the thre
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
+
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
+from pathjax.kinds.parameter import Parameter
 from pathjax.scene import parameters as named
+from pathjax.scene.scene import Scene
 
 # Of each colour the path to its table and its index there.
 Places = tuple[tuple[tuple, tuple], ...]
 
 
-def places(parameters) -> Places:
+def places(parameters: Iterable[Parameter]) -> Places:
     return tuple((parameter.path, parameter.index) for parameter in parameters)
 
 
-def by_channel(slope):
-    """Derivative (..., 3, 3) in a colour, from that of each channel in the same channel of the colour (..., 3)."""
+def by_channel(slope: Float[Array, "*shape 3"]) -> Float[Array, "*shape 3 3"]:
+    """Derivative in a colour, from that of each channel in the same channel of the colour."""
     return slope[..., None] * jnp.eye(3, dtype=slope.dtype)
 
 
-def unit_tangents(scene, colors: Places):
-    """A unit change of all channels of each colour: for every table (colors, *shape of the table)."""
+def unit_tangents(scene: Scene, colors: Places) -> list[Float[Array, "colors ..."]]:
+    """A unit change of all channels of each colour: for every table, of the shape of the table."""
     tangents = []
     for table_path in _tables(colors):
         table = named.get(scene, table_path)
@@ -36,8 +41,10 @@ def unit_tangents(scene, colors: Places):
     return tangents
 
 
-def by_tangent(of, scene, colors: Places, tangents):
-    """A value of the scene, its derivatives (T, *shape), and what comes with it: `of(scene)` is value and company.
+def by_tangent(
+    of: Callable, scene: Scene, colors: Places, tangents: list[Float[Array, "colors ..."]]
+) -> tuple[Float[Array, "*shape"], Float[Array, " colors *shape"], object]:
+    """A value of the scene, its derivatives, and what comes with it: `of(scene)` is value and company.
 
     tangents: `unit_tangents` of the colors.
     """
