@@ -261,7 +261,7 @@ OPTIONAL = {
     "dielectric.py": {"glass_and_mirror", "glass_in_glass"},
     "conductor.py": {"glass_and_mirror"},
     "fresnel.py": {"glass_and_mirror", "glass_in_glass"},
-    "texture.py": {"glass_and_mirror"},
+    "checkerboard.py": {"glass_and_mirror"},
     "sphere.py": {"glass_and_mirror", "glass_in_glass"},
     "triangle.py": {"mesh"},
     "traverse.py": {"mesh"},
