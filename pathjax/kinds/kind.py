@@ -84,7 +84,7 @@ class Kind:
         return Table(tuple(columns), cls, settings)
 
 
-def _column(declared: Declared, values: list, dtype, code: Callable) -> Column | None:
+def _column(declared: Declared, values: list, dtype, code: Callable | None) -> Column | None:
     """Of one parameter, by row: None where no row has it."""
     if isinstance(declared, Setting) or all(value is None for value in values):
         return None
