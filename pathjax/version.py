@@ -1,3 +1,3 @@
 """The version, of the package and of the states that a checkpoint may hold."""
 
-__version__ = "0.4.0"
+__version__ = "0.5.0"
