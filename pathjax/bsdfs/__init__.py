@@ -142,7 +142,7 @@ def sample(
     """Draw `wo` and its weight from the bsdf. u: 2 numbers, or 3 where a kind with `lobes` is present."""
 
     def of(table):
-        return lambda: table.kind.sample(Row(table, row, surface, materials.textures), wi, u)
+        return lambda: table.kind.sample(Row(table, row, surface, materials.textures), wi, _numbers(table, u))
 
     if len(materials.tables) == 1:
         return of(materials.tables[0])()
@@ -154,4 +154,9 @@ def sample_other(
 ) -> BSDFSample:
     """The branch that `sample` leaves out, of a kind that `branches`."""
     table = next(table for table in materials.tables if table.kind.branches)
-    return table.kind.sample(Row(table, row, surface, materials.textures), wi, u, other=True)
+    return table.kind.sample(Row(table, row, surface, materials.textures), wi, _numbers(table, u), other=True)
+
+
+def _numbers(table: Table, u: Float[Array, " numbers"]) -> Float[Array, " its_numbers"]:
+    """Those that a kind takes: 2, or 3 of one that has `lobes`."""
+    return u if table.kind.lobes or len(u) == 2 else u[:2]

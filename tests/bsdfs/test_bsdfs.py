@@ -397,6 +397,29 @@ def test_a_name_is_taken_once_but_a_cell_may_run_again(kinds):
         bsdfs.register("other")(dict)
 
 
+def test_each_kind_gets_as_many_numbers_as_it_takes(tmp_path, kinds):
+    taken = {}
+
+    class Lobed(Diffuse):
+        lobes = True
+
+        @staticmethod
+        def sample(p, wi, u):
+            taken["lobed"] = u.shape
+            return Diffuse.sample(p, wi, u[:2])
+
+    class Plain(Diffuse):
+        @staticmethod
+        def sample(p, wi, u):
+            taken["plain"] = u.shape
+            return Diffuse.sample(p, wi, u)
+
+    materials = bsdfs.build([Lobed.instance("a"), Plain.instance("b")], np.float32, (), Parameters())
+    one = jnp.int32(0)
+    bsdfs.sample(materials, one, one, SURFACE, jnp.array([0.6, 0, 0.8]), jnp.array([0.1, 0.2, 0.3]))
+    assert taken == {"lobed": (3,), "plain": (2,)}
+
+
 PACKAGE = Path(pj.__file__).parent
 ONE_MORE = """from pathjax.bsdfs.diffuse import Diffuse
 from pathjax.kinds import Color
