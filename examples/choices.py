@@ -23,6 +23,7 @@ from pathjax.bench import figures, plot
 from pathjax.bsdfs import FRESNEL
 from pathjax.integrators.options import SAMPLERS, STRATEGIES
 from pathjax.scene import UNBOUNDED, Scene, build
+from pathjax.sensors.filters import Tent
 from pathjax.shapes.accel.build import RULES
 
 SCENES = Path(__file__).resolve().parents[1] / "scenes"
@@ -48,7 +49,7 @@ def load(name, res, **more):
 
 def with_tent(scene):
     description = scene.about.description
-    film = replace(description.film, filter="tent", filter_radius=1.0)
+    film = replace(description.film, filter=Tent(1.0))
     return build(replace(description, film=film))
 
 

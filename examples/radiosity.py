@@ -14,8 +14,9 @@ from pathlib import Path
 import numpy as np
 
 import pathjax as pj
-from pathjax import description, scene, transport
+from pathjax import scene, transport
 from pathjax.images import picture, write_png
+from pathjax.shapes import Cube
 
 BLOCKS = 32  # across the image: means over blocks hide the pixels' noise and the patches' edges
 
@@ -23,7 +24,7 @@ BLOCKS = 32  # across the image: means over blocks hide the pixels' noise and th
 def empty_box(res):
     box = pj.load_scene(Path(__file__).parents[1] / "scenes" / "cornell_box.xml", res=res, max_depth=-1)
     full = box.about.description
-    walls = tuple(shape for shape in full.shapes if not isinstance(shape.geometry, description.Cube))
+    walls = tuple(shape for shape in full.shapes if not isinstance(shape.geometry, Cube))
     return scene.build(replace(full, shapes=walls))
 
 
