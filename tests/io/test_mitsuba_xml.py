@@ -428,7 +428,7 @@ def test_texels_lie_where_mitsuba_finds_them(read, mitsuba, picture, tmp_path, r
         f'<boolean name="raw" value="{raw}"/><transform name="to_uv">{to_uv}</transform></texture>'
     )
     bitmap = first_bsdf(read(with_bsdf("diffuse", inside))).values["reflectance"]
-    assert (bitmap.interpolation, bitmap.wrap) == ("nearest", "repeat")
+    assert bitmap.values["nearest"] and bitmap.values["wrap"] == "repeat"
     there = with_bsdf("diffuse", inside).replace("picture.png", str(tmp_path / "picture.png"))
     height, width, _ = bitmap.values["texels"].shape
     for uv in [(0.1, 0.1), (0.9, 0.1), (0.1, 0.9), (0.6, 0.7)]:
