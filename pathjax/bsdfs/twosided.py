@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import ClassVar
+
 from pathjax.bsdfs.bsdf import BSDF
-from pathjax.kinds import Instance
+from pathjax.kinds import Instance, Unused
 
 
 class TwoSided(BSDF):
     """Mitsuba's `twosided`: no bsdf of its own, but where others go."""
+
+    # What lets light pass cannot stand inside here.
+    unused: ClassVar[Mapping[str, Unused]] = {"allow_transmission": Unused("boolean")}
 
     @classmethod
     def read(cls, loader, fields, name):

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Mapping
 
 import numpy as np
 
 from pathjax.description.elements import Document, Element, nearest, require_attributes
 from pathjax.errors import InputError
+from pathjax.kinds import Unused
 
 VALUES = ("float", "integer", "boolean", "string", "rgb", "spectrum", "point", "vector", "transform")
 OBJECTS = ("integrator", "sensor", "sampler", "film", "rfilter", "shape", "bsdf", "texture", "emitter")
+# Objects that Mitsuba's participating media are made of.
+NOT_MODELLED = ("medium", "phase", "volume")
 
 # A uniform spectrum of 1 has CIE XYZ (1, 1, 1): this colour in linear sRGB. Mitsuba's RGB mode emits it for a spectrum
 # used as radiance; used as reflectance, the spectrum is lit by the white point and stays (1, 1, 1).
@@ -36,9 +40,11 @@ class Fields:
         self._objects: list[Element] = []
         self._taken: set[str] = set()
         for child in element.children:
+            target = document.resolve(child)
+            if target.tag in NOT_MODELLED:
+                raise child.error(f"{child}: participating media are not supported yet; take it out of {element}")
             if child.tag not in (*VALUES, *OBJECTS, "ref"):
                 raise child.error(f"{child} is not supported inside {element}; use one of: {', '.join(VALUES)}, ref")
-            target = document.resolve(child)
             if target is not child and target.tag not in OBJECTS:
                 raise child.error(f"{child} refers to {target}, which is not an object")
             if target.tag in OBJECTS and target.tag != "texture":
@@ -157,6 +163,26 @@ class Fields:
         if len(found) > limit:
             raise found[limit].error(f"{self.element} takes at most {limit} <{tag}>")
         return [self.document.resolve(child) for child in found]
+
+    def without_effect(self, parameters: Mapping[str, Unused]) -> list[str]:
+        """Check those of the parameters that the file gives. Returns a note for each."""
+        notes = []
+        for name, unused in parameters.items():
+            match unused.tag:
+                case "float":
+                    self.float(name, None, at_least=unused.at_least)
+                case "integer":
+                    self.integer(name, None, at_least=max(unused.at_least, 0), at_most=2**32 - 1)
+                case "boolean":
+                    self.boolean(name, None)
+                case "string":
+                    self.string(name, None, choices=unused.choices)
+                case "transform":
+                    self.transform(name)
+            if self.has(name):
+                place, why = self.where(name), unused.why and f": {unused.why}"
+                notes.append(f"{place.file}:{place.line}: {name} has no effect{why}")
+        return notes
 
     def finish(self) -> None:
         """Refuse what no call has asked for."""
@@ -297,6 +323,10 @@ def _unit(step: Element, vector: np.ndarray, complaint: str) -> np.ndarray:
 
 
 def _value(element: Element) -> str:
+    for key in ("type", "filename"):
+        if element.tag == "spectrum" and key in element.attributes:
+            kind = f'<spectrum {key}="{element.attributes[key][:60]}">'
+            raise element.error(f"{kind} is not supported yet; give linear RGB as <rgb>")
     require_attributes(element, required=("name", "value"))
     return element.attributes["value"]
 

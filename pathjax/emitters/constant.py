@@ -10,12 +10,13 @@ from jaxtyping import Array, Float
 from pathjax.core.math import luminance
 from pathjax.core.warp import SPHERE_PDF, square_to_sphere
 from pathjax.emitters.emitter import Background
-from pathjax.kinds import Color, Row
+from pathjax.kinds import Color, Row, Unused
 
 
 class Constant(Background):
     radiance = Color(1.0, bounds=(0, math.inf), textured=False, radiance=True)
     left_to_bsdfs = True
+    unused = Background.unused | {"to_world": Unused("transform")}
 
     @staticmethod
     def power(p) -> Float[Array, " R"]:

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Mapping
+from dataclasses import replace
 from typing import ClassVar
 
+import numpy as np
 from jaxtyping import Array, Float
 
-from pathjax.kinds import Kind, Row
+from pathjax.kinds import Kind, Row, Unused
 
 
 class Emitter(Kind):
@@ -18,6 +21,9 @@ class Emitter(Kind):
     written, so the derivative in a parameter that moves a light lacks the edges of shadows. The choice is detached.
     """
 
+    unused: ClassVar[Mapping[str, Unused]] = {
+        "sampling_weight": Unused("float", "how often a light is sampled changes noise alone", at_least=0)
+    }
     on_surfaces: ClassVar[bool] = False  # stands inside a shape
     distant: ClassVar[bool] = False  # infinitely far
     dirac: ClassVar[bool] = False  # shines from one direction at each point
@@ -71,6 +77,8 @@ class DiracEmitter(Emitter):
     """What shines from one direction at each point: no ray hits it, and no bsdf finds it."""
 
     dirac = True
+    # Mitsuba's image lacks such a light if it is never sampled.
+    unused = {"sampling_weight": replace(Emitter.unused["sampling_weight"], at_least=float(np.finfo(np.float32).tiny))}
 
     @staticmethod
     @abstractmethod

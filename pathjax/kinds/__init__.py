@@ -11,7 +11,7 @@ From the declaration follow what a scene file may say and what it leaves to defa
 the place of constants, and the parameters by name that can be set, differentiated and fitted.
 """
 
-from pathjax.kinds.declared import Color, Declared, Internal, Number, PerRow, Setting, Shared, Transform2
+from pathjax.kinds.declared import Color, Declared, Internal, Number, PerRow, Setting, Shared, Transform2, Unused
 from pathjax.kinds.kind import Instance, Kind, ordered, register
 from pathjax.kinds.parameter import Parameter, Parameters
 from pathjax.kinds.table import Column, Row, Table
@@ -32,6 +32,7 @@ __all__ = [
     "Shared",
     "Table",
     "Transform2",
+    "Unused",
     "ordered",
     "register",
 ]

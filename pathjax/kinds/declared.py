@@ -98,6 +98,16 @@ class Shared(Declared):
     shared = True
 
 
+@dataclass(frozen=True)
+class Unused:
+    """A parameter that Mitsuba's plugin takes, and on which no image depends here."""
+
+    tag: str  # "float", "integer", "boolean", "string" or "transform"
+    why: str = ""  # what the note adds
+    choices: tuple[str, ...] = ()  # of a string; none: any
+    at_least: float = -math.inf  # of a number; integers are never negative
+
+
 def _in_range(fields, name, texture, bounds):
     low, high = texture.kind.span(texture)
     if not bounds[0] <= low <= high <= bounds[1]:  # also where one is NaN

@@ -9,7 +9,7 @@ from typing import ClassVar
 import numpy as np
 
 from pathjax.errors import InputError
-from pathjax.kinds.declared import Declared, Setting
+from pathjax.kinds.declared import Declared, Setting, Unused
 from pathjax.kinds.parameter import Parameter, Parameters
 from pathjax.kinds.table import Column, Table
 
@@ -27,6 +27,7 @@ class Kind:
     """A class whose attributes of type `Declared` are the parameters of a kind."""
 
     declared: ClassVar[Mapping[str, Declared]] = {}
+    unused: ClassVar[Mapping[str, Unused]] = {}  # what files may say of it without effect
 
     def __init_subclass__(cls):
         own = {name: value for name, value in vars(cls).items() if isinstance(value, Declared)}

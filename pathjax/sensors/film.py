@@ -2,24 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from pathjax.description.fields import Fields
+from pathjax.kinds import Unused
 from pathjax.sensors import filters
 from pathjax.sensors.filters import Filter, Gaussian
 
 MAX_PIXELS = 10**9
-# Settings that concern Mitsuba's own files and blocks, with their choices; none: a boolean.
-WITHOUT_EFFECT = {
-    "file_format": ("openexr", "exr", "rgbe", "pfm"),
-    "component_format": ("float16", "float32", "uint32"),
-    "sample_border": (),
-    "compensate": (),
-}
+PIXEL_FORMATS = ("rgb", "rgba", "luminance", "luminance_alpha", "xyz", "xyza")
 
 
 @jax.tree_util.register_dataclass
@@ -40,6 +37,14 @@ class HDRFilm:
     crop: tuple[int, int, int, int] | None = None  # offset x, offset y, width, height; None: all of the film
     filter: Filter = Gaussian()
 
+    unused: ClassVar[Mapping[str, Unused]] = {
+        "file_format": Unused("string", choices=("openexr", "exr", "rgbe", "pfm")),
+        "component_format": Unused("string", choices=("float16", "float32", "uint32")),
+        "sample_border": Unused("boolean"),
+        "compensate": Unused("boolean"),
+        "banner": Unused("boolean"),
+    }
+
     @classmethod
     def read(cls, loader, fields: Fields) -> HDRFilm:
         width, height = fields.integer("width", cls.width, at_least=1), fields.integer("height", cls.height, at_least=1)
@@ -51,11 +56,11 @@ class HDRFilm:
         if x + crop_width > width or y + crop_height > height:
             window = f"({x}, {y}) + ({crop_width}, {crop_height})"
             raise fields.element.error(f"the crop window {window} reaches beyond the film, ({width}, {height})")
-        fields.string("pixel_format", "rgb", choices=("rgb",))
-        for name, choices in WITHOUT_EFFECT.items():
-            given = fields.string(name, None, choices=choices) if choices else fields.boolean(name, None)
-            if given is not None:
-                loader.notes.append(f"{fields.where(name).file}:{fields.where(name).line}: {name} has no effect")
+        pixel_format = fields.string("pixel_format", "rgb", choices=PIXEL_FORMATS)
+        if pixel_format not in ("rgb", "rgba"):
+            raise fields.error("pixel_format", f'cannot be "{pixel_format}", as images are linear RGB; use rgb')
+        if pixel_format == "rgba":
+            loader.note(fields.where("pixel_format"), "asks for alpha, which is not written; colours are the same")
         nested = fields.objects("rfilter")
         filter = loader.make(nested[0], filters.KINDS) if nested else cls.filter
         return cls(width, height, (x, y, crop_width, crop_height), filter)

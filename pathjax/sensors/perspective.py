@@ -15,6 +15,7 @@ from pathjax.compile import compute_once
 from pathjax.core.math import dot
 from pathjax.core.types import Ray
 from pathjax.description.fields import Fields
+from pathjax.kinds import Unused
 from pathjax.sensors.film import HDRFilm
 from pathjax.sensors.sensor import Camera, Sensor
 
@@ -63,6 +64,8 @@ class Perspective(Sensor):
     near_clip: float = 1e-2
     far_clip: float = 1e4
     principal_point_offset: tuple[float, float] = (0.0, 0.0)
+
+    unused = Sensor.unused | {"focus_distance": Unused("float", "a pinhole is sharp everywhere")}
 
     @classmethod
     def read(cls, loader, fields: Fields) -> Perspective:

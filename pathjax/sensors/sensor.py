@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import ClassVar
 
 from jaxtyping import Array, Float
 
 from pathjax.core.types import Ray
 from pathjax.description.fields import Fields
+from pathjax.kinds import Unused
 from pathjax.sensors.film import HDRFilm
 
 
@@ -31,6 +34,9 @@ class Camera(ABC):
 
 class Sensor(ABC):
     """What a scene file says of a sensor, NumPy and numbers."""
+
+    # Nothing moves while the shutter is open.
+    unused: ClassVar[Mapping[str, Unused]] = {"shutter_open": Unused("float"), "shutter_close": Unused("float")}
 
     @classmethod
     @abstractmethod

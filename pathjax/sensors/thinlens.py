@@ -14,6 +14,7 @@ from pathjax.core.warp import square_to_disk
 from pathjax.description.fields import Fields
 from pathjax.sensors.film import HDRFilm
 from pathjax.sensors.perspective import Perspective, PerspectiveCamera
+from pathjax.sensors.sensor import Sensor
 
 
 @jax.tree_util.register_dataclass
@@ -34,6 +35,8 @@ class ThinLensCamera(PerspectiveCamera):
 class ThinLens(Perspective):
     aperture_radius: float = 0.0
     focus_distance: float = 1.0
+
+    unused = Sensor.unused
 
     @staticmethod
     def read_lens(fields: Fields, far: float) -> dict[str, float]:

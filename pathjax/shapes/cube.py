@@ -14,6 +14,7 @@ import numpy as np
 
 from pathjax.compile import compute_once
 from pathjax.core.math import at, dot, larger, smaller
+from pathjax.kinds import Unused
 from pathjax.shapes.accel.leaves import numbers_of, pack, rows_of
 from pathjax.shapes.accel.traverse import Tree
 from pathjax.shapes.planar import Frames, PlanarShape
@@ -94,6 +95,7 @@ class CubeFaces(Frames):
 class Cube(PlanarShape):
     """[-1, 1]^3, normals outwards, carried by `to_world`."""
 
+    unused = PlanarShape.unused | {"face_normals": Unused("boolean")}  # Mitsuba makes a mesh of it
     table = Rectangles
     comes_last = True
     local = _CUBE

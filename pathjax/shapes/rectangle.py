@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pathjax.core.math import at, larger
+from pathjax.kinds import Unused
 from pathjax.shapes.planar import Planar, PlanarShape
 
 
@@ -54,4 +55,5 @@ class Rectangles(Planar):
 class Rectangle(PlanarShape):
     """[-1, 1]^2 in the xy plane, normal +z, carried by `to_world`."""
 
+    unused = PlanarShape.unused | {"face_normals": Unused("boolean")}  # Mitsuba makes a mesh of it
     table = Rectangles

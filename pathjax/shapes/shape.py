@@ -7,6 +7,7 @@ as rows of its own arrays, for everything that is asked of the one primitive tha
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import ClassVar, NamedTuple
 
@@ -19,6 +20,7 @@ from pathjax.compile import compute_once
 from pathjax.core.math import at, dot, safe_divide, safe_sqrt
 from pathjax.core.types import Hit, Ray, Surface
 from pathjax.description.fields import Fields
+from pathjax.kinds import Unused
 from pathjax.shapes.accel.build import Tree as BuiltTree
 from pathjax.shapes.accel.traverse import Tree
 from pathjax.shapes.coincident import Faces
@@ -30,6 +32,8 @@ class Shape(ABC):
     """What a scene file says of one shape, in world space; NumPy, float64."""
 
     table: ClassVar[type[Table]]  # that its primitives go into
+    # For derivatives at the edges of shapes that move, which are not taken here.
+    unused: ClassVar[Mapping[str, Unused]] = {"silhouette_sampling_weight": Unused("float", at_least=0)}
     comes_last: ClassVar[bool] = False  # in its table, after what other kinds put there
 
     @classmethod

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import ClassVar
+
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -9,7 +12,7 @@ from jaxtyping import Array, Float
 from pathjax.core.math import at
 from pathjax.core.types import Surface
 from pathjax.images import read_rgb
-from pathjax.kinds import Column, Instance, PerRow, Row, Shared, Table
+from pathjax.kinds import Column, Instance, PerRow, Row, Shared, Table, Unused
 from pathjax.textures.texture import Texture
 
 WRAPS = ("repeat", "mirror", "clamp")
@@ -24,6 +27,10 @@ class Bitmap(Texture):
     size = PerRow()  # (2,) int32 height, width
     nearest = PerRow()  # () bool, no interpolation
     wrap = PerRow()  # () int32 into WRAPS
+    unused: ClassVar[Mapping[str, Unused]] = {
+        "accel": Unused("boolean"),
+        "format": Unused("string", "texels have the precision of the scene", choices=("variant", "fp16", "auto")),
+    }
 
     @classmethod
     def read(cls, loader, fields, name):

@@ -18,7 +18,9 @@ SCENE = """<?xml version="1.0"?>
 <scene version="3.0.0">
   <default name="res" value="8"/>
   <default name="color" value="0.1, 0.2, 0.3"/>
-  <integrator type="path"><integer name="max_depth" value="4"/><integer name="rr_depth" value="5"/></integrator>
+  <integrator type="moment"><integer name="block_size" value="8"/>
+    <integrator type="path"><integer name="max_depth" value="4"/><integer name="rr_depth" value="5"/></integrator>
+  </integrator>
   <sensor type="thinlens">
     <float name="fov" value="40"/><string name="fov_axis" value="smaller"/>
     <float name="aperture_radius" value="0.1"/><float name="focus_distance" value="3"/>

@@ -7,17 +7,19 @@ Defaults are Mitsuba's. Parameters are named after ids; an object without one is
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from itertools import count
 from pathlib import Path
 
 from pathjax import bsdfs, emitters, sensors, textures
 from pathjax import description as d
 from pathjax.description.elements import Document, Element, nearest
-from pathjax.description.fields import Fields
+from pathjax.description.fields import NOT_MODELLED, VALUES, Fields
 from pathjax.io import mesh
+from pathjax.io.mitsuba import integrators, samplers
+from pathjax.io.mitsuba.plugins import PLUGINS
 from pathjax.io.mitsuba.xml_reader import read
-from pathjax.kinds import Instance
+from pathjax.kinds import Instance, Unused
 from pathjax.sensors import film
 from pathjax.shapes import KINDS as SHAPES
 from pathjax.shapes import Mesh
@@ -44,66 +46,98 @@ class _Loader:
         self.counts: defaultdict[str, Iterator[int]] = defaultdict(count)
         self.making: set[Element] = set()
         self.made: dict[Element, object] = {}  # an element that is referenced twice is one object
+        self.on_shapes: dict[Element, Element] = {}  # a light by reference, and the shape that it shines from
 
     def description(self, file: str) -> d.Description:
-        scene: dict[str, list[Element]] = {tag: [] for tag in TOP_LEVEL}
+        scene: dict[str, list[Element]] = {tag: [] for tag in (*TOP_LEVEL, *NOT_MODELLED)}
+        settings = []
         for element in self.document.root.children:
+            if element.tag in VALUES and element.attributes.get("name") in _Settings.unused:
+                settings.append(element)
+                continue
             if element.tag not in scene:
-                use = f"use one of {', '.join(scene)}{nearest(element.tag, scene)}"
+                use = f"use one of {', '.join(TOP_LEVEL)}{nearest(element.tag, TOP_LEVEL)}"
                 raise element.error(f"{element} is not supported directly in <scene>; {use}")
             scene[element.tag].append(element)
-        for tag in ("integrator", "sensor"):
-            for element in scene[tag][1:]:
-                first = f"{scene[tag][0].file}:{scene[tag][0].line}"
-                raise element.error(f"{element}: one <{tag}> is supported here; the first is at {first}")
+        if settings:
+            root = self.document.root
+            self.make(Element("scene", {"type": "scene"}, root.file, root.line, settings), {"scene": _Settings})
+        for element in scene["integrator"][1:]:
+            first = f"{scene['integrator'][0].file}:{scene['integrator'][0].line}"
+            raise element.error(f"{element}: one <integrator> is supported here; the first is at {first}")
         if not scene["sensor"]:
             raise self.document.root.error('the scene has no <sensor>; add <sensor type="perspective">')
+        for element in scene["sensor"][1:]:
+            self.note(element, f"is left out, as the first sensor is used, at line {scene['sensor'][0].line}")
 
-        camera, film, spp, sampler = self.make(scene["sensor"][0], SENSORS)
+        camera, film, spp, sampler = self.make(scene["sensor"][0], sensors.KINDS, read=_sensor)
         if scene["integrator"]:
-            integrator = self.make(scene["integrator"][0], INTEGRATORS)
+            integrator = self.make(scene["integrator"][0], integrators.KINDS)
         else:
             integrator = d.Integrator()
             self.notes.append('no <integrator> is given; <integrator type="path"> is used')
-        lights = tuple(self.emitter(element, element.id or self.unique("background")) for element in scene["emitter"])
+        lights = tuple(
+            self.emitter(element, element.id or self.unique("background"))
+            for element in scene["emitter"]
+            if not _on_surfaces(element)
+        )
         shapes = [
-            self.make(element, dict.fromkeys(SHAPES, _shape), element.id or self.numbered("shape"))
-            for element in scene["shape"]
+            self.make(element, SHAPES, element.id or self.numbered("shape"), read=_shape) for element in scene["shape"]
         ]
         shapes = tuple(shape for shape in shapes if shape is not None)
+        for element in scene["emitter"]:
+            if _on_surfaces(element) and element not in self.on_shapes:
+                self.note(element, "is used by nothing; put it, or a <ref> to it, inside the <shape> that shines")
+                self.emitter(element, element.id, inside=True)
         for element in scene["bsdf"] + scene["texture"]:
             if element not in self.made:
-                self.notes.append(f"{element.file}:{element.line}: {element} is used by nothing")
+                self.note(element, "is used by nothing")
                 self.shared(element, element.id or element.tag)
+        for tag in NOT_MODELLED:  # what refers to them is refused
+            for element in scene[tag]:
+                self.note(element, "is used by nothing")
         return d.Description(file, camera, film, integrator, spp, sampler, shapes, lights, tuple(self.notes))
 
-    def make(self, element: Element, table: dict, *context: object):
-        """What the handler for the element's type makes of it; its parameters must all have been asked for."""
+    def note(self, element: Element, text: str) -> None:
+        """What `info` should tell of an element."""
+        self.notes.append(f"{element.file}:{element.line}: {element} {text}")
+
+    def make(self, element: Element, kinds: Mapping[str, type], *context: object, read: Callable | None = None):
+        """What the kind of the element's type reads; the file may hold nothing else but what has no effect.
+
+        Args:
+            read: loader, fields, context -> what is made, in place of the kind's own.
+        """
         fields = Fields(self.document, element)
-        if fields.type not in table:
-            raise element.error(
-                f"{element} is not supported; use one of {', '.join(table)}{nearest(fields.type, table)}"
-            )
-        read = getattr(table[fields.type], "read", table[fields.type])
-        made = read(self, fields, *context)
+        if fields.type not in kinds:
+            use = f"use one of {', '.join(kinds)}"
+            if fields.type in PLUGINS.get(element.tag, ()):
+                raise element.error(f"{element} is not supported yet; {use}")
+            raise element.error(f"{element} is not supported; {use}{nearest(fields.type, kinds)}")
+        if element in self.making:
+            raise element.error(f"{element} cannot stand inside itself")
+        self.making.add(element)
+        kind = kinds[fields.type]
+        made = (read or kind.read)(self, fields, *context)
+        self.making.remove(element)
+        self.notes += fields.without_effect(kind.unused)
         fields.finish()
         return made
 
     def shared(self, element: Element, name: str) -> Instance:
         """A bsdf or texture; the same object each time. `name` is for one without an id."""
-        if element in self.making:
-            raise element.error(f"{element} cannot stand inside itself")
         if element not in self.made:
-            self.making.add(element)
             kinds = bsdfs.KINDS if element.tag == "bsdf" else textures.KINDS
             self.made[element] = self.make(element, kinds, element.id or name)
-            self.making.remove(element)
         return self.made[element]
 
     bsdf = shared
 
     def emitter(self, element: Element, name: str, inside: bool = False) -> Instance:
         """Of those that stand inside shapes, or outside."""
+        kind = emitters.KINDS.get(element.attributes.get("type", ""))
+        if kind is not None and inside and not kind.on_surfaces:
+            raise element.error(f"{element} shines from no surface; it stands directly in <scene>")
         kinds = {key: kind for key, kind in emitters.KINDS.items() if kind.on_surfaces == inside}
         return self.make(element, kinds, name)
 
@@ -140,8 +174,10 @@ def _shape(loader: _Loader, fields: Fields, name: str) -> d.Shape | None:
     flip_normals = fields.boolean("flip_normals", False) != geometry.mirrored
     emitter = None
     for element in fields.objects("emitter"):
-        if element not in fields.element.children:
-            raise element.error(f"{element} must stand inside its shape; it cannot be referred to")
+        other = loader.on_shapes.setdefault(element, fields.element)
+        if other is not fields.element:
+            first = f"{other.file}:{other.line}"
+            raise fields.element.error(f"{element} shines from {other} already, at {first}; give each its own")
         emitter = loader.emitter(element, element.id or name, inside=True)
     inherited = fields.element.id or None
     nested = fields.objects("bsdf")
@@ -152,51 +188,42 @@ def _shape(loader: _Loader, fields: Fields, name: str) -> d.Shape | None:
         grey = 0.5 if emitter is None else 0.0
         bsdf = bsdfs.Diffuse.instance(inherited or loader.numbered("bsdf"), reflectance=grey)
     if geometry.empty:
-        place, light = f"{fields.element.file}:{fields.element.line}", "" if emitter is None else ", and its light too"
-        loader.notes.append(f"{place}: {fields.element} is left out, as no triangle has an area{light}")
+        light = "" if emitter is None else ", and its light too"
+        loader.note(fields.element, f"is left out, as no triangle has an area{light}")
         return None
     return d.Shape(name, geometry, bsdf, emitter, flip_normals)
 
 
-# Integrators: (loader, fields) -> Integrator.
-
-
-def _path(loader: _Loader, fields: Fields) -> d.Integrator:
-    max_depth = fields.integer("max_depth", -1, at_least=-1)
-    if max_depth == 0:
-        raise fields.error("max_depth", "is 0, which renders black; use -1 (no limit), or 1 and more")
-    return d.Integrator(max_depth, fields.integer("rr_depth", 5, at_least=1), fields.boolean("hide_emitters", False))
-
-
-def _direct(loader: _Loader, fields: Fields) -> d.Integrator:
-    for samples in ("shading_samples", "emitter_samples", "bsdf_samples"):
-        fields.integer(samples, 1, at_least=1, at_most=1)
-    return d.Integrator(max_depth=2, hide_emitters=fields.boolean("hide_emitters", False))
-
-
-# Sensors: (loader, fields) -> camera, film, samples per pixel, sampler.
-
-
 def _sensor(loader: _Loader, fields: Fields) -> tuple[sensors.Sensor, film.HDRFilm, int, str]:
+    """Camera, film, samples per pixel, sampler."""
     camera = sensors.KINDS[fields.type].read(loader, fields)
-    films, samplers = fields.objects("film"), fields.objects("sampler")
+    films, drawn = fields.objects("film"), fields.objects("sampler")
     made = loader.make(films[0], film.KINDS) if films else film.HDRFilm()
-    spp = loader.make(samplers[0], SAMPLERS) if samplers else 4
-    return camera, made, spp, samplers[0].attributes["type"] if samplers else "independent"
+    spp = loader.make(drawn[0], samplers.KINDS) if drawn else samplers.DEFAULT_COUNT
+    return camera, made, spp, drawn[0].attributes["type"] if drawn else "independent"
 
 
-def _sampler(loader: _Loader, fields: Fields) -> int:
-    spp = fields.integer("sample_count", 4, at_least=1)
-    fields.integer("seed", 0, at_least=0, at_most=2**32 - 1)
-    if fields.type in ("stratified", "multijitter", "orthogonal"):
-        fields.boolean("jitter", True)
-    if fields.type == "orthogonal":
-        fields.integer("strength", 2, at_least=0)
-    loader.notes.append(f"{fields.element}: pathjax draws its samples from its own sequence; sample_count is kept")
-    return spp
+def _on_surfaces(element: Element) -> bool:
+    """Whether an emitter is of a kind that shines from a shape."""
+    kind = emitters.KINDS.get(element.attributes.get("type", ""))
+    return kind is not None and kind.on_surfaces
+
+
+class _Settings:
+    """What stands directly in <scene>: how Mitsuba searches for hits."""
+
+    unused = (
+        dict.fromkeys(("embree_use_robust_intersections", "allow_thread_reordering"), Unused("boolean"))
+        | dict.fromkeys(("kd_clip", "kd_retract_bad_splits"), Unused("boolean"))
+        | dict.fromkeys(("kd_traversal_cost", "kd_intersection_cost", "kd_empty_space_bonus"), Unused("float"))
+        | dict.fromkeys(
+            ("kd_max_depth", "kd_min_max_bins", "kd_stop_prims", "kd_exact_primitive_threshold"), Unused("integer")
+        )
+    )
+
+    @classmethod
+    def read(cls, loader: _Loader, fields: Fields) -> None:
+        pass
 
 
 TOP_LEVEL = ("integrator", "sensor", "emitter", "bsdf", "texture", "shape")
-INTEGRATORS = {"path": _path, "direct": _direct}
-SENSORS = dict.fromkeys(sensors.KINDS, _sensor)
-SAMPLERS = dict.fromkeys(("independent", "stratified", "multijitter", "orthogonal", "ldsampler"), _sampler)

@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from typing import ClassVar
 
 import jax
 import numpy as np
 from jaxtyping import Array, Float
 
 from pathjax.description.fields import Fields
+from pathjax.kinds import Unused
 
 
 class Filter(ABC):
     """A filter, a pytree: of numbers as a scene file has them, and once built of arrays."""
+
+    unused: ClassVar[Mapping[str, Unused]] = {}
 
     @classmethod
     @abstractmethod

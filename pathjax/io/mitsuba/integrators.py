@@ -1,0 +1,106 @@
+"""Integrators of scene files: what renders here is a path tracer, with the limits that one of them sets.
+
+A kind says with `read` what `Description.integrator` an element stands for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import ClassVar
+
+from pathjax import description as d
+from pathjax.description.fields import Fields
+from pathjax.kinds import Unused
+
+
+class Path:
+    default_depth = -1
+    unused: ClassVar[Mapping[str, Unused]] = {
+        "block_size": Unused("integer"),
+        "samples_per_pass": Unused("integer"),
+        "timeout": Unused("float", "`pathjax render --time` limits the seconds"),
+    }
+
+    @classmethod
+    def read(cls, loader, fields: Fields) -> d.Integrator:
+        max_depth = fields.integer("max_depth", cls.default_depth, at_least=-1)
+        if max_depth == 0:
+            raise fields.error("max_depth", "is 0, which renders black; use -1 (no limit), or 1 and more")
+        rr_depth = fields.integer("rr_depth", 5, at_least=1)
+        return d.Integrator(max_depth, rr_depth, fields.boolean("hide_emitters", False))
+
+
+class VolPath(Path):
+    """Without media, which are refused, Mitsuba's `volpath` estimates what `path` does."""
+
+    @classmethod
+    def read(cls, loader, fields):
+        loader.note(fields.element, "without media is the same as path, which is used")
+        return super().read(loader, fields)
+
+
+class VolPathMIS(VolPath):
+    unused = Path.unused | {"use_spectral_mis": Unused("boolean")}
+
+
+class PRB(Path):
+    """Mitsuba's differentiable path tracer; its default is another depth."""
+
+    default_depth = 6
+
+    @classmethod
+    def read(cls, loader, fields):
+        loader.note(fields.element, "is for derivatives; its image is that of path, which is used")
+        return super().read(loader, fields)
+
+
+class Direct:
+    unused = Path.unused | dict.fromkeys(
+        ("shading_samples", "emitter_samples", "bsdf_samples"),
+        Unused("integer", "one sample of each is taken; spp sets the noise", at_least=1),
+    )
+
+    @classmethod
+    def read(cls, loader, fields: Fields) -> d.Integrator:
+        return d.Integrator(max_depth=2, hide_emitters=fields.boolean("hide_emitters", False))
+
+
+class Wrapper:
+    """An integrator whose image is that of the one inside, with further channels beside it."""
+
+    unused = Path.unused | {"hide_emitters": Unused("boolean", "that of the integrator inside counts")}
+    left_out: ClassVar[str]
+
+    @classmethod
+    def read(cls, loader, fields: Fields) -> d.Integrator:
+        nested = fields.objects("integrator")
+        if not nested:
+            raise fields.element.error(f"{fields.element} needs an <integrator> inside")
+        loader.note(fields.element, f"is left out, and the integrator inside is used; {cls.left_out}")
+        return loader.make(nested[0], KINDS)
+
+
+class AOV(Wrapper):
+    unused = Wrapper.unused | {"aovs": Unused("string", "`pathjax render --aov` writes output variables")}
+    left_out = "output variables are those of render_aovs"
+
+
+class Moment(Wrapper):
+    left_out = "second moments are not written, `pathjax render --aov error` writes standard errors"
+
+
+class Stokes(Wrapper):
+    left_out = "light has no polarisation here, so Stokes vectors are not written"
+
+
+# By the name that scene files give them.
+KINDS = {
+    "path": Path,
+    "direct": Direct,
+    "volpath": VolPath,
+    "volpathmis": VolPathMIS,
+    "prb": PRB,
+    "aov": AOV,
+    "moment": Moment,
+    "stokes": Stokes,
+}

@@ -1,0 +1,23 @@
+"""The names of Mitsuba's plugins, so that one which is not modelled is told from a misspelt one."""
+
+from __future__ import annotations
+
+# By the tag of elements.
+PLUGINS = {
+    tag: frozenset(names.split())
+    for tag, names in {
+        "integrator": "aov depth direct direct_projective moment path prb prb_basic prb_projective prbvolpath ptracer "
+        "stokes volpath volpathmis",
+        "sensor": "batch circular distant irradiancemeter orthographic perspective radiancemeter thinlens",
+        "sampler": "independent ldsampler multijitter orthogonal stratified",
+        "film": "hdrfilm specfilm",
+        "rfilter": "box catmullrom gaussian lanczos mitchell tent",
+        "shape": "bsplinecurve cube cylinder disk ellipsoids ellipsoidsmesh instance linearcurve merge obj ply "
+        "rectangle sdfgrid serialized shapegroup sphere",
+        "bsdf": "blendbsdf bumpmap circular conductor dielectric diffuse hair mask measured measured_polarized "
+        "normalmap null plastic polarizer pplastic principled principledthin retarder roughconductor roughdielectric "
+        "roughplastic thindielectric twosided",
+        "texture": "bitmap checkerboard mesh_attribute uniform volume",
+        "emitter": "area constant directional directionalarea envmap point projector spot sunsky timed_sunsky",
+    }.items()
+}
