@@ -32,12 +32,13 @@ SCENE = """<?xml version="1.0"?>
   <texture type="bitmap" id="picture"><string name="filename" value="picture.png"/>
     <transform name="to_uv"><scale x="2" y="3"/></transform></texture>
   <bsdf type="twosided" id="wall"><bsdf type="diffuse"><ref name="reflectance" id="picture"/></bsdf></bsdf>
+  <alias id="metal" as="tin"/>
   <bsdf type="conductor" id="metal"><rgb name="eta" value="1"/><spectrum name="k" value="2"/></bsdf>
   <shape type="sphere" id="ball"><point name="center" x="0" y="1" z="2"/><float name="radius" value="0.5"/>
     <bsdf type="dielectric"><string name="int_ior" value="water"/></bsdf></shape>
   <shape type="rectangle"><ref id="wall"/><emitter type="area"><rgb name="radiance" value="$color"/></emitter></shape>
   <shape type="obj"><string name="filename" value="mesh.obj"/><boolean name="face_normals" value="false"/>
-    <transform name="to_world"><matrix value="1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1"/></transform><ref id="metal"/></shape>
+    <transform name="to_world"><matrix value="1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1"/></transform><ref id="tin"/></shape>
   <emitter type="constant"><rgb name="radiance" value="1"/></emitter>
   <include filename="part.xml"/>
 </scene>

@@ -173,11 +173,17 @@ def test_a_reference_may_come_before_its_object_and_shares_it(read):
         (shape('<ref name="radius" id="r"/><float id="r" name="q" value="1"/>'), 2, "which is not an object"),
         ('<include filename="nowhere.xml"/>', 2, 'no file "nowhere.xml"'),
         ('<path value="nowhere"/>', 2, 'no folder "nowhere"'),
-        ('<alias id="a" as="b"/>', 2, "<alias"),
+        ('<alias id="gray" as="b"/><bsdf type="diffuse" id="grey"/>', 2, 'no such id; did you mean "grey"?'),
+        ('<bsdf type="diffuse" id="a"/>\n<alias id="a" as="a"/>', 3, 'id "a" is taken already'),
     ],
 )
 def test_references_that_cannot_be_followed_are_refused(refused, body, line, words):
     assert words in refused(body, line)
+
+
+def test_an_alias_is_another_name_of_an_object(read):
+    scene = read('<bsdf type="diffuse" id="a"/><alias id="a" as="b"/><alias id="b" as="c"/>' + shape('<ref id="c"/>'))
+    assert first_bsdf(scene).name == "a"
 
 
 # --- names
@@ -812,6 +818,71 @@ def test_a_medium_that_nothing_uses_is_noted(read):
     assert any('<medium type="homogeneous"> is used by nothing' in note for note in scene.notes)
 
 
+# --- older files
+
+OLD = """<scene version="0.6.0">
+  <integrator type="path"><integer name="maxDepth" value="7"/><integer name="rrDepth" value="3"/></integrator>
+  <sensor type="perspective">
+    <float name="nearClip" value="0.5"/><float name="farClip" value="20"/>
+    <string name="fovAxis" value="smaller"/><float name="fov" value="30"/>
+    <transform name="toWorld"><lookAt origin="0, 1, 5" target="0, 0, 0" up="0, 1, 0"/></transform>
+    <sampler type="independent"><integer name="sampleCount" value="16"/></sampler>
+    <film type="hdrfilm"><integer name="width" value="40"/><boolean name="banner" value="false"/></film>
+  </sensor>
+  <bsdf type="dielectric" id="glass"><float name="intIOR" value="1.7"/><float name="extIOR" value="1.1"/></bsdf>
+  <bsdf type="diffuse" id="board">
+    <texture type="checkerboard" name="diffuseReflectance">
+      <float name="uscale" value="4"/><float name="vscale" value="2"/><float name="uoffset" value="0.25"/>
+    </texture>
+  </bsdf>
+  <shape type="sphere"><boolean name="flipNormals" value="true"/><ref id="glass"/></shape>
+  <shape type="rectangle"><transform name="toWorld"><translate x="1"/></transform><ref id="board"/></shape>
+</scene>
+"""
+
+
+@pytest.fixture
+def old(tmp_path):
+    path = tmp_path / "old.xml"
+    path.write_text(OLD)
+    return path
+
+
+def test_older_files_have_older_names(old):
+    scene = load(old)
+    assert scene.integrator == d.Integrator(max_depth=7, rr_depth=3) and scene.spp == 16
+    assert (scene.camera.near_clip, scene.camera.far_clip, scene.camera.fov_axis) == (0.5, 20, "smaller")
+    np.testing.assert_allclose(scene.camera.to_world[:3, 3], [0, 1, 5])
+    glass, board = (shape.bsdf.values for shape in scene.shapes)
+    assert (glass["int_ior"], glass["ext_ior"]) == (1.7, 1.1) and scene.shapes[0].flip_normals
+    np.testing.assert_array_equal(board["reflectance"].values["to_uv"], [[4, 0, 1], [0, 2, 0]])  # shifts, then scales
+    np.testing.assert_array_equal(scene.shapes[1].geometry.to_world[:3, 3], [1, 0, 0])
+
+
+def test_older_files_mean_what_they_mean_to_mitsuba(mitsuba, old):
+    old.write_text(OLD.replace("lookAt", "lookat"))  # Mitsuba 3.9 no longer renames this one
+    ours, theirs = load(old), mitsuba.load_file(str(old))
+    sensor = mitsuba.traverse(theirs.sensors()[0])
+    np.testing.assert_allclose(ours.camera.to_world, np.array(sensor["to_world"].matrix), atol=1e-6)
+    assert sensor["far_clip"] == ours.camera.far_clip
+    glass, board = (mitsuba.traverse(shape.bsdf()) for shape in theirs.shapes())
+    assert glass["eta"] == pytest.approx(1.7 / 1.1)
+    to_uv = np.array(board["reflectance.to_uv"].matrix)
+    np.testing.assert_allclose(ours.shapes[1].bsdf.values["reflectance"].values["to_uv"], to_uv[:2, :3], atol=1e-6)
+
+
+def test_names_of_older_files_are_no_names_of_newer_ones(old):
+    old.write_text(OLD.replace("0.6.0", "3.0.0"))
+    with pytest.raises(InputError, match=r'old\.xml:7: <integer name="sampleCount"> is not a parameter'):
+        load(old)
+
+
+def test_an_older_file_may_be_included_by_a_newer_one(read, tmp_path):
+    inside = '<scene version="0.5.0"><shape type="sphere"><boolean name="flipNormals" value="true"/></shape></scene>'
+    (tmp_path / "part.xml").write_text(inside)
+    assert read('<include filename="part.xml"/>').shapes[0].flip_normals
+
+
 # --- files that are no scenes
 
 
@@ -823,7 +894,8 @@ def test_a_medium_that_nothing_uses_is_noted(read):
         (b'<scene version="3.0.0">\n<shape>\n</scene>', ":3: not well-formed XML: mismatched tag"),
         (b'<!DOCTYPE scene [<!ENTITY a "aaaa">]>\n<scene version="3.0.0">&a;</scene>', ":1: a document type"),
         (b"<scene/>", 'lacks the attribute "version"'),
-        (b'<scene version="0.6.0"/>', 'version "0.6.0" is not supported'),
+        (b'<scene version="4.0.0"/>', 'version "4.0.0" is not supported'),
+        (b'<scene version="0.6"/>', 'version "0.6" is not supported'),
         (b'<scene version="3.0.0" name="x"/>', 'no attribute "name"'),
         (b'<shape type="sphere"/>', "the outermost element is"),
         (b"<a>" * 100_000, "nested more than"),

@@ -1,4 +1,4 @@
-"""Scene XML to a tree of elements that know their line: includes, `default`, `$name` and ids are settled here.
+"""Scene XML to a tree of elements that know their line: includes, `default`, `$name`, ids and aliases are settled here.
 
 What the elements mean is the business of `loader.py` and of each kind.
 """
@@ -14,6 +14,7 @@ import numpy as np
 
 from pathjax.description.elements import Document, Element, find_file, nearest, require_attributes
 from pathjax.errors import InputError
+from pathjax.io.mitsuba.upgrade import upgrade
 
 # Far above any real scene (meshes live in files of their own), and low enough that a hostile file fails at once.
 MAX_BYTES = 64 << 20
@@ -43,6 +44,13 @@ def read(path: str | Path, parameters: Mapping[str, object]) -> Document:
                 first = ids[element.id]
                 raise element.error(f'the id "{element.id}" is taken already, at {first.file}:{first.line}')
             ids[element.id] = element
+    for alias in reader.aliases:
+        name = alias.attributes["as"]
+        if alias.id not in ids:
+            raise alias.error(f"{alias}: there is no such id{nearest(alias.id, ids)}")
+        if name in ids:
+            raise alias.error(f'the id "{name}" is taken already, at {ids[name].file}:{ids[name].line}')
+        ids[name] = ids[alias.id]
     return Document(root, ids, tuple(reader.folders))
 
 
@@ -56,14 +64,17 @@ class _Reader:
         self.folders = [path.parent]
         self.elements = 0
         self.files = 1
+        self.aliases: list[Element] = []
 
     def expand(self, root: Element, chain: tuple[Path, ...]) -> Element:
         if root.tag != "scene":
             raise root.error(f'the outermost element is {root}; a scene file starts with <scene version="3.0.0">')
         require_attributes(root, required=("version",))
-        if not re.fullmatch(r"[23]\.\d+\.\d+", root.attributes["version"]):
-            version = root.attributes["version"]
+        version = root.attributes["version"]
+        if not re.fullmatch(r"[0-3]\.\d+\.\d+", version):
             raise root.error(f'scene version "{version}" is not supported; use Mitsuba 3\'s format, version="3.0.0"')
+        if version[0] in "01":
+            upgrade(root)
         children: list[Element] = []
         for element in root.children:
             self._substitute(element)
@@ -75,6 +86,9 @@ class _Reader:
                 case "path":
                     require_attributes(element, required=("value",))
                     self.folders.append(find_file(element.attributes["value"], self.folders, element, folder=True))
+                case "alias":
+                    require_attributes(element, required=("id", "as"))
+                    self.aliases.append(element)
                 case "include":
                     children += self._include(element, chain)
                 case _:
