@@ -9,7 +9,7 @@ from jax import lax
 
 from pathjax import emitters, testing
 from pathjax.core.warp import SPHERE_PDF
-from pathjax.emitters import Area, Constant
+from pathjax.emitters import Area, Constant, Directional, Point, Spot
 from pathjax.kinds import Color
 from pathjax.textures import Bitmap, Checkerboard
 
@@ -24,9 +24,21 @@ def test_textures_of_the_package_pass(kind, values):
     testing.check_texture(kind, **values)
 
 
-@pytest.mark.parametrize("kind", [Area, Constant])
-def test_emitters_of_the_package_pass(kind):
-    testing.check_emitter(kind)
+@pytest.mark.parametrize(
+    "kind, values",
+    [
+        (Area, {}),
+        (Constant, {}),
+        (Point, {}),
+        (Point, {"position": (0.3, -2, 1), "intensity": (1, 0, 2)}),
+        (Spot, {}),
+        (Spot, {"position": (0.3, -2, 1), "direction": (0, 0.6, -0.8), "cutoff_angle": 90, "beam_width": 90}),
+        (Directional, {}),
+        (Directional, {"direction": (0, 0.6, -0.8), "irradiance": 0}),
+    ],
+)
+def test_emitters_of_the_package_pass(kind, values):
+    testing.check_emitter(kind, **values)
 
 
 class Brighter(Checkerboard):

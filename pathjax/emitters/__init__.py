@@ -18,8 +18,11 @@ from pathjax.core.math import at, dot, larger
 from pathjax.core.types import EmitterSample, Hit, Ray, Surface
 from pathjax.emitters.area import Area
 from pathjax.emitters.constant import Constant
+from pathjax.emitters.directional import Directional
 from pathjax.emitters.emitter import Background, DiracEmitter, Emitter, SurfaceEmitter
+from pathjax.emitters.point import Point
 from pathjax.emitters.selection import Choice, Lights, choice, choose
+from pathjax.emitters.spot import Spot
 from pathjax.errors import InputError
 from pathjax.kinds import Instance, Parameters, ordered
 from pathjax.kinds import register as register_kind
@@ -32,15 +35,24 @@ __all__ = [
     "Choice",
     "Constant",
     "DiracEmitter",
+    "Directional",
     "Emitter",
     "Lights",
+    "Point",
+    "Spot",
     "SurfaceEmitter",
     "choice",
     "register",
 ]
 
 # By the name that scene files give them.
-KINDS: dict[str, type[Emitter]] = {"area": Area, "constant": Constant}
+KINDS: dict[str, type[Emitter]] = {
+    "area": Area,
+    "constant": Constant,
+    "point": Point,
+    "spot": Spot,
+    "directional": Directional,
+}
 
 
 def register(name: str):
@@ -87,6 +99,11 @@ def build(
 def name(lights: Lights) -> str:
     """What scene files call a kind."""
     return next(name for name, kind in KINDS.items() if kind is lights.kind)
+
+
+def usual_name(kind: str) -> str:
+    """Of a light outside of shapes that has no id; kind: as scene files call it."""
+    return "background" if issubclass(KINDS.get(kind, Emitter), Background) else kind
 
 
 def sampled(emitters: tuple[Lights, ...]) -> bool:

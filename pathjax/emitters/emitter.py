@@ -86,5 +86,6 @@ class DiracEmitter(Emitter):
         """What arrives at the point ref.
 
         Returns:
-            direction towards the light, distance, inf if it is distant, and irradiance of a surface that faces it.
+            direction towards the light; distance at which its shadow ray ends, inf if it is distant; and irradiance of
+            a surface that faces it.
         """

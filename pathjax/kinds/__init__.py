@@ -11,16 +11,30 @@ From the declaration follow what a scene file may say and what it leaves to defa
 the place of constants, and the parameters by name that can be set, differentiated and fitted.
 """
 
-from pathjax.kinds.declared import Color, Declared, Internal, Number, PerRow, Setting, Shared, Transform2, Unused
+from pathjax.kinds.declared import (
+    Angle,
+    Color,
+    Declared,
+    Direction,
+    Internal,
+    Number,
+    PerRow,
+    Position,
+    Setting,
+    Shared,
+    Transform2,
+    Unused,
+)
 from pathjax.kinds.kind import Instance, Kind, ordered, register
 from pathjax.kinds.parameter import Parameter, Parameters
 from pathjax.kinds.table import Column, Row, Table
 
 __all__ = [
-    "Setting",
+    "Angle",
     "Color",
     "Column",
     "Declared",
+    "Direction",
     "Instance",
     "Internal",
     "Kind",
@@ -28,7 +42,9 @@ __all__ = [
     "Parameter",
     "Parameters",
     "PerRow",
+    "Position",
     "Row",
+    "Setting",
     "Shared",
     "Table",
     "Transform2",

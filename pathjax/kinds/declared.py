@@ -77,6 +77,47 @@ class Transform2(Declared):
 
 
 @dataclass(frozen=True)
+class Position(Declared):
+    """A point in world space; in files a point, or the origin that `to_world` moves. No parameter of the scene."""
+
+    default: object = (0.0, 0.0, 0.0)
+    shape = (3,)
+
+    def read(self, loader, fields, name, owner):
+        given, to_world = _given_or_placed(fields, name)
+        return to_world[:3, 3] if given is None else given
+
+
+@dataclass(frozen=True)
+class Direction(Declared):
+    """A unit vector in world space; in files of any length, or the z axis that `to_world` turns. No parameter."""
+
+    default: object = (0.0, 0.0, 1.0)
+    shape = (3,)
+
+    def read(self, loader, fields, name, owner):
+        given, to_world = _given_or_placed(fields, name)
+        if given is not None and not given.any():
+            raise fields.error(name, "is the zero vector, which points nowhere")
+        return self.of(to_world[:3, 2] if given is None else given)
+
+    @staticmethod
+    def of(vector: np.ndarray) -> np.ndarray:
+        """The unit vector that points the same way; the square of no component overflows or underflows."""
+        vector = vector / np.abs(vector).max()
+        return vector / np.linalg.norm(vector)
+
+
+@dataclass(frozen=True)
+class Angle(Declared):
+    """Degrees; in files between the bounds, and neither of them. No parameter of the scene."""
+
+    def read(self, loader, fields, name, owner):
+        low, high = self.bounds
+        return fields.float(name, self.default, above=low, below=high)
+
+
+@dataclass(frozen=True)
 class Setting(Declared):
     """One of some words, the same for all rows: part of the program, not of its data."""
 
@@ -106,6 +147,14 @@ class Unused:
     why: str = ""  # what the note adds
     choices: tuple[str, ...] = ()  # of a string; none: any
     at_least: float = -math.inf  # of a number; integers are never negative
+
+
+def _given_or_placed(fields, name):
+    """A vector (3,), None where the file does not give it, and the matrix (4, 4) that stands in its place."""
+    given, to_world = fields.point(name, None), fields.transform("to_world")
+    if given is not None and fields.has("to_world"):
+        raise fields.error(name, "excludes to_world; give one or the other")
+    return given, to_world
 
 
 def _in_range(fields, name, texture, bounds):

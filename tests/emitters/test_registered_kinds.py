@@ -13,7 +13,7 @@ from pathjax.core.warp import SPHERE_PDF, square_to_sphere
 from pathjax.kinds import Color, Number
 
 
-class Point(emitters.DiracEmitter):
+class Bulb(emitters.DiracEmitter):
     """In the origin, moved along y."""
 
     intensity = Color(1.0, bounds=(0, math.inf), textured=False, radiance=True)  # W / sr
@@ -85,7 +85,7 @@ class Tinted(emitters.SurfaceEmitter):
 @pytest.fixture(autouse=True)
 def registered(monkeypatch):
     monkeypatch.setattr(emitters, "KINDS", dict(emitters.KINDS))
-    for name, kind in {"point": Point, "sun": Sun, "dome": Dome, "tinted": Tinted}.items():
+    for name, kind in {"bulb": Bulb, "sun": Sun, "dome": Dome, "tinted": Tinted}.items():
         emitters.register(name)(kind)
 
 
@@ -103,20 +103,20 @@ def color(name, value):
     return f'<rgb name="{name}" value="{value}"/>'
 
 
-POINT = emitter("point", color("intensity", "6, 3, 0") + '<float name="height" value="2"/>')
+BULB = emitter("bulb", color("intensity", "6, 3, 0") + '<float name="height" value="2"/>')
 SUN = emitter("sun", color("irradiance", "1, 2, 3"))
 DOME = emitter("dome", color("radiance", "0.3, 0.6, 0.9"))
 SKY = emitter("constant", color("radiance", "0.1, 0.2, 0.4"))
 # Of a floor of albedo rho its share rho / pi of the irradiance: I / h^2; E; L integral of cos^2 = 2 pi / 3; pi L.
 ANSWERS = {
-    POINT: 0.5 / np.pi * np.array([6, 3, 0]) / 4,
+    BULB: 0.5 / np.pi * np.array([6, 3, 0]) / 4,
     SUN: 0.5 / np.pi * np.array([1, 2, 3]),
     DOME: 0.5 / np.pi * np.array([0.3, 0.6, 0.9]) * 2 * np.pi / 3,
     SKY: 0.5 * np.array([0.1, 0.2, 0.4]),
 }
 
 
-@pytest.mark.parametrize("light", [POINT, SUN])
+@pytest.mark.parametrize("light", [BULB, SUN])
 @pytest.mark.parametrize("strategy", ["mis", "light"])
 def test_a_dirac_light_alone_leaves_no_noise(make_scene, light, strategy):
     image = pj.render(make_scene(FLOOR.format("") + light, **VIEW), 1, strategy=strategy)
@@ -126,8 +126,8 @@ def test_a_dirac_light_alone_leaves_no_noise(make_scene, light, strategy):
 @pytest.mark.parametrize("strategy", ["mis", "light"])
 def test_lights_of_all_kinds_add_up(make_scene, estimate, agree, strategy):
     """Two that no ray hits, and two backgrounds, of which one is sampled by one strategy alone."""
-    scene = make_scene(FLOOR.format('<scale value="9"/>') + SKY + POINT + DOME + SUN, **VIEW)
-    assert [emitters.name(lights) for lights in scene.emitters] == ["point", "constant", "sun", "dome"]
+    scene = make_scene(FLOOR.format('<scale value="9"/>') + SKY + BULB + DOME + SUN, **VIEW)
+    assert [emitters.name(lights) for lights in scene.emitters] == ["bulb", "constant", "sun", "dome"]
     agree(estimate(scene, 64, 16, strategy=strategy), sum(ANSWERS.values()), pixelwise=False)
 
 
@@ -141,12 +141,12 @@ def test_backgrounds_of_one_kind_add_up_and_are_parameters_each(make_scene):
 
 
 def test_the_parameters_of_a_registered_kind_are_differentiated(make_scene):
-    scene = make_scene(FLOOR.format("") + POINT, **VIEW)
-    assert {"point.intensity", "point.height"} <= set(pj.parameters(scene))
-    _, J = pj.jacobian(scene, ["point.intensity", "point.height"], 1)
-    np.testing.assert_allclose(J["point.intensity"][0, 0], np.eye(3) * 0.5 / np.pi / 4, rtol=1e-4)
+    scene = make_scene(FLOOR.format("") + BULB, **VIEW)
+    assert {"bulb.intensity", "bulb.height"} <= set(pj.parameters(scene))
+    _, J = pj.jacobian(scene, ["bulb.intensity", "bulb.height"], 1)
+    np.testing.assert_allclose(J["bulb.intensity"][0, 0], np.eye(3) * 0.5 / np.pi / 4, rtol=1e-4)
     # d/dh of I / h^2 is -2 / h of it.
-    np.testing.assert_allclose(J["point.height"][0, 0], -ANSWERS[POINT], rtol=1e-3)
+    np.testing.assert_allclose(J["bulb.height"][0, 0], -ANSWERS[BULB], rtol=1e-3)
 
 
 LAMP = '<shape type="rectangle"><transform name="to_world"><rotate x="1" angle="90"/>{}</transform>{}</shape>'
@@ -165,7 +165,7 @@ def test_two_kinds_of_lamp_are_sampled_and_hit_as_one_another(make_scene, estima
 
 def test_a_name_is_taken_once():
     with pytest.raises(pj.InputError, match="taken by Area"):
-        emitters.register("area")(Point)
+        emitters.register("area")(Bulb)
     with pytest.raises(pj.InputError, match="must be a class derived from emitters.Emitter"):
         emitters.register("other")(dict)
 

@@ -40,6 +40,10 @@ SCENE = """<?xml version="1.0"?>
   <shape type="obj"><string name="filename" value="mesh.obj"/><boolean name="face_normals" value="false"/>
     <transform name="to_world"><matrix value="1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1"/></transform><ref id="tin"/></shape>
   <emitter type="constant"><rgb name="radiance" value="1"/></emitter>
+  <emitter type="point"><point name="position" x="0" y="1" z="2"/><spectrum name="intensity" value="3"/></emitter>
+  <emitter type="spot"><float name="cutoff_angle" value="30"/><float name="beam_width" value="20"/>
+    <transform name="to_world"><lookat origin="0,0,4" target="0,0,0" up="0,1,0"/></transform></emitter>
+  <emitter type="directional"><vector name="direction" value="1, -2, 0"/></emitter>
   <include filename="part.xml"/>
 </scene>
 """

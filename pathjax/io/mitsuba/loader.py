@@ -77,7 +77,7 @@ class _Loader:
             integrator = d.Integrator()
             self.notes.append('no <integrator> is given; <integrator type="path"> is used')
         lights = tuple(
-            self.emitter(element, element.id or self.unique("background"))
+            self.emitter(element, element.id or self.unnamed(element))
             for element in scene["emitter"]
             if not _on_surfaces(element)
         )
@@ -140,6 +140,10 @@ class _Loader:
             raise element.error(f"{element} shines from no surface; it stands directly in <scene>")
         kinds = {key: kind for key, kind in emitters.KINDS.items() if kind.on_surfaces == inside}
         return self.make(element, kinds, name)
+
+    def unnamed(self, element: Element) -> str:
+        """Name of an emitter outside of shapes that has no id."""
+        return self.unique(emitters.usual_name(element.attributes.get("type", "")))
 
     def texture(self, fields: Fields, parameter: str, owner: str) -> Instance | None:
         """The texture that sets a parameter; None where it is something else. `owner` names one without an id."""

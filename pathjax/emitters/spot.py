@@ -1,0 +1,66 @@
+"""A light without size that shines into a cone."""
+
+from __future__ import annotations
+
+import math
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from pathjax.core.math import cross, dot, larger, safe_atan2, safe_divide, safe_sqrt
+from pathjax.emitters.point import Point
+from pathjax.kinds import Angle, Direction, Row
+
+
+class Spot(Point):
+    """Of `intensity` up to `beam_width` off the axis; from there it falls linearly in the angle, to 0 at
+    `cutoff_angle`.
+    """
+
+    cutoff_angle = Angle(20.0, bounds=(0, 180))
+    beam_width = Angle(None)  # by default 3/4 of the cutoff angle
+    direction = Direction()
+
+    @classmethod
+    def read(cls, loader, fields, name):
+        if fields.has("texture"):
+            raise fields.error("texture", "is not supported; without it the light is even within beam_width")
+        intensity = cls.intensity.read(loader, fields, "intensity", name)
+        cutoff = cls.cutoff_angle.read(loader, fields, "cutoff_angle", name)
+        beam = fields.float("beam_width", None, at_least=0)
+        if beam is not None and beam > cutoff:
+            raise fields.error("beam_width", f"must not exceed cutoff_angle, {cutoff:g}; is {beam:g}")
+        to_world = fields.transform("to_world")
+        axes = to_world[:3, :3] / np.linalg.norm(to_world[:3, 2])
+        if not np.allclose(axes.T @ axes, np.eye(3), atol=2e-3):
+            raise fields.error("to_world", "shears or scales unevenly, and its cone would not be round")
+        placed = {"position": to_world[:3, 3], "direction": Direction.of(to_world[:3, 2])}
+        return cls.instance(name, intensity=intensity, cutoff_angle=cutoff, beam_width=beam, **placed)
+
+    @classmethod
+    def instance(cls, name="", **values):
+        if values.get("beam_width") is None:
+            values["beam_width"] = values.get("cutoff_angle", cls.cutoff_angle.default) * 3 / 4
+        return super().instance(name, **values)
+
+    @staticmethod
+    def power(p) -> Float[Array, " R"]:
+        """Of a point light, times the root of the share of its light that is left: the mean square error of an image is
+        least where lights are chosen by the root of the mean square of what they add to it.
+        """
+        cutoff, beam = jnp.radians(p.cutoff_angle), jnp.radians(p.beam_width)
+        middle, half = (cutoff + beam) / 2, (cutoff - beam) / 2
+        # (1 - (sin c - sin b) / (c - b)) / 2. Written so, it would be 0 for narrow cones by rounding, and they would
+        # never be chosen.
+        share = jnp.sin(middle / 2) ** 2 + jnp.cos(middle) * (1 - jnp.sinc(half / math.pi)) / 2
+        return Point.power(p) * jnp.sqrt(share)
+
+    @staticmethod
+    def sample(p: Row, ref: Float[Array, "3"]) -> tuple[Float[Array, "3"], Float[Array, ""], Float[Array, "3"]]:
+        d, distance, irradiance = Point.sample(p, ref)
+        axis, cutoff, beam = p.direction, p.cutoff_angle, p.beam_width
+        across = cross(axis, d)
+        angle = safe_atan2(safe_sqrt(dot(across, across)), -dot(axis, d)) * (180 / math.pi)
+        falloff = jnp.where(angle < beam, 1, larger(safe_divide(cutoff - angle, cutoff - beam), 0))
+        return d, distance, irradiance * falloff

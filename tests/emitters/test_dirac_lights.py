@@ -1,0 +1,370 @@
+"""Lights without size, of which a point of a surface sees one direction: against closed forms and Mitsuba's own."""
+
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import pathjax as pj
+from pathjax import emitters, transport
+from pathjax.description.fields import UNIFORM_RADIANCE
+from pathjax.emitters import Directional, Point, Spot
+from pathjax.emitters.selection import AllRows
+from pathjax.kinds import Parameters, Row
+
+# ---- one light, one point of a floor --------------------------------------------------------------------------------
+
+ALBEDO = np.array([0.2, 0.5, 0.8])
+GREY = '<bsdf type="diffuse" id="grey"><rgb name="reflectance" value="0.2, 0.5, 0.8"/></bsdf>'
+# It looks at the origin alone, and sees light that is reflected once.
+VIEW = {"origin": "1, 2, 1.5", "fov": 1e-3, "res": 2, "depth": 2}
+# Samples lie within 3e-5 of the origin, and float32 adds 1e-6.
+NEAR = 2e-4
+
+
+def emitter(kind, inside="", name=None):
+    return f'<emitter type="{kind}" id="{name or kind}">{inside}</emitter>'
+
+
+def color(name, *value):
+    return f'<rgb name="{name}" value="{", ".join(map(str, value))}"/>'
+
+
+def vector(name, value):
+    return f'<vector name="{name}" value="{", ".join(map(str, value))}"/>'
+
+
+def placed(*steps):
+    return f'<transform name="to_world">{"".join(steps)}</transform>'
+
+
+def lookat(origin, target, up=(0.1, 1, 0.3)):
+    values = (", ".join(map(str, v)) for v in (origin, target, up))
+    return placed("<lookat origin='{}' target='{}' up='{}'/>".format(*values))
+
+
+def plate(*steps, inside=GREY):
+    """A square that faces up, unless `steps` turn it."""
+    up = '<rotate x="1" angle="-90"/>'
+    return f'<shape type="rectangle">{placed(up, *steps)}{inside}</shape>'
+
+
+FLOOR = plate()
+
+
+def reflected(irradiance):
+    return ALBEDO / np.pi * irradiance
+
+
+def rendered(scene, **how):
+    """The mean of all pixels, one sample each."""
+    return np.asarray(pj.render(scene, 1, **how), float).mean((0, 1))
+
+
+INTENSITY = np.array([6.0, 3.0, 1.0])
+
+
+@pytest.mark.parametrize("where", [(0, 2, 0), (0.5, 0.3, -2), (-3, 40, 1)])
+@pytest.mark.parametrize("strategy", ["mis", "light"])
+def test_a_point_light_falls_with_the_square_of_the_distance(make_scene, where, strategy):
+    scene = make_scene(FLOOR + emitter("point", color("intensity", *INTENSITY) + vector("position", where)), **VIEW)
+    distance = np.linalg.norm(where)
+    expected = reflected(INTENSITY * where[1] / distance**3)
+    np.testing.assert_allclose(rendered(scene, strategy=strategy), expected, rtol=NEAR)
+
+
+def test_to_world_moves_the_origin_to_a_point_light(make_scene):
+    moved = placed('<scale value="2"/>', '<translate x="0.25" y="1"/>', '<scale x="2" y="1" z="-1"/>')
+    one, other = (
+        make_scene(FLOOR + emitter("point", inside), **VIEW) for inside in (moved, vector("position", (0.5, 1, 0)))
+    )
+    np.testing.assert_array_equal(pj.render(one, 1), pj.render(other, 1))
+
+
+def spot(angle, inside, distance=2.0):
+    """Straight above the origin, aimed `angle` degrees beside it."""
+    x, y = math.sin(math.radians(angle)), distance - math.cos(math.radians(angle))
+    return emitter("spot", color("intensity", *INTENSITY) + inside + lookat((0, distance, 0), (x, y, 0)))
+
+
+def cone(cutoff=None, beam=None):
+    values = {"cutoff_angle": cutoff, "beam_width": beam}
+    return "".join(f'<float name="{name}" value="{x}"/>' for name, x in values.items() if x is not None)
+
+
+@pytest.mark.parametrize(
+    "cutoff, beam, angle, falloff",
+    [
+        (None, None, 0, 1),  # 20 and 15 degrees
+        (None, None, 14.9, 1),
+        (None, None, 16, 0.8),
+        (None, None, 19, 0.2),
+        (None, None, 20.1, 0),
+        (40, None, 35, 0.5),
+        (40, 0, 0.0, 1),
+        (40, 0, 10, 0.75),
+        (30, 30, 29.9, 1),  # a hard edge
+        (30, 30, 30.1, 0),
+        (0.5, 0.1, 0.2, 0.75),  # cosines have no digits left here
+        (170, 100, 135, 0.5),
+        (170, 100, 180, 0),
+    ],
+)
+def test_a_spot_falls_linearly_in_the_angle(make_scene, cutoff, beam, angle, falloff):
+    scene = make_scene(FLOOR + spot(angle, cone(cutoff, beam)), **VIEW)
+    # Samples lie within 1e-3 degrees, seen from the light; the narrowest ramp is 0.4 degrees wide.
+    np.testing.assert_allclose(rendered(scene), reflected(INTENSITY * falloff / 4), rtol=3e-3 if falloff % 1 else NEAR)
+
+
+@pytest.mark.parametrize("tilt", [0, 30, -60, 89])
+@pytest.mark.parametrize("given", ["direction", "to_world"])
+def test_a_directional_light_falls_with_the_cosine(make_scene, tilt, given):
+    towards = np.array([-1.0, -2.0, 0.5])
+    where = vector("direction", 7e-30 * towards) if given == "direction" else lookat((5, 6, 7), (5, 6, 7) + towards)
+    floor = plate(f'<rotate z="1" angle="{tilt}"/>')
+    scene = make_scene(floor + emitter("directional", color("irradiance", 1, 2, 3) + where), **VIEW)
+    normal = np.array([-math.sin(math.radians(tilt)), math.cos(math.radians(tilt)), 0])
+    cosine = max(-towards @ normal / np.linalg.norm(towards), 0)
+    # The camera is behind the floor that is tilted most.
+    expected = reflected(np.array([1, 2, 3]) * cosine) * (normal @ [1, 2, 1.5] > 0)
+    np.testing.assert_allclose(rendered(scene), expected, rtol=NEAR)
+
+
+def test_defaults_are_mitsubas(make_scene):
+    """1 in the origin, along z, within 20 degrees; a uniform spectrum has the colour that it has as a radiance."""
+    wall = plate('<rotate x="1" angle="-90"/>', '<translate z="1"/>')
+    for kind in ("point", "spot", "directional"):
+        scene = make_scene(wall + f'<emitter type="{kind}"/>', **VIEW | {"target": "0, 0, 1", "origin": "0.1, 0.2, 0"})
+        np.testing.assert_allclose(rendered(scene), reflected(1.0), rtol=NEAR)
+        assert {f"{kind}.{name}" for name in ("intensity", "irradiance")} & pj.parameters(scene).keys()
+    uniform = emitter("point", '<spectrum name="intensity" value="2"/>')
+    found = pj.parameters(make_scene(uniform))["point.intensity"]
+    np.testing.assert_allclose(found, 2 * UNIFORM_RADIANCE, rtol=1e-6)
+
+
+# ---- shadows --------------------------------------------------------------------------------------------------------
+
+BULB = emitter("point", color("intensity", *INTENSITY) + vector("position", (0, 2, 0)))
+SPOT = spot(0, cone(30))
+SUN = emitter("directional", color("irradiance", *INTENSITY) + vector("direction", (0, -1, 0)))
+
+
+@pytest.mark.parametrize("light", [BULB, SPOT, SUN], ids=["point", "spot", "directional"])
+@pytest.mark.parametrize("kind", ["diffuse", "dielectric", "conductor"])
+def test_what_stands_in_the_way_casts_a_shadow(make_scene, light, kind):
+    """Glass too: a light without size is seen through it from no direction that a bsdf draws, in Mitsuba as here."""
+    sheet = plate('<scale value="0.1"/>', '<translate y="0.5"/>', inside=f'<bsdf type="{kind}"/>')
+    beside = sheet.replace('y="0.5"', 'x="0.3" y="0.5"')
+    above = sheet.replace('y="0.5"', 'y="3"')
+    assert not np.any(pj.render(make_scene(FLOOR + sheet + light, **VIEW | {"depth": 8}), 4))
+    lit = rendered(make_scene(FLOOR + beside + light, **VIEW))
+    assert lit.min() > 0
+    over = rendered(make_scene(FLOOR + above + light, **VIEW))
+    np.testing.assert_allclose(over, 0 if light is SUN else lit, rtol=NEAR)
+
+
+def test_a_light_shines_off_the_wall_that_it_lies_in(make_scene):
+    """Far from the origin and aslant, where rounding hides the light from a tenth of all points."""
+    tilt, wide, there = np.radians(17), '<scale value="9"/>', '<translate x="1000" y="{}" z="1000"/>'
+    tilted = '<rotate x="1" angle="17"/>'
+    turn = np.array([[1, 0, 0], [0, np.cos(tilt), -np.sin(tilt)], [0, np.sin(tilt), np.cos(tilt)]])
+    light, origin, target = turn @ [1000, 102.3, 1000], turn @ [1001, 102, 1001.5], turn @ [1000, 100.3, 1000]
+    floor = plate(wide, there.format(100.3), tilted)
+    ceiling = plate('<rotate x="1" angle="180"/>', wide, there.format(102.3), tilted, inside="")
+    scene = make_scene(
+        floor + ceiling + emitter("point", color("intensity", *INTENSITY) + vector("position", light)),
+        **VIEW | {"origin": ", ".join(map(str, origin)), "target": ", ".join(map(str, target)), "fov": 1},
+    )
+    # Samples lie within 0.02 of the point below the light.
+    np.testing.assert_allclose(np.asarray(pj.render(scene, 64)).mean((0, 1)), reflected(INTENSITY / 4), rtol=1e-3)
+
+
+def test_at_the_light_itself_nothing_is_nan():
+    for kind in (Point, Spot):
+        p = Row(table(kind), 0)
+        for ref in (np.zeros(3), np.array([0, 0, 1e-25]), np.array([0, 0, 3e18])):
+            value, slopes = jax.jvp(lambda ref, p=p, kind=kind: kind.sample(p, ref), [jnp.float32(ref)], [jnp.ones(3)])
+            assert all(np.isfinite(x).all() for x in (*value, *slopes))
+
+
+# ---- derivatives ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("light, name", [(BULB, "intensity"), (SPOT, "intensity"), (SUN, "irradiance")])
+def test_images_are_linear_in_the_light(make_scene, light, name):
+    """To the last bits, with the light that walls throw at each other."""
+    ball = '<shape type="sphere"><point name="center" x="0.4" y="0.3" z="0"/><float name="radius" value="0.3"/></shape>'
+    scene = make_scene(FLOOR + ball + light, origin="1, 2, 1.5", depth=4)
+    (parameter,) = (each for each in pj.parameters(scene) if each.endswith(name))
+    image, J = pj.jacobian(scene, [parameter], 16)
+    assert np.asarray(image).max() > 0.1
+    slope = np.einsum("...cc->...c", np.asarray(J[parameter]))
+    np.testing.assert_allclose(slope * INTENSITY, image, rtol=1e-5, atol=1e-7)
+    doubled = pj.with_parameters(scene, {parameter: 2 * INTENSITY})
+    np.testing.assert_allclose(pj.render(doubled, 16), 2 * image, rtol=1e-5, atol=1e-7)
+
+
+def test_a_dark_light_has_a_derivative(make_scene):
+    dark = FLOOR + emitter("point", color("intensity", 0, 0, 0) + vector("position", (0, 2, 0)))
+    _, J = pj.jacobian(make_scene(dark, **VIEW), ["point.intensity"], 1)
+    np.testing.assert_allclose(J["point.intensity"][0, 0], np.diag(reflected(0.25)), rtol=NEAR)
+
+
+def test_places_and_angles_are_no_parameters(make_scene):
+    scene = make_scene(FLOOR + BULB + SPOT + SUN)
+    assert set(pj.parameters(scene)) == {
+        "grey.reflectance",
+        "point.intensity",
+        "spot.intensity",
+        "directional.irradiance",
+    }
+    with pytest.raises(pj.InputError, match="no parameter is named 'point.position'"):
+        pj.with_parameters(scene, {"point.position": (0, 1, 0)})
+    with pytest.raises(pj.InputError, match="outside its bounds"):
+        pj.with_parameters(scene, {"spot.intensity": -1})
+
+
+# ---- among other lights ---------------------------------------------------------------------------------------------
+
+LAMP = plate(
+    '<rotate x="1" angle="180"/>',
+    '<scale value="0.3"/>',
+    '<translate x="-1" y="1.5"/>',
+    inside=emitter("area", color("radiance", 3, 2, 1)),
+)
+SKY = emitter("constant", color("radiance", 0.1, 0.2, 0.4))
+LIGHTS = {
+    "point": BULB,
+    "second point": emitter("point", color("intensity", 0, 1, 9) + vector("position", (3, 1, 0.5)), "second"),
+    "spot": SPOT,
+    "second spot": spot(5, cone(8), 1).replace('id="spot"', 'id="beam"'),
+    "directional": SUN,
+    "second directional": emitter("directional", color("irradiance", 0, 2, 0) + vector("direction", (1, -1, 0)), "eve"),
+    "area": LAMP,
+    "constant": SKY,
+}
+
+
+@pytest.mark.parametrize("strategy", ["mis", "light"])
+def test_lights_of_all_kinds_add_up(make_scene, estimate, agree, strategy):
+    """z-test with the false-alarm rate of `agree`, 1e-4: one of them is chosen for each sample. Alone they are exact,
+    but the lamp, and the sky that it hides a part of, which 16,384 samples know to `NEAR`."""
+    unlit = LAMP.replace("3, 2, 1", "0, 0, 0")
+    alone = [make_scene(FLOOR + light + (unlit if light is SKY else ""), **VIEW) for light in LIGHTS.values()]
+    expected = sum(np.asarray(pj.render(scene, 4096), float).mean((0, 1)) for scene in alone)
+    together = make_scene(FLOOR + "".join(LIGHTS.values()), **VIEW)
+    kinds = ["area", "point", "spot", "constant", "directional"]
+    assert [emitters.name(lights) for lights in together.emitters] == kinds
+    agree(estimate(together, 1024, 24, strategy=strategy), expected, pixelwise=False, rounding=NEAR)
+
+
+def test_terms_of_the_series_and_first_hits(make_scene):
+    scene = make_scene(FLOOR + BULB, **VIEW)
+    terms = np.asarray(pj.render_bounces(scene, 3, 4).terms)
+    np.testing.assert_allclose(terms[1].mean((0, 1)), reflected(INTENSITY / 4), rtol=NEAR)
+    assert not terms[0].any() and not terms[2].any()
+    np.testing.assert_allclose(pj.render_aovs(scene, ["albedo"])["albedo"][0, 0], ALBEDO, rtol=1e-5)
+
+
+def integral(falloff):
+    """Over the sphere, of a function of the angle in degrees."""
+    theta = (np.arange(2_000_000) + 0.5) / 2_000_000 * np.pi
+    return 2 * np.pi * np.sum(falloff(np.degrees(theta)) * np.sin(theta)) * np.pi / 2_000_000
+
+
+def table(kind, dtype=np.float32, **values):
+    return jax.device_put(kind.build([kind.instance("it", **values)], dtype, (), Parameters(), None))
+
+
+@pytest.mark.parametrize("cutoff, beam", [(20, 15), (90, 0), (50, 50), (170, 20), (2, 1)])
+def test_a_spot_is_chosen_by_the_root_of_its_share_of_directions(cutoff, beam):
+    """The error of an image is then least, if all directions are seen alike."""
+    made = table(Spot, intensity=(3, 3, 3), cutoff_angle=cutoff, beam_width=beam)
+    share = integral(lambda a: np.interp(a, [beam, cutoff + 1e-9], [1, 0])) / (4 * np.pi)
+    np.testing.assert_allclose(Spot.power(AllRows(made)), [4 * 3 * np.sqrt(share)], rtol=1e-3)
+
+
+def test_the_narrowest_spot_has_some_power():
+    """Else it would never be chosen."""
+    assert Spot.power(AllRows(table(Spot, cutoff_angle=1e-4)))[0] > 0
+
+
+# ---- beside Mitsuba -------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def mitsuba():
+    mi = pytest.importorskip("mitsuba")
+    mi.set_variant("scalar_rgb")
+    mi.set_log_level(mi.LogLevel.Error)
+    return mi
+
+
+TURNED = lookat((0.3, 1, -0.4), (-1, 0.2, 0.5))
+
+
+@pytest.mark.parametrize(
+    "kind, inside",
+    [
+        (Point, vector("position", (0.3, 1, -0.4))),
+        (Point, placed('<translate x="0.3"/>', '<scale value="-2"/>') + '<spectrum name="intensity" value="2"/>'),
+        (Spot, TURNED + color("intensity", 3, 2, 1)),
+        (Spot, TURNED + cone(60, 10)),
+        (Spot, TURNED + cone(150)),
+        (Spot, TURNED + cone(70, 70)),
+        (Spot, placed('<scale x="3" y="3" z="-3"/>', '<translate z="1"/>') + cone(80)),
+        (Directional, vector("direction", (1, -2, 3)) + color("irradiance", 3, 2, 1)),
+        (Directional, TURNED),
+    ],
+)
+def test_what_arrives_is_what_mitsuba_says(make_scene, mitsuba, kind, inside):
+    name = next(name for name, each in emitters.KINDS.items() if each is kind)
+    text = emitter(name, inside)
+    scene = make_scene(FLOOR + text)
+    theirs = mitsuba.load_string(f'<scene version="3.0.0">{FLOOR}{text}</scene>').emitters()[0]
+    p = Row(scene.emitters[0].table, 0)
+    for ref in np.random.default_rng(3).normal(size=(50, 3)):
+        at = mitsuba.SurfaceInteraction3f()
+        at.p = list(ref)
+        drawn, irradiance = theirs.sample_direction(at, [0.5, 0.5])
+        d, distance, arriving = kind.sample(p, jnp.asarray(ref, jnp.float32))
+        np.testing.assert_allclose(d, np.array(drawn.d), atol=1e-6)
+        np.testing.assert_allclose(arriving, np.array(irradiance), rtol=1e-4, atol=1e-5)
+        assert np.isinf(distance) if kind.distant else np.isclose(distance, drawn.dist, rtol=1e-3)
+
+
+# ---- refusals -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "light, words",
+    [
+        (emitter("point", color("intensity", 1, -1, 1)), "must not be negative"),
+        (emitter("point", color("irradiance", 1, 1, 1)), "it has: intensity, position, to_world"),
+        (emitter("point", TURNED + vector("position", (0, 1, 0))), '"position" of .* excludes to_world'),
+        (emitter("point", '<point name="position" x="1" y="2"/>'), 'lacks the attribute "z"'),
+        (emitter("directional", vector("direction", (0, 0, 0))), "is the zero vector"),
+        (emitter("directional", TURNED + vector("direction", (0, 1, 0))), '"direction" of .* excludes to_world'),
+        (emitter("directional", color("intensity", 1, 1, 1)), "it has: irradiance, direction, to_world"),
+        (emitter("spot", cone(180)), "must be above 0 and below 180, is 180"),
+        (emitter("spot", cone(0)), "must be above 0 and below 180, is 0"),
+        (emitter("spot", cone(None, 25)), "must not exceed cutoff_angle, 20; is 25"),
+        (emitter("spot", cone(None, -1)), "must be at least 0, is -1"),
+        (emitter("spot", vector("position", (0, 1, 0))), "it has: intensity, cutoff_angle, beam_width, to_world"),
+        (emitter("spot", placed('<scale x="2"/>')), "scales unevenly"),
+        (emitter("spot", '<texture name="texture" type="bitmap"/>'), '"texture" of .* is not supported'),
+        (emitter("spot", '<texture name="intensity" type="bitmap"/>'), "cannot be a <texture>"),
+        (plate(inside=emitter("point")), "use one of area"),
+    ],
+)
+def test_bad_values_are_refused_with_file_line_and_cause(make_scene, light, words):
+    with pytest.raises(pj.InputError, match=rf"\.xml:\d+: .*{words}"):
+        make_scene(FLOOR + light)
+
+
+def test_transport_refuses_them_by_name(make_scene):
+    for kind, light in {"point": BULB, "spot": SPOT, "directional": SUN}.items():
+        with pytest.raises(pj.InputError, match=f"has a {kind} emitter"):
+            transport.operator(make_scene(FLOOR + LAMP + light))
