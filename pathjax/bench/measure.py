@@ -17,7 +17,7 @@ import pathjax
 from pathjax.bench import figures, peers, rays
 from pathjax.bench.figures import Reference
 from pathjax.bench.peers.mitsuba3 import SAMPLERS
-from pathjax.integrators.options import STRATEGIES
+from pathjax.integrators.options import strategies
 from pathjax.scene.scene import Scene
 from pathjax.sensors import film
 
@@ -201,11 +201,11 @@ def _middle(spps: list[int]) -> int:
 
 
 def _strategies(subject: Subject, plan: Plan) -> list[dict]:
-    spp = _middle(plan.spps)
-    for strategy in STRATEGIES:
+    spp, possible = _middle(plan.spps), strategies(subject.scene)
+    for strategy in possible:
         jax.block_until_ready(pathjax.render(subject.scene, 1, strategy=strategy))
-    done = _timed(subject.scene, {strategy: (spp, strategy) for strategy in STRATEGIES}, range(plan.repeat))
-    return [{"strategy": strategy, **subject.row(spp, spp, *done[strategy])} for strategy in STRATEGIES]
+    done = _timed(subject.scene, {strategy: (spp, strategy) for strategy in possible}, range(plan.repeat))
+    return [{"strategy": strategy, **subject.row(spp, spp, *done[strategy])} for strategy in possible]
 
 
 def _precision(subject: Subject, plan: Plan, failures) -> tuple[dict | None, int | None]:

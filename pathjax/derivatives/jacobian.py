@@ -100,6 +100,7 @@ def jacobian(
         raise InputError(f"step = {step}; it must lie between 0 and 1, in units of relative IOR")
     options = Options(strategy)
     options.check_counts(spp, seed)
+    options.check_strategy(scene)
     wanted = {name: named.find(scene, name) for name in names}
     pixels = jnp.arange(film.pixel_count(scene.film), dtype=jnp.int32)
     image, derivatives, bias, used = pixel_jacobians(

@@ -111,6 +111,11 @@ def sampled(emitters: tuple[Lights, ...]) -> bool:
     return any(not lights.left_to_bsdfs for lights in emitters)
 
 
+def met_by_no_ray(emitters: tuple[Lights, ...]) -> list[str]:
+    """Names of the kinds that are found by light samples alone."""
+    return [name(lights) for lights in emitters if issubclass(lights.kind, DiracEmitter)]
+
+
 def darkness(emitters: tuple[Lights, ...]) -> str | None:
     """Why every image is black, in words; None where light may come. Of known values, not of traced ones."""
     if not emitters:

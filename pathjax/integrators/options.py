@@ -12,7 +12,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Integer
 
-from pathjax import bsdfs
+from pathjax import bsdfs, emitters
 from pathjax.compile import is_traced
 from pathjax.core import sampler
 from pathjax.errors import InputError
@@ -60,6 +60,15 @@ class Options:
             if np.any(np.asarray(spp) % sampler.SUBPIXELS):
                 raise InputError(f"spp = {spp}; sampler='subpixel' takes samples by fours, so make it a multiple of 4")
 
+    def check_strategy(self, scene: Scene) -> None:
+        """Refuse, with an InputError, a strategy that misses some of the scene's light."""
+        if self.strategy not in strategies(scene):
+            missed = ", ".join(emitters.met_by_no_ray(scene.emitters))
+            raise InputError(
+                f"strategy {self.strategy!r} misses all light of the {missed} emitters, which no ray meets; "
+                f"use one of {', '.join(strategies(scene))}"
+            )
+
     def check_differentiable(self) -> None:
         """Refuse, with an InputError, what derivatives are not made with."""
         if self.split_depth or self.sampler != "lattice":
@@ -76,6 +85,11 @@ class Options:
 
 
 DEFAULTS = Options()
+
+
+def strategies(scene: Scene) -> tuple[str, ...]:
+    """Those that find all light of a scene."""
+    return tuple(each for each in STRATEGIES if each != "bsdf" or not emitters.met_by_no_ray(scene.emitters))
 
 
 def check_counts(spp: Counts, seed: Counts, name: str = "spp") -> None:

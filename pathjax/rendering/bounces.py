@@ -100,6 +100,7 @@ def render_bounces(
     _check_depth(depth)
     options = Options(strategy)
     options.check_counts(spp, seed)
+    options.check_strategy(scene)
     shape = film.image_shape(scene.film)
     pixels = jnp.arange(film.pixel_count(scene.film), dtype=jnp.int32).reshape(shape)
     return _bounces(scene, int(depth), pixels, spp, seed, options, errors)

@@ -45,7 +45,8 @@ def render(
         spp: samples per pixel, at least 1.
         seed: other seeds give independent images; the same seed gives the same image, bit for bit, on any number of
             CPU devices.
-        strategy: "mis", or "light" or "bsdf" for experiments.
+        strategy: "mis", or "light" or "bsdf" for experiments. "bsdf" is refused where it misses the light of emitters
+            that no ray meets.
         fresnel: reflectance of dielectrics, "exact", or "schlick", whose approximation biases the image. This and what
             follows are for experiments; the defaults compile nothing of them.
         split_depth: number of dielectrics, counted along a path, at which both branches are followed instead of one by
@@ -55,11 +56,12 @@ def render(
         control: a `transport.Control`, made by `Operator.control`, into which paths end instead of into darkness. The
             mean stays, whatever light it holds. It seldom pays: see `pathjax help transport`.
     Raises:
-        InputError: a choice is unknown, or spp, seed or split_depth is out of range; differentiation in anything but
-            named parameters, or with another sampler, split_depth or control than the default.
+        InputError: a choice is unknown or refused, or spp, seed or split_depth is out of range; differentiation in
+            anything but named parameters, or with another sampler, split_depth or control than the default.
     """
     options = Options(strategy, fresnel, split_depth, sampler, controlled=control is not None)
     options.check_counts(spp, seed)
+    options.check_strategy(scene)
     if control is not None:
         _check_control(control, scene)
     pixels = jnp.arange(film.pixel_count(scene.film), dtype=jnp.int32)

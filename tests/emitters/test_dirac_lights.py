@@ -364,6 +364,20 @@ def test_bad_values_are_refused_with_file_line_and_cause(make_scene, light, word
         make_scene(FLOOR + light)
 
 
+def test_a_strategy_that_meets_no_such_light_is_refused(make_scene):
+    """Without light samples their light would be missing from the image."""
+    scene = make_scene(FLOOR + BULB + SUN + SKY)
+    message = "'bsdf' misses all light of the point, directional emitters.*use one of mis, light$"
+    for call in (
+        lambda: pj.render(scene, 1, strategy="bsdf"),
+        lambda: pj.jacobian(scene, ["grey.reflectance"], 1, strategy="bsdf"),
+        lambda: pj.render_bounces(scene, 2, 1, strategy="bsdf"),
+        lambda: pj.render_until(scene, spp=1, strategy="bsdf"),
+    ):
+        with pytest.raises(pj.InputError, match=message):
+            call()
+
+
 def test_transport_refuses_them_by_name(make_scene):
     for kind, light in {"point": BULB, "spot": SPOT, "directional": SUN}.items():
         with pytest.raises(pj.InputError, match=f"has a {kind} emitter"):

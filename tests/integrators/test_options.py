@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import pathjax as pj
-from pathjax.integrators.options import DEFAULTS, Options, check_counts
+from pathjax.integrators.options import DEFAULTS, Options, check_counts, strategies
 
 
 @pytest.mark.parametrize("spp", [0, -1, 2**31, 1.5, 64.0, True, "64", None])
@@ -33,6 +33,11 @@ def test_counts_in_range_pass_and_so_does_what_is_traced_or_of_pixels():
 def test_unknown_choices_are_refused_when_they_are_made():
     with pytest.raises(pj.InputError, match="strategy 'mix' is unknown; use one of mis, light, bsdf"):
         Options("mix")
+
+
+def test_strategies_of_a_scene_find_all_of_its_light(shipped):
+    assert strategies(shipped("cornell_box", res=4)) == ("mis", "light", "bsdf")
+    assert strategies(shipped("lights", res=4)) == ("mis", "light")
 
 
 def test_options_of_the_same_choices_are_one_key():

@@ -101,6 +101,7 @@ class Render:
         _check(target_error, time_limit, spp)
         self.options = Options(strategy)
         check_counts(MAX_SPP if spp is None else spp, seed)
+        self.options.check_strategy(scene)
         self.scene, self.seed = scene, operator.index(seed)
         self.target_error, self.time_limit = target_error, time_limit
         self.spp = MAX_SPP if spp is None else int(spp)
