@@ -356,7 +356,7 @@ def test_what_arrives_is_what_mitsuba_says(make_scene, mitsuba, kind, inside):
         (emitter("spot", placed('<scale x="2"/>')), "scales unevenly"),
         (emitter("spot", '<texture name="texture" type="bitmap"/>'), '"texture" of .* is not supported'),
         (emitter("spot", '<texture name="intensity" type="bitmap"/>'), "cannot be a <texture>"),
-        (plate(inside=emitter("point")), "use one of area"),
+        (plate(inside=emitter("point")), "shines from no surface; it stands directly in <scene>"),
     ],
 )
 def test_bad_values_are_refused_with_file_line_and_cause(make_scene, light, words):
