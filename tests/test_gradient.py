@@ -910,8 +910,8 @@ def test_colours_of_every_scene_against_differences(shipped, derivatives, agree,
     """Every colour of every material and light: against central differences of plain images with the same seeds.
 
     Without roulette, which depends on the colours. Images are polynomials of third order in a colour; they are linear
-    in a radiance, which takes a step of half its size: a light's power also changes how often it is chosen, and of few
-    such changes no variance could be told.
+    in a radiance or intensity, which takes a step of half its size: a light's power also changes how often it is
+    chosen, and of few such changes no variance could be told.
     """
     scene = without_roulette(shipped(name, res=16), 4)
     names = [n for n in pj.parameters(scene) if not n.endswith("_ior")]
@@ -920,7 +920,7 @@ def test_colours_of_every_scene_against_differences(shipped, derivatives, agree,
     for parameter in names:
         value = np.asarray(pj.parameters(scene)[parameter])
         low, high = named.find(scene, parameter).bounds
-        h = value / 2 if parameter.endswith("radiance") else np.full(3, 0.02)
+        h = value / 2 if parameter.endswith(("radiance", "intensity")) else np.full(3, 0.02)
         middle = np.clip(value, low + h, high - h)
         slope = slopes[parameter]
         if not np.array_equal(middle, value):
