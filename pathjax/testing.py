@@ -34,6 +34,8 @@ CELLS, POINTS = (20, 24), 12
 LEAST_EXPECTED = 10
 # Of differences: float32 keeps five digits of them, and what they err by is of second order.
 STEP = 0.01
+# All that kinds of the package ask of a surface: where textures are looked up.
+_SURFACE = SimpleNamespace(uv=jnp.full(2, 0.5, jnp.float32))
 
 
 # ---- bsdfs ----------------------------------------------------------------------------------------------------------
@@ -90,9 +92,6 @@ def evaluate(materials: Materials, wi, wo):
 def sample_tangent(materials: Materials, tangent: Materials, wi, u):
     """How the samples change with the materials."""
     return jax.jvp(lambda m: sample(m, wi, u), (materials,), (tangent,))[1]
-
-
-_SURFACE = SimpleNamespace(uv=jnp.full(2, 0.5, jnp.float32))
 
 
 def random_numbers(materials: Materials, count: int, seed: int):

@@ -57,17 +57,15 @@ KINDS: dict[str, type[Emitter]] = {
 
 def register(name: str):
     """A decorator that makes a subclass of `SurfaceEmitter`, `Background` or `DiracEmitter` a kind named `name`."""
-    enter = register_kind(KINDS, Emitter, name, "emitters")
+    return register_kind(KINDS, Emitter, name, "emitters", _fault)
 
-    def checked(kind):
-        declared = enter(kind).declared.values()
-        if not declared or any(parameter.textured for parameter in declared):
-            del KINDS[name]
-            why = "declares a textured parameter, which lights cannot have" if declared else "declares nothing"
-            raise InputError(f"emitters.register({name!r}): {kind!r} {why}; declare a Color(..., textured=False)")
-        return kind
 
-    return checked
+def _fault(kind: type[Emitter]) -> str:
+    declared = kind.declared.values()
+    if declared and not any(parameter.textured for parameter in declared):
+        return ""
+    why = "declares a textured parameter, which lights cannot have" if declared else "declares nothing"
+    return f"{why}; declare a Color(..., textured=False)"
 
 
 def build(
@@ -158,25 +156,25 @@ def sample(
     """
     number, probability, u = choose(chosen, u)
     sampled = [(lights, first) for lights, first in zip(emitters, chosen.first, strict=True) if first is not None]
-    some_dirac = any(issubclass(lights.kind, DiracEmitter) for lights, _ in sampled)
+    some_dirac = any(lights.kind.dirac for lights, _ in sampled)
 
     def of(lights: Lights, first):
         def draw():
             light = number - first if first else number
             p = lights.parameters(light)
-            if issubclass(lights.kind, SurfaceEmitter):
+            if lights.kind.on_surfaces:
                 d, distance, n, pdf, primitive = geometry.sample_lamp(shapes, lights.lamps, light, ref, u, u_part)
                 front = dot(n, d) < 0
                 Le = jnp.where(front, lights.kind.emitted(p, d), 0)
                 pdf = jnp.where(front, pdf, 0) * probability
-            elif issubclass(lights.kind, Background):
+            elif not lights.kind.dirac:
                 d = lights.kind.sample(p, u, u_part)
                 distance, primitive = jnp.full_like(d[0], jnp.inf), jnp.int32(-1)
                 Le, pdf = background(emitters, chosen, d)
             else:
                 d, distance, Le = lights.kind.sample(p, ref)
                 primitive, pdf = jnp.int32(-1), probability
-            delta = jnp.bool_(issubclass(lights.kind, DiracEmitter)) if some_dirac else None
+            delta = jnp.bool_(lights.kind.dirac) if some_dirac else None
             return EmitterSample(d, distance, primitive, Le, pdf, delta)
 
         return draw

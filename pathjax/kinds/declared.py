@@ -57,7 +57,11 @@ class Color(Declared):
         if self.textured and (made := loader.texture(fields, name, owner)) is not None:
             return _in_range(fields, name, made, self.bounds)
         default = None if self.default is None else np.broadcast_to(np.asarray(self.default, float), 3)
-        return fields.color(name, default, at_most=self.bounds[1], radiance=self.radiance)
+        low, high = self.bounds
+        color = fields.color(name, default, at_most=high, radiance=self.radiance)
+        if color is not None and (color < low).any():
+            raise fields.error(name, f"must be at least {low:g}, is {', '.join(f'{c:g}' for c in color)}")
+        return color
 
 
 @dataclass(frozen=True)
@@ -161,5 +165,5 @@ def _in_range(fields, name, texture, bounds):
     low, high = texture.kind.span(texture)
     if not bounds[0] <= low <= high <= bounds[1]:  # also where one is NaN
         above = f", above {bounds[1]:g}" if bounds[1] < math.inf else ""
-        raise fields.error(name, f"is an image with values below {bounds[0]:g}{above} or NaN")
+        raise fields.error(name, f"is a texture with values below {bounds[0]:g}{above} or NaN")
     return texture

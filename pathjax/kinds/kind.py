@@ -109,8 +109,10 @@ def ordered(instances, kinds: Mapping[str, type]) -> dict[type, list[Instance]]:
     return by_kind
 
 
-def register(kinds: dict[str, type], base: type, name: str, room: str):
+def register(kinds: dict[str, type], base: type, name: str, room: str, fault: Callable = lambda kind: ""):
     """A decorator that enters a class among the kinds of a room, for scene files to name it.
+
+    fault: class -> what the room cannot do with it, in words; empty: nothing.
 
     Raises:
         InputError: the name is taken by another class, or the class is not of the room's kind.
@@ -119,6 +121,8 @@ def register(kinds: dict[str, type], base: type, name: str, room: str):
     def enter(cls):
         if not (isinstance(cls, type) and issubclass(cls, base)):
             raise InputError(f"{room}.register({name!r}): {cls!r} must be a class derived from {room}.{base.__name__}")
+        if why := fault(cls):
+            raise InputError(f"{room}.register({name!r}): {cls.__qualname__} {why}")
         known = kinds.get(name)
         # A cell of a notebook that runs again defines its class again.
         if known and (known.__module__, known.__qualname__) != (cls.__module__, cls.__qualname__):

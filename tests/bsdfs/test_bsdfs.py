@@ -397,6 +397,15 @@ def test_a_name_is_taken_once_but_a_cell_may_run_again(kinds):
         bsdfs.register("other")(dict)
 
 
+def test_colours_below_their_bound_are_refused(tmp_path, kinds):
+    class Pale(Diffuse):
+        reflectance = Color(0.9, bounds=(0.4, 1))
+
+    bsdfs.register("pale")(Pale)
+    with pytest.raises(pj.InputError, match=r'pale.xml:6: "reflectance" .* must be at least 0.4, is 0.8, 0.5, 0.3'):
+        load(tmp_path, "pale")
+
+
 def test_each_kind_gets_as_many_numbers_as_it_takes(tmp_path, kinds):
     taken = {}
 
