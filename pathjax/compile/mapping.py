@@ -14,6 +14,7 @@ from jax.sharding import Mesh, PartitionSpec
 
 from pathjax.compile.lanes import lanes
 from pathjax.compile.promotion import usual_promotion
+from pathjax.compile.vectorised import vectorised
 from pathjax.compile.xla import native
 
 # Items that a native loop takes at once: enough that loops over them vectorise and their overheads vanish, few enough
@@ -116,4 +117,16 @@ def _lanes(f, xs, shared, width):
 
 
 def _vmap_chunks(f, xs, shared, chunk):
-    return lax.map(lambda x: f(x, *shared), xs, batch_size=min(chunk, jax.tree.leaves(xs)[0].shape[0]))
+    count = jax.tree.leaves(xs)[0].shape[0]
+    chunks = -(-count // chunk)
+    each = -(-count // chunks)
+
+    # Chunks of one size are one program; the first item fills the last one up.
+    def split(x):
+        x = jnp.concatenate([x, jnp.broadcast_to(x[:1], (each * chunks - count, *x.shape[1:]))])
+        return x.reshape(chunks, each, *x.shape[1:])
+
+    def join(y):
+        return y.reshape(chunks * each, *y.shape[2:])[:count]
+
+    return jax.tree.map(join, lax.map(lambda rows: vectorised(f, rows, shared), jax.tree.map(split, xs)))

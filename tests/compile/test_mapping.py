@@ -74,3 +74,37 @@ def test_map_passes_tangents():
     primal, tangent = jax.jvp(lambda s: native_map(lambda x, s: jnp.sin(s * x), xs, s), (2.0,), (1.0,))
     np.testing.assert_allclose(primal, np.sin(2 * xs), rtol=1e-6)
     np.testing.assert_allclose(tangent, xs * np.cos(2 * xs), rtol=1e-6)
+
+
+def test_lanes_of_the_vectorised_form_share_one_table():
+    """A conditional whose lanes differ, within a loop, gives no lane a copy of what it looks up."""
+    lanes, rows = 64, 1000
+
+    def f(x, table):
+        def step(i, y):
+            return lax.cond(y > 0, lambda: y - table[i], lambda: y + table[2 * i])
+
+        return lax.fori_loop(0, 10, step, x)
+
+    xs, table = jnp.linspace(-1, 1, lanes), jnp.sin(jnp.arange(rows, dtype=jnp.float32))
+    program = jax.jit(lambda xs, table: native_map(f, xs, table, form="vmap", devices=1)).lower(xs, table)
+    assert f"tensor<{lanes}x{rows}" not in program.as_text()
+    assert f"tensor<{rows}xf32>" in program.as_text()
+    np.testing.assert_allclose(
+        native_map(f, xs, table, form="vmap"), native_map(f, xs, table, form="loop"), rtol=1e-5, atol=1e-6
+    )
+
+
+@pytest.mark.parametrize("differing", [False, True])
+def test_branches_of_the_vectorised_form(differing):
+    """Where all lanes take one branch, and where they differ; results of several shapes, one of them of no entries."""
+
+    def f(x, which):
+        def branch(k):
+            return lambda: (jnp.full(2, k) * x, jnp.zeros((0, 3)), jnp.int32(k))
+
+        return lax.switch(which + jnp.int32(x) if differing else which, [branch(k) for k in range(3)])
+
+    xs = jnp.arange(3.0)
+    for a, b in zip(*(native_map(f, xs, 0, form=form, devices=1) for form in ("vmap", "loop")), strict=True):
+        np.testing.assert_array_equal(a, b)
