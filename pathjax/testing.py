@@ -154,7 +154,8 @@ def _chi_square(directions, samples: int, shares, false_alarm: float, where: str
     expected = np.append(expected[~few], max(expected[few].sum(), 0))
     used = expected > LEAST_EXPECTED
     statistic = ((seen - expected)[used] ** 2 / expected[used]).sum()
-    chance = stats.chi2.sf(statistic, used.sum() - 1)
+    # With one cell alone all samples fall into it.
+    chance = stats.chi2.sf(statistic, used.sum() - 1) if used.sum() > 1 else 1.0
     assert chance > false_alarm, f"samples do not follow the stated density at {where}: p = {chance:.2g}"
     assert seen[~used].sum() <= 5 * LEAST_EXPECTED, f"{seen[~used].sum():.0f} samples lie where the density is 0"
 

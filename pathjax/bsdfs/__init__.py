@@ -19,6 +19,7 @@ from pathjax.bsdfs.bsdf import BSDF
 from pathjax.bsdfs.conductor import Conductor
 from pathjax.bsdfs.dielectric import Dielectric
 from pathjax.bsdfs.diffuse import Diffuse
+from pathjax.bsdfs.plastic import Plastic
 from pathjax.bsdfs.twosided import TwoSided
 from pathjax.core.math import at
 from pathjax.core.types import BSDFSample, Surface
@@ -26,13 +27,14 @@ from pathjax.kinds import Column, Instance, Parameters, Row, Table, ordered
 from pathjax.kinds import register as register_kind
 from pathjax.textures import Textures
 
-__all__ = ["KINDS", "BSDF", "Conductor", "Dielectric", "Diffuse", "Materials", "TwoSided", "register"]
+__all__ = ["KINDS", "BSDF", "Conductor", "Dielectric", "Diffuse", "Materials", "Plastic", "TwoSided", "register"]
 
 # By the name that scene files give them.
 KINDS: dict[str, type[BSDF]] = {
     "diffuse": Diffuse,
     "conductor": Conductor,
     "dielectric": Dielectric,
+    "plastic": Plastic,
     "twosided": TwoSided,
 }
 # Place of the table of a kind, row in it, or place of a shape; -1: none.

@@ -48,6 +48,19 @@ def _refraction(cos_i, eta):
     return contrast, refracts, safe_sqrt(cos2_t)
 
 
+def diffuse(eta: Float[Array, ""]) -> Float[Array, ""]:
+    """Share of isotropic light that an interface reflects, by fits of d'Eon and Irving (2011) for eta > 1, and of Egan
+    and Hilgeman (1973) below, where some is reflected totally. Both are wrong by less than 0.002.
+
+    The second one strays below 1/2. There it follows from the first: of isotropic light, what passes one way is
+    eta^2 times what passes the other way.
+    """
+    thin, x = eta < 1, jnp.where(eta < 1, eta, 1 / eta)
+    enters = 0.919317 + x * (-3.4793 + x * (6.75335 + x * (-7.80989 + x * (4.98554 - x * 1.36881))))
+    leaves = jnp.where(x > 0.5, 0.0636 / x + 0.6681 + x * (0.7099 - x * 1.4399), 1 - (1 - enters) * x * x)
+    return jnp.where(thin, leaves, enters)
+
+
 @jax.custom_jvp
 def conductor(cos_i: Float[Array, ""], eta: Float[Array, "3"], k: Float[Array, "3"]) -> Float[Array, "3"]:
     """Reflectance of a metal of complex IOR eta + i k, per channel (Born and Wolf; PBRT 4 ed., 9.3.6).

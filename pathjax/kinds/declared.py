@@ -129,6 +129,16 @@ class Setting(Declared):
 
 
 @dataclass(frozen=True)
+class Flag(Declared):
+    """A boolean, which rows that lack it have as false. No parameter of the scene."""
+
+    dtype = bool
+
+    def read(self, loader, fields, name, owner):
+        return fields.boolean(name, False) or None
+
+
+@dataclass(frozen=True)
 class Internal(Declared):
     """A number that no file gives: the package sets it, for derivatives."""
 

@@ -372,7 +372,7 @@ def test_conductor_is_an_ideal_mirror_unless_told_otherwise(read):
 @pytest.mark.parametrize(
     ("kind", "inside", "words"),
     [
-        ("plastic", "", "is not supported yet; use one of diffuse, conductor, dielectric, twosided"),
+        ("hair", "", "is not supported yet; use one of diffuse, conductor, "),
         ("difuse", "", 'did you mean "diffuse"?'),
         ("diffuse", '<rgb name="reflectence" value="1"/>', 'it has: reflectance; did you mean "reflectance"?'),
         ("diffuse", '<rgb name="reflectance" value="1.1"/>', "between 0 and 1"),

@@ -1,0 +1,84 @@
+"""Smooth plastic: a diffuse base under a clear coat, a smooth interface."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float
+
+from pathjax.bsdfs import fresnel
+from pathjax.bsdfs.bsdf import BSDF
+from pathjax.bsdfs.dielectric import IndexOfRefraction
+from pathjax.bsdfs.ior import IOR
+from pathjax.core.math import larger, safe_divide, smaller
+from pathjax.core.types import BSDFSample
+from pathjax.core.warp import square_to_cosine_hemisphere, square_to_cosine_hemisphere_pdf
+from pathjax.kinds import Color, Flag, Row
+
+# Lobes are chosen as if neither reflectance were below this: one that is black has a derivative all the same.
+LEAST_REFLECTANCE = 0.01
+
+
+class Plastic(BSDF):
+    """One-sided. The coat reflects in the mirror direction; what enters the base leaves it through the coat again.
+
+    Light that the coat sends back to the base is reflected there again, any number of times. `nonlinear`: by the
+    colour of the base each time, which so becomes more saturated; else its colour counts once.
+    """
+
+    diffuse_reflectance = Color(0.5)
+    specular_reflectance = Color(1.0)
+    int_ior = IndexOfRefraction(IOR["polypropylene"])
+    ext_ior = IndexOfRefraction(IOR["air"])
+    nonlinear = Flag()
+    smooth = delta = True
+
+    @staticmethod
+    def evaluate(p: Row, wi: Float[Array, "3"], wo: Float[Array, "3"]) -> tuple[Float[Array, "3"], Float[Array, ""]]:
+        eta = p.int_ior / p.ext_ior
+        passes_in, passes_out = 1 - reflectance(wi, eta), 1 - reflectance(wo, eta)
+        cosine = square_to_cosine_hemisphere_pdf(wo)
+        f = base(p, eta, fresnel.diffuse(1 / eta)) * (passes_in * passes_out * cosine)
+        return f, (1 - chance_of_coat(p, 1 - passes_in)) * cosine
+
+    @staticmethod
+    def sample(p: Row, wi: Float[Array, "3"], u: Float[Array, " numbers"]) -> BSDFSample:
+        """The mirror direction by about the share that the coat has in the light, else by the cosine."""
+        mirrors = reflectance(wi, p.int_ior / p.ext_ior)
+        chance = chance_of_coat(p, mirrors)
+        coat = u[0] < chance
+        # Below the chance, and above it, u[0] is uniform too.
+        rest = smaller(safe_divide(u[0] - chance, 1 - chance), jnp.ones_like(chance))
+        diffuse = square_to_cosine_hemisphere(jnp.stack([jnp.where(coat, 0, rest), u[1]]))
+        f, pdf = Plastic.evaluate(p, wi, diffuse)
+        wo = jnp.where(coat, jnp.stack([-wi[0], -wi[1], wi[2]]), diffuse)
+        mirrored = p.specular_reflectance * safe_divide(mirrors, chance)
+        weight = jnp.where(coat, mirrored, f * safe_divide(jnp.ones_like(pdf), pdf))
+        return BSDFSample(wo, weight, jnp.where(coat, chance, pdf), coat, jnp.ones_like(pdf))
+
+
+def reflectance(w: Float[Array, "3"], eta: Float[Array, ""]) -> Float[Array, ""]:
+    """Of the coat, from outside."""
+    return fresnel.dielectric(jnp.clip(w[2], 0, 1), eta)[0]
+
+
+def base(p: Row, eta: Float[Array, ""], internal: Float[Array, ""]) -> Float[Array, "3"]:
+    """Albedo of the base, with all reflections between it and the coat, over eta^2: radiance is spread where it leaves.
+
+    internal: share of diffuse light that the coat sends back to the base.
+    """
+    albedo, nonlinear = p.diffuse_reflectance, p.nonlinear
+    returns = internal if nonlinear is None else internal * jnp.where(nonlinear, albedo, 1)
+    return albedo / ((1 - returns) * (eta * eta))
+
+
+def chance_of_coat(p: Row, mirrors: Float[Array, ""]) -> Float[Array, ""]:
+    """Probability with which the coat is sampled; detached.
+
+    mirrors: reflectance of the coat for light from `wi`.
+    """
+    specular, diffuse = (
+        larger(jnp.mean(color), LEAST_REFLECTANCE) for color in (p.specular_reflectance, p.diffuse_reflectance)
+    )
+    coat = mirrors * specular
+    return lax.stop_gradient(coat / (coat + (1 - mirrors) * diffuse))

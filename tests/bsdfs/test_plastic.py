@@ -1,0 +1,99 @@
+"""Smooth plastic: its checks, closed forms, derivatives, and its values beside Mitsuba's."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from pathjax import bsdfs, testing
+from pathjax.bsdfs import Plastic, fresnel
+
+COLORS = {"diffuse_reflectance": np.array([0.9, 0.3, 0.0]), "specular_reflectance": np.array([0.2, 0.5, 1.0])}
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {},
+        pytest.param({"nonlinear": True, "diffuse_reflectance": np.array([0.95, 0.5, 0.1])}, marks=pytest.mark.slow),
+        pytest.param({**COLORS, "int_ior": 1.9}, marks=pytest.mark.slow),
+        pytest.param({"int_ior": 1.3, "ext_ior": 1.3}, marks=pytest.mark.slow),
+        pytest.param({"int_ior": 1.0, "ext_ior": 1.5}, marks=pytest.mark.slow),
+        pytest.param({"int_ior": 9.0, "nonlinear": True, "diffuse_reflectance": 1.0}, marks=pytest.mark.slow),
+    ],
+)
+def test_plastic_passes_the_checks_of_all_kinds(values):
+    testing.check_bsdf(Plastic, samples=50_000, **values)
+
+
+def test_diffuse_reflectance_of_an_interface_is_its_integral():
+    """2 integral R(cos) cos dcos, by the midpoint rule; the fits claim 0.002."""
+    cos = (np.arange(20_000) + 0.5) / 20_000
+    for eta in (0.2, 0.4, 0.6, 0.67, 0.8, 1.1, 1.5, 2.4):
+        R = jax.vmap(lambda c, eta=eta: fresnel.dielectric(c, jnp.float32(eta))[0])(jnp.asarray(cos, jnp.float32))
+        exact = 2 * (np.asarray(R, float) * cos).mean()
+        assert fresnel.diffuse(jnp.float32(eta)) == pytest.approx(exact, abs=2e-3), eta
+
+
+def scattered(materials, wi):
+    """Share of light that is scattered, (3,): the base by quadrature, and the mirrored part in closed form."""
+    table = materials.tables[0]
+    inside, outside = (float(table.column(name).values[0]) for name in ("int_ior", "ext_ior"))
+    n, cos_i = inside / outside, float(wi[2])
+    cos_t = np.sqrt(1 - (1 - cos_i**2) / n**2)
+    r_s, r_p = (cos_i - n * cos_t) / (cos_i + n * cos_t), (n * cos_i - cos_t) / (n * cos_i + cos_t)
+    mirrored = (r_s**2 + r_p**2) / 2 * np.asarray(table.column("specular_reflectance").values[0], float)
+    return testing._on_sphere(materials, wi)[0].sum(0) + mirrored
+
+
+@pytest.mark.parametrize("nonlinear", [None, True])
+def test_samples_scatter_what_base_and_coat_do_and_so_do_their_derivatives(nonlinear):
+    """`check_bsdf` leaves out the mean of the weights where Dirac lobes are part of it."""
+    count, sigmas, step = 200_000, 4.5, 0.01
+    materials = testing.material(Plastic, int_ior=1.7, nonlinear=nonlinear, **COLORS)
+    u = testing.random_numbers(materials, count, 8)
+    tangents = testing._material_tangents(materials)
+    assert tangents.keys() == {"diffuse_reflectance", "specular_reflectance", "int_ior", "ext_ior"}
+    for wi in testing.directions(Plastic):
+        weights = np.asarray(testing.sample(materials, wi, u).weight, float)
+        error = sigmas * weights.std(0) / np.sqrt(count) + 1e-3  # of the quadrature
+        assert (abs(weights.mean(0) - scattered(materials, wi)) < error).all()
+        for name, tangent in tangents.items():
+            moved = np.asarray(testing.sample_tangent(materials, tangent, wi, u).weight, float)
+            ahead, behind = (scattered(testing._plus(materials, s * step, tangent), wi) for s in (1, -1))
+            error = sigmas * moved.std(0) / np.sqrt(count) + 3e-3  # of quadrature and differences
+            assert (abs(moved.mean(0) - (ahead - behind) / (2 * step)) < error).all(), (name, wi)
+
+
+def test_a_black_lobe_is_drawn_sometimes_so_that_its_derivative_is_known():
+    wi = np.array([0.6, 0, 0.8], np.float32)
+    for black in COLORS:
+        materials = testing.material(Plastic, **{black: 0.0})
+        u = testing.random_numbers(materials, 20_000, 9)
+        moved = testing.sample_tangent(materials, testing._material_tangents(materials)[black], wi, u).weight
+        assert np.asarray(moved).mean() > 0.01
+
+
+# ---- beside Mitsuba -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "values", [{}, {"nonlinear": True}, {**COLORS, "int_ior": 1.9}, {"int_ior": 1.0, "ext_ior": 1.5, "nonlinear": True}]
+)
+def test_values_and_densities_are_those_of_mitsuba(mitsuba_values, values):
+    """Lobes are chosen as Mitsuba does, but where a reflectance is all but black or textured."""
+    rng = np.random.default_rng(1)
+    wi, wo = (w / np.linalg.norm(w, axis=1, keepdims=True) for w in rng.normal(size=(2, 200, 3)))
+    wi[:, 2] = abs(wi[:, 2])
+    materials = testing.material(Plastic, **values)
+
+    def ours(wi, wo):
+        return bsdfs.evaluate(materials, jnp.int32(0), jnp.int32(0), testing._SURFACE, wi, wo)
+
+    f, pdf = jax.vmap(ours)(jnp.asarray(wi, jnp.float32), jnp.asarray(wo, jnp.float32))
+    their_f, their_pdf = mitsuba_values("plastic", values, wi, wo)
+    np.testing.assert_allclose(f, their_f, rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(pdf, their_pdf, rtol=1e-4, atol=1e-6)
+    assert their_f.any()
