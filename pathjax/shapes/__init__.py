@@ -19,7 +19,7 @@ from pathjax.shapes.geometry import Geometry
 from pathjax.shapes.rectangle import Rectangle
 from pathjax.shapes.shape import Lamps, Primitives, Shape, Table
 from pathjax.shapes.sphere import Sphere
-from pathjax.shapes.triangle import FORMATS, Mesh
+from pathjax.shapes.triangle import FORMATS, Mesh, SerializedMesh
 
 __all__ = [
     "KINDS",
@@ -44,6 +44,7 @@ KINDS: dict[str, type[Shape]] = {
     "disk": Disk,
     "cube": Cube,
     **dict.fromkeys(FORMATS, Mesh),
+    "serialized": SerializedMesh,
 }
 
 

@@ -255,6 +255,20 @@ class Mesh(Shape):
         return Facets(self.vertices[faces], normals, None if self.uv is None else self.uv[faces])
 
 
+class SerializedMesh(Mesh):
+    """One mesh of a file that holds several."""
+
+    @classmethod
+    def read(cls, loader, fields: Fields):
+        return loader.read_mesh(
+            loader.find(fields, "filename"),
+            fields.type,
+            fields.transform("to_world"),
+            face_normals=fields.boolean("face_normals", False),
+            part=fields.integer("shape_index", 0, at_least=0),
+        )
+
+
 def leaf_numbers(vertices):
     """(P, 3, 3) -> (P, 9), what a leaf keeps of each triangle: x of the vertices, y, z."""
     return np.swapaxes(np.asarray(vertices), 1, 2).reshape(-1, 9)

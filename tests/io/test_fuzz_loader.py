@@ -1,6 +1,7 @@
 """Whatever bytes a file holds, a loader returns or raises InputError; nothing else escapes, and nothing hangs."""
 
 import re
+import zlib
 
 import numpy as np
 import pytest
@@ -78,6 +79,12 @@ GLTF_SPARSE = GLTF.replace(
     '"type": "VEC3", "sparse": {"count": 1, "indices": {"bufferView": 0, "byteOffset": 12, "componentType": 5121},'
     '"values": {"bufferView": 0}}}',
 ).replace('"POSITION": 0}', '"POSITION": 0}, "mode": 5')
+SERIALIZED = b"\x1c\x04\x03\x00" + zlib.compress(
+    np.array([0x1000, 3, 0, 1, 0], "<u4").tobytes()
+    + np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0)], "<f4").tobytes()
+    + np.arange(3, dtype="<u4").tobytes(),
+    level=0,  # so that damage comes to the numbers themselves
+)
 MESHES = {
     "obj": ("obj", OBJ.encode(), 1),
     "obj with odd lines": ("obj", OBJ_ODD.encode(), 2),
@@ -88,6 +95,7 @@ MESHES = {
     "text stl": ("stl", STL_TEXT.encode(), 1),
     "gltf": ("gltf", GLTF.encode(), 1),
     "sparse gltf of a strip": ("gltf", GLTF_SPARSE.encode(), 1),
+    "serialized": ("serialized", SERIALIZED, 1),
 }
 
 WORDS = ["", "nan", "-1", "0", "1e999", "1e38", "true", "x", "$res", "$none", "ball", "wall", "diffuse", "\u0660"]

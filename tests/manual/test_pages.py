@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+import struct
+import zlib
 
 import pytest
 
@@ -80,6 +82,7 @@ PLACES = {
     "emitter": '<sensor type="perspective"/>{}',
     "area light": '<sensor type="perspective"/><shape type="cube">{}</shape>',
 }
+MESHES = ("obj", "ply", "stl", "glb", "gltf", "serialized")
 # What an element must have to be read at all; the second of a pair, where one excludes the other.
 NEEDS = {
     "perspective": ["", '<float name="fov" value="40"/>'],
@@ -87,7 +90,12 @@ NEEDS = {
     "twosided": ['<bsdf type="diffuse"/>'],
     "bitmap": ['<string name="filename" value="marks.png"/>'],
     **dict.fromkeys(("aov", "moment", "stokes"), ['<integrator type="path"/>']),
-} | {kind: [f'<string name="filename" value="mesh.{kind}"/>'] for kind in ("obj", "ply", "stl", "glb", "gltf")}
+} | {kind: [f'<string name="filename" value="mesh.{kind}"/>'] for kind in MESHES}
+
+# One triangle. Of the formats this is the one that trimesh cannot write.
+SERIALIZED = b"\x1c\x04\x03\x00" + zlib.compress(
+    struct.pack("<IQQ", 0x1000, 3, 1) + struct.pack("<9f", 0, 0, 0, 1, 0, 0, 0, 1, 0) + struct.pack("<3I", 0, 1, 2)
+)
 
 
 @pytest.fixture(scope="module")
@@ -97,7 +105,8 @@ def refusal(root, tmp_path_factory):
 
     folder = tmp_path_factory.mktemp("kinds")
     (folder / "marks.png").write_bytes((root / "tests" / "scenes" / "textures" / "marks.png").read_bytes())
-    for kind in ("obj", "ply", "stl", "glb", "gltf"):
+    (folder / "mesh.serialized").write_bytes(SERIALIZED)
+    for kind in MESHES[:-1]:
         mesh = trimesh.creation.box()
         if kind == "gltf":
             for name, data in mesh.export(file_type="gltf").items():

@@ -1,11 +1,11 @@
-"""Triangle meshes from OBJ, PLY, STL and glTF files, in world space and fit to be traced.
+"""Triangle meshes from OBJ, PLY, STL, glTF and Mitsuba's serialized files, in world space and fit to be traced.
 
 A file for each format says what is in it (`Raw`); `load` checks that, cuts polygons into triangles, and carries them to
 world space.
 
 uv of a `Mesh` points v downwards: (u, v) looks up `texels[int(v * H), int(u * W)]`, the top row of the image first.
 glTF files store it like that. OBJ files count v from the bottom of the image, so it is flipped (`flip_tex_coords`
-true by default); of PLY, Mitsuba assumes that nothing is to be flipped, and so does this loader.
+true by default); of PLY and serialized files, Mitsuba assumes that nothing is to be flipped, and so does this loader.
 """
 
 from __future__ import annotations
@@ -15,11 +15,20 @@ from pathlib import Path
 import numpy as np
 
 from pathjax.errors import InputError
-from pathjax.io.mesh import gltf, obj, ply, polygons, stl
+from pathjax.io.mesh import gltf, obj, ply, polygons, serialized, stl
 from pathjax.io.mesh.raw import Raw
 from pathjax.shapes import Mesh
 
-READERS = {"obj": obj.read, "ply": ply.read, "stl": stl.read, "glb": gltf.read, "gltf": gltf.read}
+READERS = {
+    "obj": obj.read,
+    "ply": ply.read,
+    "stl": stl.read,
+    "glb": gltf.read,
+    "gltf": gltf.read,
+    "serialized": serialized.read,
+}
+# Formats whose meshes are shaded smoothly where the file has no normals.
+SMOOTH = ("obj", "ply", "serialized")
 
 
 def load(
@@ -28,25 +37,27 @@ def load(
     to_world: np.ndarray,
     face_normals: bool = False,
     flip_tex_coords: bool | None = None,
+    part: int | None = None,
 ) -> tuple[Mesh, list[str]]:
     """Read a mesh, carry it to world space, and leave out degenerate triangles.
 
-    Shading normals are the file's; where OBJ and PLY have none they are means of the faces around, weighted by angle,
-    as Mitsuba makes them, and where these cancel the faces are flat. STL and glTF without normals are flat. A mirroring
-    `to_world` turns faces inside out, as in Mitsuba; where the file has normals those decide, and the order of vertices
-    is reversed to agree with them.
+    Shading normals are the file's; where OBJ, PLY and serialized files have none they are means of the faces around,
+    weighted by angle, as Mitsuba makes them, and where these cancel the faces are flat. STL and glTF without normals
+    are flat. A mirroring `to_world` turns faces inside out, as in Mitsuba; where the file has normals those decide, and
+    the order of vertices is reversed to agree with them.
 
     Args:
-        kind: "obj", "ply", "stl", "glb" or "gltf".
+        kind: "obj", "ply", "stl", "glb", "gltf" or "serialized".
         to_world: (4, 4), affine and invertible.
         face_normals: flat shading whatever the file has.
         flip_tex_coords: v to 1 - v; None: what the format needs.
+        part: which mesh of a serialized file.
     Returns:
         the mesh, without faces if all its triangles are degenerate, and notes worth telling the user.
     Raises:
         InputError: unreadable file, no triangles, an index out of range, a coordinate that is not finite in float32.
     """
-    raw = _read(Path(path), kind)
+    raw = _read(Path(path), kind, () if part is None else (part,))
     vertices = _transformed(path, raw.vertices, to_world)
     notes = list(raw.notes)
     if raw.sizes is None:
@@ -64,7 +75,7 @@ def load(
         notes.append(f"{dropped} degenerate triangles left out")
 
     normals, uv = None, raw.uv
-    if not face_normals and (raw.normals is not None or kind in ("obj", "ply")):
+    if not face_normals and (raw.normals is not None or kind in SMOOTH):
         if raw.normals is None:
             given, lacking = np.empty_like(vertices), np.ones(len(vertices), bool)
         else:
@@ -96,10 +107,10 @@ def load(
     return Mesh(vertices, np.ascontiguousarray(faces), normals, uv, dropped), [f"{path}: {note}" for note in notes]
 
 
-def _read(path: Path, kind: str) -> Raw:
+def _read(path: Path, kind: str, part: tuple[int, ...]) -> Raw:
     """What the file says; all indices and all normals and uv are sound."""
     try:
-        raw = READERS[kind](path)
+        raw = READERS[kind](path, *part)
     except InputError:
         raise
     except Exception as error:  # of the libraries, or brought about by a header that is not as the format says
