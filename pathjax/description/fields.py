@@ -5,9 +5,11 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
+from pathlib import Path
 
 import numpy as np
 
+from pathjax.description import spectra
 from pathjax.description.elements import Document, Element, nearest, require_attributes
 from pathjax.errors import InputError
 from pathjax.kinds import Unused
@@ -17,12 +19,8 @@ OBJECTS = ("integrator", "sensor", "sampler", "film", "rfilter", "shape", "bsdf"
 # Objects that Mitsuba's participating media are made of.
 NOT_MODELLED = ("medium", "phase", "volume")
 
-# A uniform spectrum of 1 has CIE XYZ (1, 1, 1): this colour in linear sRGB. Mitsuba's RGB mode emits it for a spectrum
-# used as radiance; used as reflectance, the spectrum is lit by the white point and stays (1, 1, 1).
-UNIFORM_RADIANCE = np.array(
-    [[3.240479, -1.537150, -0.498535], [-0.969256, 1.875991, 0.041556], [0.055648, -0.204043, 1.057311]]
-).sum(axis=1)
-
+# Spectra that are plugins of their own.
+TYPED = ("uniform", "d65", "srgb")
 NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 REQUIRED = object()
 
@@ -39,6 +37,7 @@ class Fields:
         self._values: dict[str, Element] = {}
         self._objects: list[Element] = []
         self._taken: set[str] = set()
+        self.notes: list[str] = []  # what `info` should tell
         for child in element.children:
             target = document.resolve(child)
             if target.tag in NOT_MODELLED:
@@ -126,13 +125,19 @@ class Fields:
         return default if element is None else triple(element, default=None, extra=("name",))
 
     def color(self, name: str, default=REQUIRED, *, at_most: float = math.inf, radiance: bool = False):
-        """(3,) float64 linear RGB from <rgb>, a uniform <spectrum> or a <float>, each channel in [0, at_most]."""
-        element = self._take(name, default, ("rgb", "spectrum", "float"))
+        """(3,) float64 linear RGB, each channel in [0, at_most], from <rgb>, <spectrum> or a number.
+
+        radiance: of a light; else it is a reflectance, or an index of refraction, as seen under white light.
+        """
+        element = self._take(name, default, ("rgb", "spectrum", "float", "integer"))
         if element is None:
             return default
+        if element.tag == "spectrum" and "type" in element.attributes:
+            return self._typed_spectrum(element, at_most)
+        by_wavelength = "filename" in element.attributes or ":" in element.attributes.get("value", "")
+        if element.tag == "spectrum" and by_wavelength:
+            return self._listed_spectrum(element, at_most, radiance)
         text = _value(element)
-        if element.tag == "spectrum" and ":" in text:
-            raise element.error(f"{element}: a spectrum by wavelengths is not supported; give linear RGB as <rgb>")
         if text.strip().startswith("#"):
             raise element.error(f'{element}: hexadecimal colours are not supported; give linear RGB, value="r, g, b"')
         values = np.array(numbers(element, text))
@@ -141,8 +146,49 @@ class Fields:
         if values.min() < 0 or values.max() > at_most:
             limit = "not be negative" if at_most == math.inf else f"lie between 0 and {at_most:g}"
             raise self.error(name, f"must {limit}, is {text.strip()[:60]}")
-        scale = UNIFORM_RADIANCE if radiance and element.tag == "spectrum" else np.ones(3)
+        scale = spectra.UNIFORM_RADIANCE if radiance and element.tag == "spectrum" else np.ones(3)
         return values * scale
+
+    def _typed_spectrum(self, element: Element, at_most: float) -> np.ndarray:
+        """Of a spectrum that is a plugin of its own: none of these is converted by Mitsuba, but taken as linear RGB."""
+        fields = Fields(self.document, element)
+        match fields.type:
+            case "uniform":
+                color = np.full(3, fields.float("value", at_least=0, at_most=at_most))
+            case "srgb":
+                color = fields.color("color", at_most=at_most)
+            case "d65":
+                color = fields.color("color", np.ones(3)) * fields.float("scale", 1.0, at_least=0)
+                if color.max() > at_most:
+                    raise element.error(f"{element} must lie between 0 and {at_most:g}, is {color.max():g}")
+            case "blackbody" | "regular" | "irregular":
+                remedy = 'give its colour as <rgb>, or wavelengths as <spectrum value="400:0.1, 500:0.2, ...">'
+                raise element.error(f"{element} has no colour in Mitsuba's RGB mode, which scenes are in; {remedy}")
+            case _:
+                raise element.error(f"{element} is not supported; use one of {', '.join(TYPED)}")
+        fields.finish()
+        return color
+
+    def _listed_spectrum(self, element: Element, at_most: float, radiance: bool) -> np.ndarray:
+        """Of values by wavelength, which stand in the file, or in one that it names."""
+        if "filename" in element.attributes:
+            require_attributes(element, required=("name", "filename"))
+            pairs = _pairs_of_file(self.document.find(element.attributes["filename"], element), element)
+        else:
+            pairs = [numbers(element, each.replace(":", " ")) for each in re.split(r"[\s,]+", _value(element).strip())]
+            if any(len(pair) != 2 for pair in pairs):
+                raise element.error(f'{element} must be pairs of a wavelength in nm and a value, "400:0.1, 500:0.2"')
+        wavelengths, values = np.array(pairs).T if len(pairs) > 1 else (np.zeros(1),) * 2
+        if not (np.diff(wavelengths) > 0).all() or len(pairs) < 2:
+            raise element.error(f"{element} must have two wavelengths or more, in ascending order")
+        color = spectra.rgb(wavelengths, values, lit=not radiance)
+        if not (np.abs(color) < 3e38).all():
+            raise element.error(f"{element} overflows")
+        shown = np.clip(color, 0, at_most)
+        if (shown != color).any():
+            was = ", ".join(f"{c:.4g}" for c in color)
+            self.notes.append(f"{element.file}:{element.line}: {element} has the colour {was}, which is clipped")
+        return shown
 
     def texture(self, name: str) -> Element | None:
         """The <texture> that sets `name`, or None where it is something else, to be read by `color`."""
@@ -206,7 +252,7 @@ class Fields:
         if element.tag not in tags:
             kind = element.tag if element.tag != "ref" else "texture"
             raise self.error(name, f"cannot be a <{kind}>; give it as {' or '.join(f'<{tag}>' for tag in tags)}")
-        if element.children and element.tag not in ("transform", "texture"):
+        if element.children and element.tag not in ("transform", "texture") and "type" not in element.attributes:
             raise element.children[0].error(f"{element.children[0]} has no place inside {element}")
         return element
 
@@ -322,11 +368,23 @@ def _unit(step: Element, vector: np.ndarray, complaint: str) -> np.ndarray:
     return vector / length
 
 
+def _pairs_of_file(path: Path, element: Element) -> list[list[float]]:
+    """Wavelengths and values, a pair a line; what begins with # is a comment."""
+    try:
+        text = path.read_text(encoding="utf-8", errors="replace")
+    except OSError as error:
+        raise element.error(f"{path} cannot be read: {error.strerror}") from None
+    pairs = []
+    for count, line in enumerate(text.splitlines(), 1):
+        if not line.strip() or line.lstrip().startswith("#"):
+            continue
+        pairs.append(numbers(element, line))
+        if len(pairs[-1]) != 2:
+            raise element.error(f"{path}:{count}: {line.strip()[:40]!r} must be a wavelength in nm and a value")
+    return pairs
+
+
 def _value(element: Element) -> str:
-    for key in ("type", "filename"):
-        if element.tag == "spectrum" and key in element.attributes:
-            kind = f'<spectrum {key}="{element.attributes[key][:60]}">'
-            raise element.error(f"{kind} is not supported yet; give linear RGB as <rgb>")
     require_attributes(element, required=("name", "value"))
     return element.attributes["value"]
 

@@ -9,7 +9,7 @@ import pytest
 
 import pathjax as pj
 from pathjax import emitters, transport
-from pathjax.description.fields import UNIFORM_RADIANCE
+from pathjax.description.spectra import UNIFORM_RADIANCE
 from pathjax.emitters import Directional, Point, Spot
 from pathjax.emitters.selection import AllRows
 from pathjax.kinds import Parameters, Row

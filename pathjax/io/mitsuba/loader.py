@@ -120,7 +120,7 @@ class _Loader:
         kind = kinds[fields.type]
         made = (read or kind.read)(self, fields, *context)
         self.making.remove(element)
-        self.notes += fields.without_effect(kind.unused)
+        self.notes += fields.notes + fields.without_effect(kind.unused)
         fields.finish()
         return made
 
