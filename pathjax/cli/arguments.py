@@ -95,6 +95,8 @@ def _add_scene(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--set", dest="settings", action="append", default=[], type=_pair, metavar="NAME=VALUE", help="set a parameter"
     )
+    sensor = "which of several sensors of the file: its number, from 0, or its id"
+    parser.add_argument("--sensor", default="0", metavar="WHICH", help=sensor)
 
 
 def _pair(text: str) -> tuple[str, str]:

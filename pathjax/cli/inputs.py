@@ -18,7 +18,7 @@ def load(options) -> Scene:
 
 def _load(options) -> Scene:
     keep_kernels()
-    scene = build(loader.load(options.scene, **dict(options.defines)))
+    scene = build(loader.load(options.scene, options.sensor, **dict(options.defines)))
     return with_parameters(scene, {name: numbers("--set", name, text) for name, text in options.settings})
 
 

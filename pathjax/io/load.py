@@ -19,6 +19,7 @@ from pathjax.scene.scene import Scene
 def load_scene(
     file: str | os.PathLike,
     *,
+    sensor: int | str = 0,
     dtype: DTypeLike = jnp.float32,
     split_rule: str = "sah",
     parameters: Mapping[str, object] | None = None,
@@ -28,6 +29,7 @@ def load_scene(
 
     Args:
         file: path of the scene file.
+        sensor: which of several to use: its number, from 0, or its id.
         dtype: of all real numbers; float64 needs `jax_enable_x64`.
         split_rule: how hierarchies are split, for experiments: "sah" (least expected cost), "equal" (equal counts) or
             "middle" (in the middle of the centroids' bounds). Images are the same; only their cost differs.
@@ -41,7 +43,7 @@ def load_scene(
     parameters = dict(parameters or {})
     for name in parameters.keys() & keywords.keys():
         raise InputError(f"the parameter {name} is given twice, in parameters and as a keyword; give it once")
-    scene = build(loader.load(file, **parameters, **keywords), dtype, split_rule)
+    scene = build(loader.load(file, sensor, **parameters, **keywords), dtype, split_rule)
     if dark := emitters.darkness(scene.emitters):
         warnings.warn(f"{file}: {dark}, so images of it are black", InputWarning, stacklevel=2)
     return scene

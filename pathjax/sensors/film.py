@@ -57,10 +57,8 @@ class HDRFilm:
             window = f"({x}, {y}) + ({crop_width}, {crop_height})"
             raise fields.element.error(f"the crop window {window} reaches beyond the film, ({width}, {height})")
         pixel_format = fields.string("pixel_format", "rgb", choices=PIXEL_FORMATS)
-        if pixel_format not in ("rgb", "rgba"):
-            raise fields.error("pixel_format", f'cannot be "{pixel_format}", as images are linear RGB; use rgb')
-        if pixel_format == "rgba":
-            loader.note(fields.where("pixel_format"), "asks for alpha, which is not written; colours are the same")
+        if pixel_format != "rgb":
+            loader.note(fields.where("pixel_format"), f"asks for {pixel_format}; images are linear RGB here")
         nested = fields.objects("rfilter")
         filter = loader.make(nested[0], filters.KINDS) if nested else cls.filter
         return cls(width, height, (x, y, crop_width, crop_height), filter)

@@ -33,6 +33,14 @@ def test_split_rule_reaches_the_hierarchy(root):
         pj.load_scene(root / "scenes" / "mesh.xml", split_rule="luck")
 
 
+def test_each_of_several_sensors_gives_a_scene_of_its_own(write_scene):
+    second = '<sensor type="perspective" id="near"><float name="fov" value="20"/></sensor>'
+    file = write_scene(MESH + second)
+    views = [pj.load_scene(file, sensor=which) for which in (0, 1, "near")]
+    extents = [float(view.camera.extent[0]) for view in views]
+    assert abs(extents[0]) > abs(extents[1]) == abs(extents[2])
+
+
 def test_a_file_parameter_named_like_an_argument_is_set_by_the_mapping(write_scene):
     scene = pj.load_scene(write_scene(MESH), parameters={"dtype": "0.5, 0.25, 0.125"})
     np.testing.assert_array_equal(pj.parameters(scene)["wall.reflectance"], [0.5, 0.25, 0.125])

@@ -602,8 +602,6 @@ FILM = '<film type="hdrfilm">{}</film>'
         (FILM.format('<float name="width" value="10"/>'), "cannot be a <float>"),
         (FILM.format('<integer name="widht" value="10"/>'), 'did you mean "width"'),
         (FILM.format('<integer name="crop_offset_x" value="10"/>'), "beyond the film"),
-        (FILM.format('<string name="pixel_format" value="luminance"/>'), "as images are linear RGB; use rgb"),
-        (FILM.format('<string name="pixel_format" value="xyza"/>'), "as images are linear RGB; use rgb"),
         (FILM.format('<string name="pixel_format" value="rbg"/>'), 'did you mean "rgb"'),
         (FILM.format('<string name="banner" value="no"/>'), "cannot be a <string>; give it as <boolean>"),
         (FILM.format('<rfilter type="mitchell"/>'), "is not supported yet; use one of box, tent, gaussian"),
@@ -786,10 +784,25 @@ def test_the_first_of_several_sensors_is_used(read):
     assert any('scene.xml:2: <sensor type="orthographic"> is left out' in note for note in scene.notes)
 
 
-def test_rgba_is_rgb_without_alpha(read):
-    film = '<film type="hdrfilm"><string name="pixel_format" value="RGBA"/></film>'
+@pytest.mark.parametrize("which", [1, "1", "right"])
+def test_another_sensor_is_chosen_by_its_number_or_id(tmp_path, which):
+    views = "".join(
+        f'<sensor type="perspective" id="{name}"><float name="fov" value="{fov}"/></sensor>'
+        for name, fov in (("left", 30), ("right", 50))
+    )
+    (tmp_path / "scene.xml").write_text(f'<scene version="3.0.0">{views}</scene>')
+    assert load(tmp_path / "scene.xml", which).camera.fov == 50
+    with pytest.raises(InputError, match=r'scene.xml: there is no sensor \'rihgt\'; use 0 to 1 or left, right; did'):
+        load(tmp_path / "scene.xml", "rihgt")
+    with pytest.raises(InputError, match="there is no sensor 2; use 0 to 1"):
+        load(tmp_path / "scene.xml", 2)
+
+
+@pytest.mark.parametrize("pixels", ["RGBA", "luminance", "luminance_alpha", "xyz", "xyza"])
+def test_images_are_linear_rgb_whatever_the_pixel_format(read, pixels):
+    film = f'<film type="hdrfilm"><string name="pixel_format" value="{pixels}"/></film>'
     scene = read("", sensor=f'<sensor type="perspective">{film}</sensor>')
-    assert any("asks for alpha, which is not written" in note for note in scene.notes)
+    assert any(f"asks for {pixels.lower()}; images are linear RGB here" in note for note in scene.notes)
 
 
 def test_a_light_may_be_referred_to_by_its_shape(read):

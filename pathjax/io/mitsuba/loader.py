@@ -15,6 +15,7 @@ from pathjax import bsdfs, emitters, sensors, textures
 from pathjax import description as d
 from pathjax.description.elements import Document, Element, nearest
 from pathjax.description.fields import NOT_MODELLED, VALUES, Fields
+from pathjax.errors import InputError
 from pathjax.io import mesh
 from pathjax.io.mitsuba import integrators, samplers
 from pathjax.io.mitsuba.plugins import PLUGINS
@@ -25,15 +26,16 @@ from pathjax.shapes import KINDS as SHAPES
 from pathjax.shapes import Mesh
 
 
-def load(path: str | Path, /, **parameters: object) -> d.Description:
+def load(path: str | Path, sensor: int | str = 0, /, **parameters: object) -> d.Description:
     """Read a scene file and the meshes and images that it names.
 
     Args:
+        sensor: which of several to use: its number, or its id.
         parameters: values for the file's `$name`s, in place of its `default`s.
     Raises:
         InputError: a file cannot be read, or asks for what pathjax does not model.
     """
-    return _Loader(read(path, parameters)).description(str(path))
+    return _Loader(read(path, parameters)).description(str(path), sensor)
 
 
 class _Loader:
@@ -48,7 +50,7 @@ class _Loader:
         self.made: dict[Element, object] = {}  # an element that is referenced twice is one object
         self.on_shapes: dict[Element, Element] = {}  # a light by reference, and the shape that it shines from
 
-    def description(self, file: str) -> d.Description:
+    def description(self, file: str, sensor: int | str = 0) -> d.Description:
         scene: dict[str, list[Element]] = {tag: [] for tag in (*TOP_LEVEL, *NOT_MODELLED)}
         settings = []
         for element in self.document.root.children:
@@ -67,10 +69,12 @@ class _Loader:
             raise element.error(f"{element}: one <integrator> is supported here; the first is at {first}")
         if not scene["sensor"]:
             raise self.document.root.error('the scene has no <sensor>; add <sensor type="perspective">')
-        for element in scene["sensor"][1:]:
-            self.note(element, f"is left out, as the first sensor is used, at line {scene['sensor'][0].line}")
+        seen = _chosen(scene["sensor"], sensor)
+        for element in scene["sensor"]:
+            if element is not seen:
+                self.note(element, f"is left out, as the sensor at line {seen.line} is used; `sensor` chooses another")
 
-        camera, film, spp, sampler = self.make(scene["sensor"][0], sensors.KINDS, read=_sensor)
+        camera, film, spp, sampler = self.make(seen, sensors.KINDS, read=_sensor)
         if scene["integrator"]:
             integrator = self.make(scene["integrator"][0], integrators.KINDS)
         else:
@@ -196,6 +200,17 @@ def _shape(loader: _Loader, fields: Fields, name: str) -> d.Shape | None:
         loader.note(fields.element, f"is left out, as no triangle has an area{light}")
         return None
     return d.Shape(name, geometry, bsdf, emitter, flip_normals)
+
+
+def _chosen(elements: list[Element], which: int | str) -> Element:
+    """The sensor of this number, or id."""
+    for number, element in enumerate(elements):
+        if which in (number, str(number)) or (element.id and which == element.id):
+            return element
+    ids = [element.id for element in elements if element.id]
+    known = f"0 to {len(elements) - 1}" + (f" or {', '.join(ids)}" if ids else "")
+    place = elements[0]
+    raise InputError(f"{place.file}: there is no sensor {which!r}; use {known}{nearest(str(which), ids)}")
 
 
 def _sensor(loader: _Loader, fields: Fields) -> tuple[sensors.Sensor, film.HDRFilm, int, str]:
