@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pathjax.errors import InputError
-from pathjax.images.decoder import file_format
+from pathjax.images.decoder import LINEAR, file_format
 from pathjax.images.exr import read_exr
 from pathjax.images.metrics import flip, mse, psnr, rel_mse, relative_error, sidak_p, z_scores
 from pathjax.images.picture import side_by_side, signed_colors
@@ -53,7 +53,7 @@ def compare(image_file: str, reference_file: str, errors: bool = False) -> Compa
         raise InputError(f"{image_file}, {reference_file}: no pixel is finite in both, so there is nothing to compare")
 
     a, b = image[compared], reference[compared]
-    hdr = all(file_format(file) == "OpenEXR" for file in files)
+    hdr = all(file_format(file) in LINEAR for file in files)
     peak = max(float(b.max()), 0.0) if hdr else 1.0
     shown = compared[..., None]
     differences = flip(np.where(shown, image, 0), np.where(shown, reference, 0), hdr)

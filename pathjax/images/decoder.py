@@ -11,11 +11,18 @@ import numpy as np
 from pathjax.errors import InputError
 
 MAX_PIXELS = 10**9
-_FIRST_BYTES = {"OpenEXR": b"\x76\x2f\x31\x01", "PNG": b"\x89PNG\r\n\x1a\n", "JPEG": b"\xff\xd8\xff"}
+_FIRST_BYTES = {
+    "OpenEXR": b"\x76\x2f\x31\x01",
+    "Radiance HDR": b"#?",
+    "PNG": b"\x89PNG\r\n\x1a\n",
+    "JPEG": b"\xff\xd8\xff",
+}
+# Formats of linear numbers, which are measured; the others are looked at.
+LINEAR = ("OpenEXR", "Radiance HDR")
 
 
 def file_format(path: str | Path) -> str:
-    """Return "OpenEXR", "PNG" or "JPEG", by the file's first bytes, whatever its name says.
+    """Return "OpenEXR", "Radiance HDR", "PNG" or "JPEG", by the file's first bytes, whatever its name says.
 
     Raises:
         InputError: no such file, no right to read it, or another format.
@@ -31,7 +38,7 @@ def file_format(path: str | Path) -> str:
         if start.startswith(first):
             return name
     reason = "begins like another format" if start else "is empty"
-    raise InputError(f"{path}: not supported, as it {reason}; use OpenEXR, PNG or JPEG")
+    raise InputError(f"{path}: not supported, as it {reason}; use OpenEXR, Radiance HDR, PNG or JPEG")
 
 
 class Unreadable(Exception):

@@ -6,12 +6,13 @@ from pathlib import Path
 
 import numpy as np
 
-from pathjax.images import exr, png
+from pathjax.images import exr, hdr, png
 from pathjax.images.decoder import file_format
 
 
 def read_rgb(path: str | Path, raw: bool = False) -> np.ndarray:
-    """(H, W, 3) float32 linear RGB with the primaries of Rec. 709, the top row first, from OpenEXR, PNG or JPEG.
+    """(H, W, 3) float32 linear RGB with the primaries of Rec. 709, the top row first, from OpenEXR, Radiance
+    HDR, PNG or JPEG.
 
     Grey is repeated and alpha left out, as in Mitsuba: colours of OpenEXR are multiplied by alpha already, as light
     that reached the camera is; those of PNG are taken as they stand. PNG and JPEG are sRGB, also with 16 bits; their
@@ -22,12 +23,13 @@ def read_rgb(path: str | Path, raw: bool = False) -> np.ndarray:
     window.
 
     Args:
-        raw: PNG and JPEG hold plain numbers (stored / maximum), not sRGB. OpenEXR is linear in any case.
+        raw: PNG and JPEG hold plain numbers (stored / maximum), not sRGB. OpenEXR and HDR are linear in any case.
     Raises:
         InputError: no such file, another format, a damaged file, or one that does not tell which colours are meant.
     """
-    if file_format(path) == "OpenEXR":
-        return exr.read_colors(path)
+    readers = {"OpenEXR": exr.read_colors, "Radiance HDR": hdr.read_colors}
+    if reader := readers.get(file_format(path)):
+        return reader(path)
     stored = png.read_stored(path)
     maximum = np.iinfo(stored.dtype).max
     levels = np.arange(maximum + 1) / maximum

@@ -153,16 +153,27 @@ def png(width, height, bits, color, rows, interlaced=False, chunks=b""):
     return b"\x89PNG\r\n\x1a\n" + b"".join(parts)
 
 
+def hdr(line="# a remark", size="-Y 1 +X 2", form="rgbe", rows=bytes((200, 100, 50, 129, 0, 0, 0, 0))):
+    """Rows as they were before they were compressed, which narrow images still have."""
+    return f"#?RADIANCE\n{line}\nFORMAT=32-bit_rle_{form}\n\n{size}\n".encode() + rows
+
+
 @pytest.mark.parametrize(
     ("name", "data", "words"),
     [
-        ("a.exr", b"", "not supported, as it is empty; use OpenEXR, PNG or JPEG"),
+        ("a.exr", b"", "not supported, as it is empty; use OpenEXR, Radiance HDR, PNG or JPEG"),
         ("a.exr", b"\x76\x2f\x31\x01\x02\0\0\0garbage", "cannot be read as OpenEXR"),
         ("a.png", b"", "not supported, as it is empty"),
         ("a.png", b"\x89PNG\r\n\x1a\n\0\0", "cannot be read as PNG: .*damaged"),
         ("a.png", png(100_000, 100_000, 8, 2, b""), "cannot be read as PNG|pixels"),
         ("a.png", png(4, 4, 8, 2, b"\0" * 10), "cannot be read as PNG: .*damaged"),
         ("a.jpg", b"\xff\xd8\xff", "cannot be read as JPEG: .*damaged"),
+        ("a.hdr", b"#?RADIANCE\n", "cannot be read as Radiance HDR: .*damaged"),
+        ("a.hdr", hdr(rows=b"\1\2\3"), "cannot be read as Radiance HDR: .*damaged"),
+        ("a.hdr", hdr(size="+Y 1 +X 2"), 'cannot be read as Radiance HDR: its rows do not run as "-Y height'),
+        ("a.hdr", hdr("GAMMA=2.2"), "cannot be read as Radiance HDR: it states a gamma"),
+        ("a.hdr", hdr(form="xyze"), "cannot be read as Radiance HDR"),
+        ("a.hdr", hdr(size="-Y 100000 +X 100000"), "cannot be read as Radiance HDR: .*may not exceed"),
         ("a.tif", b"II*\0", "not supported, as it begins like another format; use"),
         ("a", b"", "not supported"),
     ],
@@ -180,6 +191,30 @@ def test_missing_images_are_refused(tmp_path):
             read(tmp_path / "none.exr")
         with pytest.raises(InputError, match="not a file"):
             read(tmp_path)
+
+
+# ---- Radiance HDR --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("line", ["EXPOSURE=8", "# a remark", "SOFTWARE=pathjax"])
+def test_hdr_is_mantissas_times_a_shared_power_of_two(tmp_path, line):
+    (tmp_path / "a.hdr").write_bytes(hdr(line))
+    expected = np.array([[[200, 100, 50], [0, 0, 0]]]) * 2.0 ** (129 - 128 - 8)
+    for raw in (False, True):
+        np.testing.assert_array_equal(read_rgb(tmp_path / "a.hdr", raw=raw), expected)
+
+
+def test_hdr_of_mitsuba_is_read_as_mitsuba_reads_it(tmp_path):
+    """Its rows are wide enough to be compressed."""
+    mi = pytest.importorskip("mitsuba")
+    mi.set_variant("scalar_rgb")
+    rng = np.random.default_rng(0)
+    pixels = rng.random((5, 40, 3)) * 10.0 ** rng.uniform(-4, 4, (5, 40, 1))
+    pixels[:, 7:30] = pixels[:, 7:8]
+    mi.Bitmap(pixels.astype(np.float32)).write(str(tmp_path / "a.hdr"))
+    found = read_rgb(tmp_path / "a.hdr")
+    np.testing.assert_array_equal(found, np.array(mi.Bitmap(str(tmp_path / "a.hdr"))))
+    assert (abs(found - pixels) <= pixels.max(-1, keepdims=True) * 2**-7).all()
 
 
 # ---- kinds of OpenEXR ---------------------------------------------------------------------------------------------

@@ -1,0 +1,28 @@
+"""Radiance's pictures (Ward 1991, "Real pixels"): linear numbers whose three channels share an exponent."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from pathjax.images.decoder import Unreadable, opened, read_pixels, require_size
+
+# As OpenImageIO tells the ways that rows may run: `-Y height +X width`, from the top and the left.
+_UPRIGHT = 1
+
+
+def read_colors(path: str | Path) -> np.ndarray:
+    """(H, W, 3) float32 linear RGB as it is stored: a stated exposure is not divided out, as Mitsuba has it.
+
+    Raises:
+        InputError: as `read_rgb`.
+    """
+    with opened(path) as image:
+        spec = image.spec()
+        require_size(spec)
+        if spec.getattribute("Orientation") != _UPRIGHT:
+            raise Unreadable('its rows do not run as "-Y height +X width" says; write them so')
+        if spec.getattribute("oiio:Gamma"):
+            raise Unreadable("it states a gamma, so its numbers are not linear; write it without one")
+        return read_pixels(image, 0, 0, 3, "float")
