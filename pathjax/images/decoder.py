@@ -16,13 +16,16 @@ _FIRST_BYTES = {
     "Radiance HDR": b"#?",
     "PNG": b"\x89PNG\r\n\x1a\n",
     "JPEG": b"\xff\xd8\xff",
+    "BMP": b"BM",
 }
 # Formats of linear numbers, which are measured; the others are looked at.
 LINEAR = ("OpenEXR", "Radiance HDR")
 
 
 def file_format(path: str | Path) -> str:
-    """Return "OpenEXR", "Radiance HDR", "PNG" or "JPEG", by the file's first bytes, whatever its name says.
+    """Return "OpenEXR", "Radiance HDR", "PNG", "JPEG" or "BMP", by the file's first bytes, whatever its name says.
+
+    What begins like none of them is "TGA", which has no mark of its own, if it is named so.
 
     Raises:
         InputError: no such file, no right to read it, or another format.
@@ -37,8 +40,10 @@ def file_format(path: str | Path) -> str:
     for name, first in _FIRST_BYTES.items():
         if start.startswith(first):
             return name
+    if start and Path(path).suffix.lower() == ".tga":
+        return "TGA"
     reason = "begins like another format" if start else "is empty"
-    raise InputError(f"{path}: not supported, as it {reason}; use OpenEXR, Radiance HDR, PNG or JPEG")
+    raise InputError(f"{path}: not supported, as it {reason}; use OpenEXR, Radiance HDR, PNG, JPEG, BMP or TGA")
 
 
 class Unreadable(Exception):

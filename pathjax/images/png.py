@@ -1,4 +1,4 @@
-"""PNG and JPEG, which are looked at: 8 or 16 bits of sRGB."""
+"""PNG, JPEG and their like, which are looked at: 8 or 16 bits of sRGB."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def write_png(path: str | Path, rgb: np.ndarray) -> None:
 
 
 def read_stored(path: str | Path) -> np.ndarray:
-    """(H, W, 3) uint8 or uint16 of a PNG or JPEG as they are stored, before the curve of sRGB.
+    """(H, W, 3) uint8 or uint16 of a PNG, JPEG, BMP or TGA as they are stored, before the curve of sRGB.
 
     Grey is repeated, alpha left out; fewer than 8 bits are spread over 0 to 255, and palettes are looked up.
 
@@ -50,7 +50,7 @@ def read_stored(path: str | Path) -> np.ndarray:
             raise Unreadable("it is CMYK, for a printer; convert it to RGB")
         channels = 3 if spec.nchannels >= 3 else 1
         stored = read_pixels(image, 0, 0, channels, spec.format)
-    return np.repeat(stored, 3 // channels, axis=-1)
+    return stored if channels == 3 else np.repeat(stored, 3, axis=-1)
 
 
 def storage(path: str | Path) -> tuple[int, np.ndarray]:

@@ -12,18 +12,18 @@ from pathjax.images.decoder import file_format
 
 def read_rgb(path: str | Path, raw: bool = False) -> np.ndarray:
     """(H, W, 3) float32 linear RGB with the primaries of Rec. 709, the top row first, from OpenEXR, Radiance
-    HDR, PNG or JPEG.
+    HDR, PNG, JPEG, BMP or TGA.
 
     Grey is repeated and alpha left out, as in Mitsuba: colours of OpenEXR are multiplied by alpha already, as light
-    that reached the camera is; those of PNG are taken as they stand. PNG and JPEG are sRGB, also with 16 bits; their
-    gamma, ICC profile and EXIF orientation are not applied, and of an animation its still image is read.
+    that reached the camera is; those of others are taken as they stand. All but OpenEXR and HDR are sRGB, also with 16
+    bits; their gamma, ICC profile and EXIF orientation are not applied, and of an animation its still image is read.
 
     From OpenEXR come R, G, B, or X, Y, Z, or Y; or R, G, B of a layer if there is one alone. X, Y, Z are converted, and
     so are primaries that the file states; white is not adapted. The image is the display window, 0 outside the data
     window.
 
     Args:
-        raw: PNG and JPEG hold plain numbers (stored / maximum), not sRGB. OpenEXR and HDR are linear in any case.
+        raw: plain numbers (stored / maximum) are meant, not sRGB. OpenEXR and HDR are linear in any case.
     Raises:
         InputError: no such file, another format, a damaged file, or one that does not tell which colours are meant.
     """

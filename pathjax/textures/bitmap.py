@@ -49,7 +49,7 @@ class Bitmap(Texture):
         counts = [image.shape[0] * image.shape[1] for image in images]
         columns = {
             "to_uv": np.asarray([np.eye(2, 3) if m is None else m for m in all_of("to_uv")], dtype),
-            "texels": np.asarray(np.concatenate([image.reshape(-1, 3) for image in images]), dtype),
+            "texels": np.asarray(_joined([image.reshape(-1, 3) for image in images]), dtype),
             "first": np.asarray(np.cumsum([0, *counts[:-1]]), np.int32),
             "size": np.asarray([image.shape[:2] for image in images], np.int32),
             "nearest": np.asarray([bool(nearest) for nearest in all_of("nearest")]),
@@ -83,6 +83,11 @@ class Bitmap(Texture):
     def refused(cls, name):
         why = "whose texels are too many for one derivative each; name a constant or the colours of a checkerboard"
         return {name: f"{name} is a bitmap, {why}"}
+
+
+def _joined(arrays: list[np.ndarray]) -> np.ndarray:
+    """One after another; of one alone no copy is made, as it may be large."""
+    return arrays[0] if len(arrays) == 1 else np.concatenate(arrays)
 
 
 def _wrapped(index, size, wrap):

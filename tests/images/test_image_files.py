@@ -161,7 +161,7 @@ def hdr(line="# a remark", size="-Y 1 +X 2", form="rgbe", rows=bytes((200, 100, 
 @pytest.mark.parametrize(
     ("name", "data", "words"),
     [
-        ("a.exr", b"", "not supported, as it is empty; use OpenEXR, Radiance HDR, PNG or JPEG"),
+        ("a.exr", b"", "not supported, as it is empty; use OpenEXR, Radiance HDR, PNG, JPEG, BMP or TGA"),
         ("a.exr", b"\x76\x2f\x31\x01\x02\0\0\0garbage", "cannot be read as OpenEXR"),
         ("a.png", b"", "not supported, as it is empty"),
         ("a.png", b"\x89PNG\r\n\x1a\n\0\0", "cannot be read as PNG: .*damaged"),
@@ -191,6 +191,27 @@ def test_missing_images_are_refused(tmp_path):
             read(tmp_path / "none.exr")
         with pytest.raises(InputError, match="not a file"):
             read(tmp_path)
+
+
+# ---- BMP and TGA ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("suffix", ["bmp", "tga"])
+@pytest.mark.parametrize("mode", ["RGB", "RGBA", "L"])
+@pytest.mark.parametrize("raw", [False, True])
+def test_bmp_and_tga_hold_srgb_like_png(tmp_path, suffix, mode, raw):
+    channels = {"RGB": 3, "RGBA": 4, "L": 1}[mode]
+    stored = np.random.default_rng(1).integers(0, 256, (4, 5, channels), np.uint8)
+    Image.fromarray(stored if channels > 1 else stored[..., 0], mode).save(tmp_path / f"a.{suffix}")
+    expected = np.broadcast_to(stored[..., :3] / 255, (4, 5, 3))
+    expected = expected if raw else srgb_to_linear(expected)
+    np.testing.assert_allclose(read_rgb(tmp_path / f"a.{suffix}", raw=raw), expected, atol=1e-6)
+
+
+def test_packed_tga_is_unpacked(tmp_path):
+    stored = np.repeat(np.arange(12, dtype=np.uint8).reshape(4, 1, 3), 5, axis=1)
+    Image.fromarray(stored).save(tmp_path / "a.tga", compression="tga_rle")
+    np.testing.assert_array_equal(read_stored(tmp_path / "a.tga"), stored)
 
 
 # ---- Radiance HDR --------------------------------------------------------------------------------------------------

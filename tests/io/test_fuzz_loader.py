@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from PIL import Image
 
 from pathjax.description import Description
 from pathjax.errors import InputError
@@ -210,15 +211,17 @@ def test_damaged_meshes_load_sound_or_are_refused(folder, name, data):
     assert made.uv is None or made.uv.shape == (len(made.vertices), 2)
 
 
-@pytest.mark.parametrize("suffix", ["exr", "png"])
+@pytest.mark.parametrize("suffix", ["exr", "png", "jpg", "bmp", "tga", "hdr"])
 @quickly(120)
 @given(data=st.data())
 def test_damaged_images_load_or_are_refused(folder, suffix, data):
     path = folder / f"i.{suffix}"
     if suffix == "exr":
         write_exr(path, {name: np.full((3, 4), 0.5) for name in "RGB"}, {})
+    elif suffix == "hdr":
+        path.write_bytes(b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 1 +X 2\n" + bytes((200, 100, 50, 129, 0, 0, 0, 0)))
     else:
-        write_png(path, np.full((3, 4, 3), 0.5))
+        Image.fromarray(np.full((3, 4, 3), 128, np.uint8)).save(path)
     path.write_bytes(data.draw(damaged(path.read_bytes()) | st.binary(max_size=100)))
     for read in (read_rgb, read_exr) if suffix == "exr" else (read_rgb,):
         try:
