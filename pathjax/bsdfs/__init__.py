@@ -1,7 +1,8 @@
 """How surfaces scatter: a file a kind, the table of kinds, and the dispatch over those that a scene holds.
 
 A bsdf is a subclass of `BSDF`, which says what it must offer and what it may be capable of. A material has a front and
-a back, each a bsdf or nothing, which absorbs: a kind, which is the place of a table, and a row in that table.
+a back, each a bsdf or nothing, which absorbs: a kind, which is the place of a table, and a row in that table. Where
+settings of bsdfs differ, they are in tables of their own.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from pathjax.bsdfs.conductor import Conductor
 from pathjax.bsdfs.dielectric import Dielectric
 from pathjax.bsdfs.diffuse import Diffuse
 from pathjax.bsdfs.plastic import Plastic
+from pathjax.bsdfs.roughconductor import RoughConductor
 from pathjax.bsdfs.twosided import TwoSided
 from pathjax.core.math import at
 from pathjax.core.types import BSDFSample, Surface
@@ -27,12 +29,24 @@ from pathjax.kinds import Column, Instance, Parameters, Row, Table, ordered
 from pathjax.kinds import register as register_kind
 from pathjax.textures import Textures
 
-__all__ = ["KINDS", "BSDF", "Conductor", "Dielectric", "Diffuse", "Materials", "Plastic", "TwoSided", "register"]
+__all__ = [
+    "KINDS",
+    "BSDF",
+    "Conductor",
+    "Dielectric",
+    "Diffuse",
+    "Materials",
+    "Plastic",
+    "RoughConductor",
+    "TwoSided",
+    "register",
+]
 
 # By the name that scene files give them.
 KINDS: dict[str, type[BSDF]] = {
     "diffuse": Diffuse,
     "conductor": Conductor,
+    "roughconductor": RoughConductor,
     "dielectric": Dielectric,
     "plastic": Plastic,
     "twosided": TwoSided,
@@ -66,20 +80,22 @@ def build(bsdfs: list[Instance], dtype, path: tuple, parameters: Parameters) -> 
     made, codes = textures.build(list(used), dtype, (*path, "textures"), parameters)
     tables, places = [], {None: (-1, 0)}
     for kind, rows in ordered(present, KINDS).items():
-        places |= {side: (len(tables), row) for row, side in enumerate(rows)}
-        tables.append(kind.build(rows, dtype, (*path, "tables", len(tables)), parameters, codes.get))
+        for variant in sorted({kind.variant(row) for row in rows}):
+            alike = [row for row in rows if kind.variant(row) == variant]
+            places |= {side: (len(tables), row) for row, side in enumerate(alike)}
+            tables.append(kind.build(alike, dtype, (*path, "tables", len(tables)), parameters, codes.get))
     numbers = [[places[side] for side in pair] for pair in sides]
     return Materials(tuple(tables), np.asarray(np.reshape(numbers, (-1, 2, 2)), np.int32), made)
 
 
 def occurs(materials: Materials, capability: str) -> bool:
     """Whether some kind present is capable of it: "smooth", "delta", ... of `BSDF`, or "moves_paths"."""
-    return any(_is(table.kind, capability) for table in materials.tables)
+    return any(_is(table, capability) for table in materials.tables)
 
 
 def has(materials: Materials, kind: Index, capability: str) -> Bool[Array, ""]:
     """Whether this kind is capable of it, as in `occurs`; where there is no bsdf nothing is."""
-    flags = [_is(table.kind, capability) for table in materials.tables]
+    flags = [_is(table, capability) for table in materials.tables]
     if not any(flags):
         return jnp.bool_(False)
     if all(flags):
@@ -87,10 +103,10 @@ def has(materials: Materials, kind: Index, capability: str) -> Bool[Array, ""]:
     return at(jnp.array(flags), jnp.maximum(kind, 0)) & (kind >= 0)
 
 
-def _is(kind: type[BSDF], capability: str) -> bool:
+def _is(table: Table, capability: str) -> bool:
     if capability == "moves_paths":
-        return any(declared.moves_paths for declared in kind.declared.values())
-    return getattr(kind, capability)
+        return any(declared.moves_paths for declared in table.kind.declared.values())
+    return table.kind.capable(table, capability)
 
 
 def moving_bit(materials: Materials, kind: Index, row: Index) -> Index:

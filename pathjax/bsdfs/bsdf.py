@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from pathjax.core.types import BSDFSample
-from pathjax.kinds import Instance, Kind, Row
+from pathjax.kinds import Instance, Kind, Row, Table
 
 
 class BSDF(Kind):
@@ -51,6 +51,11 @@ class BSDF(Kind):
         Both are 0 where `sample` never goes. wi.z > 0 is the caller's to see to, unless the kind is `sided`.
         """
         return jnp.zeros_like(wi), jnp.zeros_like(wi[2])
+
+    @classmethod
+    def capable(cls, table: Table, capability: str) -> bool:
+        """Whether rows of a table are: of what is the same for all rows of the kind, as the class says."""
+        return getattr(cls, capability)
 
     @classmethod
     def sides(cls, instance: Instance) -> tuple[Instance | None, Instance | None]:

@@ -10,28 +10,36 @@ from jaxtyping import Array, Float
 
 from pathjax.bsdfs import fresnel
 from pathjax.bsdfs.bsdf import BSDF
+from pathjax.bsdfs.metals import METALS
 from pathjax.core.types import BSDFSample
+from pathjax.description.elements import nearest
 from pathjax.kinds import Color, Row
 
 
 class Conductor(BSDF):
     """Smooth one-sided metal. Without eta and k it is Mitsuba's material "none", an ideal mirror."""
 
-    specular_reflectance = Color(1.0, textured=False)
-    eta = Color(None, bounds=(0, math.inf), textured=False)
-    k = Color(None, bounds=(0, math.inf), textured=False)
+    specular_reflectance = Color(1.0)
+    eta = Color(None, bounds=(0, math.inf))
+    k = Color(None, bounds=(0, math.inf))
     delta = True
 
     @classmethod
     def read(cls, loader, fields, name):
         material = fields.string("material", "none")
+        if material != "none" and material not in METALS:
+            use = f'use "none" or one of {", ".join(METALS)}{nearest(material, METALS)}'
+            raise fields.error("material", f'cannot be "{material[:40]}"; {use}')
+        values = super().read(loader, fields, name).values
+        given = [key for key in ("eta", "k") if values[key] is not None]
         if material != "none":
-            raise fields.error("material", f'cannot be "{material[:40]}"; give eta and k as <rgb>')
-        made = super().read(loader, fields, name)
-        given = [made.values[key] is not None for key in ("eta", "k")]
-        # Of "none" eta is 0 and k is 1: all is reflected.
-        defaults = {"eta": np.zeros(3), "k": np.ones(3)} if any(given) else {}
-        return cls.instance(name, **{key: defaults.get(key) if v is None else v for key, v in made.values.items()})
+            if given:
+                raise fields.error(given[0], "cannot stand beside material; give either eta and k, or material")
+            defaults = dict(zip(("eta", "k"), map(np.array, METALS[material]), strict=True))
+        else:
+            # Of "none" eta is 0 and k is 1: all is reflected.
+            defaults = {"eta": np.zeros(3), "k": np.ones(3)} if given else {}
+        return cls.instance(name, **{key: defaults.get(key) if v is None else v for key, v in values.items()})
 
     @classmethod
     def build(cls, instances, dtype, path, parameters, code):
@@ -43,10 +51,15 @@ class Conductor(BSDF):
         return table.with_column("k", np.where(ideal, np.ones(1, k.values.dtype), k.values))
 
     @staticmethod
-    def sample(p: Row, wi: Float[Array, "3"], u: Float[Array, " numbers"]) -> BSDFSample:
-        """Mirror direction; the weight is the Fresnel reflectance times `specular_reflectance`."""
-        weight = p.specular_reflectance
+    def reflectance(p: Row, cos: Float[Array, ""]) -> Float[Array, "3"]:
+        """Fresnel reflectance times `specular_reflectance`. cos: in [0, 1], of the angle of incidence."""
+        share = p.specular_reflectance
         if (eta := p.eta) is not None:
-            weight = weight * fresnel.conductor(wi[2], eta, p.k)
-        one = jnp.ones_like(wi[2])
+            share = share * fresnel.conductor(cos, eta, p.k)
+        return share
+
+    @staticmethod
+    def sample(p: Row, wi: Float[Array, "3"], u: Float[Array, " numbers"]) -> BSDFSample:
+        """Mirror direction; the weight is the reflectance."""
+        weight, one = Conductor.reflectance(p, wi[2]), jnp.ones_like(wi[2])
         return BSDFSample(jnp.stack([-wi[0], -wi[1], wi[2]]), weight, one, jnp.bool_(True), one)

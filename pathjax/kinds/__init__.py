@@ -13,6 +13,7 @@ the place of constants, and the parameters by name that can be set, differentiat
 
 from pathjax.kinds.declared import (
     Angle,
+    Choice,
     Color,
     Declared,
     Direction,
@@ -32,6 +33,7 @@ from pathjax.kinds.table import Column, Row, Table
 
 __all__ = [
     "Angle",
+    "Choice",
     "Color",
     "Column",
     "Declared",

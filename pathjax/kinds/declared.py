@@ -123,7 +123,7 @@ class Angle(Declared):
 
 @dataclass(frozen=True)
 class Setting(Declared):
-    """One of some words, the same for all rows: part of the program, not of its data."""
+    """One of some words, the same for all rows of a table: part of the program, not of its data."""
 
     options: tuple[str, ...] = ()
 
@@ -136,6 +136,14 @@ class Flag(Declared):
 
     def read(self, loader, fields, name, owner):
         return fields.boolean(name, False) or None
+
+
+@dataclass(frozen=True)
+class Choice(Setting):
+    """A setting that files make. Rows that differ in it have tables of their own."""
+
+    def read(self, loader, fields, name, owner):
+        return fields.string(name, self.default, choices=self.options)
 
 
 @dataclass(frozen=True)

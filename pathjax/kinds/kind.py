@@ -30,8 +30,8 @@ class Kind:
     unused: ClassVar[Mapping[str, Unused]] = {}  # what files may say of it without effect
 
     def __init_subclass__(cls):
-        own = {name: value for name, value in vars(cls).items() if isinstance(value, Declared)}
-        cls.declared = {**cls.declared, **own}
+        classes = [vars(each) for each in reversed(cls.__mro__)]
+        cls.declared = {key: d for each in classes for key, d in each.items() if isinstance(d, Declared)}
         cls._places = {name: place for place, name in enumerate(cls.declared)}
 
     @classmethod
@@ -48,7 +48,7 @@ class Kind:
             fields: `description.fields.Fields`, which refuses what nobody asks for.
             name: by which its parameters are known.
         """
-        return Instance(cls, name, {key: d.read(loader, fields, key, name) for key, d in cls.declared.items()})
+        return cls.instance(name, **{key: d.read(loader, fields, key, name) for key, d in cls.declared.items()})
 
     @classmethod
     def instance(cls, name: str = "", **values) -> Instance:
@@ -59,10 +59,15 @@ class Kind:
         return Instance(cls, name, {key: values.get(key, d.default) for key, d in cls.declared.items()})
 
     @classmethod
+    def variant(cls, instance: Instance) -> tuple:
+        """What is the same for all rows of a table: what its program is made for."""
+        return tuple(instance.values[key] for key, d in cls.declared.items() if isinstance(d, Setting))
+
+    @classmethod
     def build(
         cls, instances: list[Instance], dtype, path: tuple, parameters: Parameters, code: Callable | None
     ) -> Table:
-        """The table of all rows.
+        """The table of rows of the same `variant`.
 
         Args:
             path: where the table will be in the scene; parameters: to enter those of the rows.
@@ -81,7 +86,7 @@ class Kind:
                     where = (*path, "columns", place, "values"), (row,)
                     moves = declared.moves_paths
                     parameters.known[name] = Parameter(*where, declared.shape, declared.bounds, key, moves)
-        settings = tuple((key, d.default) for key, d in cls.declared.items() if isinstance(d, Setting))
+        settings = tuple((key, instances[0].values[key]) for key, d in cls.declared.items() if isinstance(d, Setting))
         return Table(tuple(columns), cls, settings)
 
 
