@@ -42,6 +42,7 @@ class Surface(NamedTuple):
     shading_n: Float[Array, "3"]  # unit shading normal
     uv: Float[Array, "2"]
     tangent: Float[Array, "3"] | None = None  # unit, the way u grows, across shading_n; None: no bsdf of the scene asks
+    attributes: dict[str, Float[Array, "3"]] | None = None  # of the mesh, by name; None: no texture of the scene asks
 
 
 class BSDFSample(NamedTuple):

@@ -7,6 +7,7 @@ builders and kernels.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -20,6 +21,7 @@ from pathjax.shapes.rectangle import Rectangle
 from pathjax.shapes.shape import Lamps, Primitives, Shape, Table
 from pathjax.shapes.sphere import Sphere
 from pathjax.shapes.triangle import FORMATS, Mesh, SerializedMesh
+from pathjax.textures import mesh_attribute
 
 __all__ = [
     "KINDS",
@@ -74,10 +76,15 @@ def build(shapes, dtype, rule: str, tangents: bool = False) -> tuple[Geometry, l
     """
     order = dict.fromkeys(kind.table for kind in KINDS.values())
     by_table: dict[type[Table], list[_Part]] = {table: [] for table in order}
+    asked = {t.values["names"] for shape in shapes for _, _, t in mesh_attribute.asked(shape.bsdf)}
     numbers = sorted(range(len(shapes)), key=lambda number: shapes[number].geometry.comes_last)
     for number in numbers:
         shape = shapes[number]
-        primitives = shape.geometry.primitives(shape.flip_normals)
+        geometry = shape.geometry
+        if geometry.attributes:
+            kept = {name: values for name, values in geometry.attributes.items() if name in asked}
+            geometry = replace(geometry, attributes=kept)
+        primitives = geometry.primitives(shape.flip_normals)
         part = _Part(number, primitives, shape.bsdf.kind.sided, shape.emitter is not None)
         by_table[shape.geometry.table].append(part)
     by_table = {table: parts for table, parts in by_table.items() if parts}

@@ -91,6 +91,7 @@ def surface(geometry: Geometry, ray: Ray, hit: Hit) -> Surface:
     """What the ray sees at its hit; differentiable in the ray. A miss gives the surface of some primitive."""
     first = firsts(geometry)
     primitive = jnp.maximum(hit.primitive, 0)
+    names = [name for table in geometry.tables for name in table.attributes]
 
     def of(table, start):
         def see():
@@ -98,6 +99,8 @@ def surface(geometry: Geometry, ray: Ray, hit: Hit) -> Surface:
             seen = table.surface(row, ray.o, ray.d, hit.t)
             if geometry.tangents:
                 seen = seen._replace(tangent=_tangent(table.along_u(row, seen), seen.shading_n))
+            if names and seen.attributes is None:
+                seen = seen._replace(attributes=dict.fromkeys(names, jnp.zeros_like(seen.p)))
             return seen
 
         return see

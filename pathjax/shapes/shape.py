@@ -9,6 +9,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from types import MappingProxyType
 from typing import ClassVar, NamedTuple
 
 import jax
@@ -35,6 +36,7 @@ class Shape(ABC):
     # For derivatives at the edges of shapes that move, which are not taken here.
     unused: ClassVar[Mapping[str, Unused]] = {"silhouette_sampling_weight": Unused("float", at_least=0)}
     comes_last: ClassVar[bool] = False  # in its table, after what other kinds put there
+    attributes: Mapping[str, np.ndarray] = MappingProxyType({})  # (N, 3) by name, of vertices or faces, for textures
 
     @classmethod
     @abstractmethod
@@ -132,6 +134,8 @@ class Searched(ABC):
 
 class Table(Searched):
     """All primitives of one kind in a scene, P rows: a pytree."""
+
+    attributes: Mapping[str, Float[Array, "P 3 3"]] = MappingProxyType({})  # by name: those that `surface` tells
 
     # What of transport between patches is known of the kind.
     polygons: ClassVar[bool] = False  # flat, with three or four straight edges: `edges_and_normals` is its own

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import jax
 import jax.numpy as jnp
@@ -29,6 +30,7 @@ class Facets(Primitives):
     vertices: np.ndarray  # (F, 3, 3)
     normals: np.ndarray | None  # (F, 3, 3)
     uv: np.ndarray | None  # (F, 3, 2)
+    attributes: Mapping[str, np.ndarray]  # (F, 3, 3) at the corners
 
     one_lamp = True
 
@@ -65,6 +67,8 @@ class Triangles(Table):
     uv: jax.Array | None  # (P, 3, 2)
     margins: jax.Array | None  # (P,) of `coincident`, beside their own; None: nothing flat lies in any of these
     area_cdf: jax.Array | None  # (P,) running share of the area of each mesh that emits; None: none does
+    # (P, 3, 3) by row: vertex, channel; 0 where a mesh has none of that name.
+    attributes: Mapping[str, jax.Array] = field(default_factory=dict)
 
     kind = "triangle"
     polygons = triangular = True
@@ -88,7 +92,12 @@ class Triangles(Table):
             cdf = joined([np.cumsum(areas) / np.sum(areas) * on for areas, on in running])
         vertices = np.concatenate([part.vertices for part in parts])
         packed, tree, built = pack(leaf_numbers(vertices), *bounds(vertices), dtype, rule)
-        return cls(packed, tree, np.asarray(vertices, dtype), normals, uv, margins, cdf), {cls.kind: built}
+        names = dict.fromkeys(name for part in parts for name in part.attributes)
+        attributes = {
+            name: joined([part.attributes.get(name, np.zeros_like(part.vertices)) for part in parts]) for name in names
+        }
+        made = cls(packed, tree, np.asarray(vertices, dtype), normals, uv, margins, cdf, attributes)
+        return made, {cls.kind: built}
 
     def prepare(self, o, d):
         """Constants of a ray: the shear that turns it into the z axis (Woop, Benthin, Wald 2013, JCGT 2(1)).
@@ -167,7 +176,8 @@ class Triangles(Table):
         margin = dot(jnp.abs(n), _point_error(vertices))
         if self.margins is not None:
             margin = margin + at(self.margins, row)
-        return Surface(interpolate(vertices), n, margin, shading_n, uv)
+        attributes = {name: interpolate(at(values, row)) for name, values in self.attributes.items()} or None
+        return Surface(interpolate(vertices), n, margin, shading_n, uv, attributes=attributes)
 
     def along_u(self, row, surface):
         """Nowhere, where the mesh has no uv or squeezes it to a line."""
@@ -229,6 +239,7 @@ class Mesh(Shape):
     normals: np.ndarray | None  # (V, 3): smooth shading; None: face normals
     uv: np.ndarray | None  # (V, 2)
     dropped: int = 0  # degenerate triangles left out
+    attributes: Mapping[str, np.ndarray] = field(default_factory=dict)  # "vertex_*" (V, 3), "face_*" (F, 3)
     table = Triangles
 
     @classmethod
@@ -252,7 +263,11 @@ class Mesh(Shape):
     def primitives(self, flip):
         faces = self.faces[:, ::-1] if flip else self.faces
         normals = None if self.normals is None else self.normals[faces] * (-1 if flip else 1)
-        return Facets(self.vertices[faces], normals, None if self.uv is None else self.uv[faces])
+        carried = {
+            name: values[faces] if name.startswith("vertex_") else np.repeat(values[:, None], 3, axis=1)
+            for name, values in self.attributes.items()
+        }
+        return Facets(self.vertices[faces], normals, None if self.uv is None else self.uv[faces], carried)
 
 
 class SerializedMesh(Mesh):

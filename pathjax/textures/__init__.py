@@ -17,14 +17,28 @@ from pathjax.kinds import Instance, Parameters, Row, Table, ordered
 from pathjax.kinds import register as register_kind
 from pathjax.textures.bitmap import Bitmap
 from pathjax.textures.checkerboard import Checkerboard
+from pathjax.textures.mesh_attribute import MeshAttribute
 from pathjax.textures.texture import Texture
+from pathjax.textures.uniform import Uniform
 
-__all__ = ["KINDS", "Bitmap", "Checkerboard", "Texture", "Textures", "build", "register"]
+__all__ = [
+    "KINDS",
+    "Bitmap",
+    "Checkerboard",
+    "MeshAttribute",
+    "Texture",
+    "Textures",
+    "Uniform",
+    "build",
+    "register",
+]
 
 # By the name that scene files give them.
 KINDS: dict[str, type[Texture]] = {
     "bitmap": Bitmap,
     "checkerboard": Checkerboard,
+    "mesh_attribute": MeshAttribute,
+    "uniform": Uniform,
 }
 
 

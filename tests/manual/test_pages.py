@@ -87,6 +87,8 @@ MESHES = ("obj", "ply", "stl", "glb", "gltf", "serialized")
 NEEDS = {
     "perspective": ["", '<float name="fov" value="40"/>'],
     "thinlens": [f'<float name="aperture_radius" value="1"/>{fov}' for fov in ("", '<float name="fov" value="40"/>')],
+    "uniform": ['<float name="value" value="1"/>'],
+    "mesh_attribute": ['<string name="name" value="vertex_color"/>'],
     "twosided": ['<bsdf type="diffuse"/>'],
     "bitmap": ['<string name="filename" value="marks.png"/>'],
     **dict.fromkeys(("aov", "moment", "stokes"), ['<integrator type="path"/>']),

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import pathjax as pj
-from pathjax import textures
+from pathjax import testing, textures
 from pathjax.kinds import Color, Parameters
 from pathjax.textures import Bitmap, Checkerboard
 from pathjax.textures.bitmap import WRAPS
@@ -110,6 +110,12 @@ def test_to_uv_is_applied_before_the_look_up():
 def test_checkerboard_starts_with_color0_and_repeats():
     colors = lookup_all([checkerboard()], [[0.2, 0.2], [0.7, 0.2], [0.2, 0.7], [0.7, 0.7], [-0.2, 0.2], [1.2, 5.2]])[0]
     np.testing.assert_allclose(colors[:, 0], np.float32([0.1, 0.9, 0.9, 0.1, 0.9, 0.1]))
+
+
+def test_a_uniform_texture_is_one_number_of_all_channels():
+    testing.check_texture(textures.Uniform, value=0.3)
+    made = [textures.Uniform.instance("u", value=0.3), checkerboard()]
+    np.testing.assert_allclose(lookup_all(made, [[0.2, 0.7]])[0], [[0.3] * 3], rtol=1e-6)
 
 
 def test_bilinear_derivative_in_uv_is_the_slope():

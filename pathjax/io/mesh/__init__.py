@@ -10,6 +10,7 @@ true by default); of PLY and serialized files, Mitsuba assumes that nothing is t
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -60,9 +61,11 @@ def load(
     raw = _read(Path(path), kind, () if part is None else (part,))
     vertices = _transformed(path, raw.vertices, to_world)
     notes = list(raw.notes)
+    attributes = dict(raw.attributes)
     if raw.sizes is None:
         faces = raw.corners.reshape(-1, 3)
     else:
+        attributes = _by_kind(attributes, "face_", lambda of_faces: np.repeat(of_faces, raw.sizes - 2, axis=0))
         faces, crossing = polygons.triangles(raw.vertices, raw.corners, raw.sizes)
         if crossing:
             notes.append(f"{crossing} polygons cross themselves; no triangles cover such just once")
@@ -72,6 +75,7 @@ def load(
     dropped = int(len(solid) - np.count_nonzero(solid))
     if dropped:
         faces, area_vectors = faces[solid], area_vectors[:, solid]
+        attributes = _by_kind(attributes, "face_", lambda of_faces: of_faces[solid])
         notes.append(f"{dropped} degenerate triangles left out")
 
     normals, uv = None, raw.uv
@@ -100,11 +104,18 @@ def load(
             own = (area_vectors / _norm(area_vectors)).T[np.nonzero(flat)[0]]
             vertices, normals = np.concatenate([vertices, vertices[at]]), np.concatenate([normals, own])
             uv = None if uv is None else np.concatenate([uv, uv[at]])
+            attributes = _by_kind(attributes, "vertex_", lambda values: np.concatenate([values, values[at]]))
             notes.append(f"{np.unique(at).size} vertices are flat, as the normals of the faces around them cancel")
 
     if uv is not None and (kind == "obj" if flip_tex_coords is None else flip_tex_coords):
         uv = uv * [1, -1] + [0, 1]
-    return Mesh(vertices, np.ascontiguousarray(faces), normals, uv, dropped), [f"{path}: {note}" for note in notes]
+    made = Mesh(vertices, np.ascontiguousarray(faces), normals, uv, dropped, attributes)
+    return made, [f"{path}: {note}" for note in notes]
+
+
+def _by_kind(attributes: dict[str, np.ndarray], kind: str, change: Callable) -> dict[str, np.ndarray]:
+    """The attributes, those whose names begin like this changed."""
+    return {name: change(values) if name.startswith(kind) else values for name, values in attributes.items()}
 
 
 def _read(path: Path, kind: str, part: tuple[int, ...]) -> Raw:

@@ -24,6 +24,9 @@ TYPES = {
     **{"uint64": "Q", "float16": "e", "float32": "f", "float64": "d"},
 }
 ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
+# Ends of the names of an attribute's channels; without a stem those of a colour.
+COLORS = ("r", "red")
+CHANNELS = (("r", "g", "b"), ("red", "green", "blue"), ("_r", "_g", "_b"), ("_x", "_y", "_z"), ("_0", "_1", "_2"))
 UV = (("texture_u", "texture_v"), ("u", "v"), ("s", "t"))
 
 
@@ -66,6 +69,7 @@ def read(path: Path) -> Raw:
         sizes,
         _table(path, vertex, ("nx", "ny", "nz")) if "nx" in vertex.types else None,
         _table(path, vertex, uv) if uv else None,
+        *_attributes(elements),
     )
 
 
@@ -181,6 +185,31 @@ def _table(path: Path, element: _Element, names: tuple[str, ...]) -> np.ndarray:
             raise InputError(f"{path}: element {element.name} lacks the property {name}")
     with np.errstate(over="ignore"):  # text may hold more than its type; what is not finite is found later
         return np.stack([element.columns[name].astype(element.types[name][0]) for name in names], 1).astype(np.float64)
+
+
+def _attributes(elements: dict[str, _Element]) -> tuple[dict[str, np.ndarray], tuple[str, ...]]:
+    """What vertices and faces carry, (N, 3) by Mitsuba's names, and notes.
+
+    Of properties r, g, b or red, green, blue the name is "color"; of N_r, N_g, N_b "N_color"; of N_x, N_y, N_z or N_0,
+    N_1, N_2 "N". One alone of these stands for three.
+    """
+    found, notes = {}, []
+    for element in (elements[kind] for kind in ("vertex", "face") if kind in elements and "tristrips" not in elements):
+        single = [key for key, (_, length) in element.types.items() if not length]
+        for first, *others in CHANNELS:
+            for key in (key for key in single if key.endswith(first)):
+                stem = key.removesuffix(first)
+                keys = [key, *(stem + other for other in others if stem + other in single)]
+                if len(keys) == 2 or (stem or len(keys) == 1 if first in COLORS else not stem):
+                    continue
+                values = np.stack([element.columns[each].astype(np.float64) for each in keys], axis=1)
+                number = element.types[key][0]
+                if np.dtype(number).kind in "iu":
+                    values = values / np.iinfo(number).max
+                    notes.append(f"{', '.join(keys)} of each {element.name} are integers, divided by the largest one")
+                words = [element.name, stem, "color" if first.strip("_") in COLORS else ""]
+                found["_".join(word for word in words if word)] = np.broadcast_to(values, (len(values), 3))
+    return found, tuple(notes)
 
 
 def _faces(path: Path, elements: dict[str, _Element]) -> tuple[np.ndarray, np.ndarray]:

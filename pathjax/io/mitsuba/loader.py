@@ -24,6 +24,7 @@ from pathjax.kinds import Instance, Unused
 from pathjax.sensors import film
 from pathjax.shapes import KINDS as SHAPES
 from pathjax.shapes import Mesh
+from pathjax.textures import mesh_attribute
 
 
 def load(path: str | Path, sensor: int | str = 0, /, **parameters: object) -> d.Description:
@@ -195,6 +196,8 @@ def _shape(loader: _Loader, fields: Fields, name: str) -> d.Shape | None:
         # Mitsuba: a light that is given no bsdf reflects nothing
         grey = 0.5 if emitter is None else 0.0
         bsdf = bsdfs.Diffuse.instance(inherited or loader.numbered("bsdf"), reflectance=grey)
+    if why := mesh_attribute.fault(bsdf, geometry.attributes):
+        raise fields.element.error(f"{fields.element} {why}")
     if geometry.empty:
         light = "" if emitter is None else ", and its light too"
         loader.note(fields.element, f"is left out, as no triangle has an area{light}")

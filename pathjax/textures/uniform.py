@@ -1,0 +1,30 @@
+"""The same everywhere."""
+
+from __future__ import annotations
+
+import math
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from pathjax.core.types import Surface
+from pathjax.kinds import Instance, Number, Row
+from pathjax.textures.texture import Texture
+
+
+class Uniform(Texture):
+    """One number, of all channels."""
+
+    value = Number(bounds=(0, math.inf))
+
+    @classmethod
+    def read(cls, loader, fields, name):
+        return cls.instance(name, value=fields.float("value", at_least=0))
+
+    @staticmethod
+    def look_up(p: Row, uv: Float[Array, "2"], surface: Surface) -> Float[Array, "3"]:
+        return jnp.stack([p.value] * 3)
+
+    @classmethod
+    def span(cls, texture: Instance) -> tuple[float, float]:
+        return (texture.values["value"],) * 2
