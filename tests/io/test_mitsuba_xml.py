@@ -618,7 +618,6 @@ FILM = '<film type="hdrfilm">{}</film>'
         (FILM.format('<integer name="crop_offset_x" value="10"/>'), "beyond the film"),
         (FILM.format('<string name="pixel_format" value="rbg"/>'), 'did you mean "rgb"'),
         (FILM.format('<string name="banner" value="no"/>'), "cannot be a <string>; give it as <boolean>"),
-        (FILM.format('<rfilter type="mitchell"/>'), "is not supported yet; use one of box, tent, gaussian"),
         ('<medium type="homogeneous"/>', "participating media are not supported yet"),
         ('<string name="shutter_open" value="0"/>', "cannot be a <string>; give it as <float>"),
         (FILM.format('<rfilter type="gaussian"><float name="radius" value="2"/></rfilter>'), "it has: stddev"),

@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 from pathjax.sensors import film
-from pathjax.sensors.filters import Box, Gaussian, Tent
+from pathjax.sensors.filters import Box, CatmullRom, Gaussian, Lanczos, Mitchell, Tent
 
 # Chance that a correct filter fails one test; seeds are fixed.
 FALSE_ALARM = 1e-4
@@ -29,6 +29,18 @@ def uniform(n=N, seed=1):
     return jnp.asarray(np.random.default_rng(seed).integers(0, 1 << 24, (n, 2)) * 2.0**-24, jnp.float32)
 
 
+def cubic(B, C):
+    """Mitchell and Netravali 1988, equation 8."""
+
+    def height(x):
+        x = np.abs(x)
+        near = (12 - 9 * B - 6 * C) * x**3 + (-18 + 12 * B + 6 * C) * x**2 + 6 - 2 * B
+        far = (-B - 6 * C) * x**3 + (6 * B + 30 * C) * x**2 + (-12 * B - 48 * C) * x + 8 * B + 24 * C
+        return np.where(x < 1, near, far) / 6
+
+    return height
+
+
 FILTERS = {
     "box": (Box(), 0.5, lambda x: np.ones_like(x)),
     "wide box": (Box(1.5), 1.5, lambda x: np.ones_like(x)),
@@ -36,7 +48,13 @@ FILTERS = {
     "wide tent": (Tent(2.0), 2.0, lambda x: 1 - np.abs(x) / 2),
     "gaussian": (Gaussian(), 2.0, lambda x: np.exp(-2 * x**2) - np.exp(-8)),
     "wide gaussian": (Gaussian(1.0, 3.0), 3.0, lambda x: np.exp(-(x**2) / 2) - np.exp(-4.5)),
+    "mitchell": (Mitchell(), 2.0, cubic(1 / 3, 1 / 3)),
+    "another mitchell": (Mitchell(0.1, 0.6), 2.0, cubic(0.1, 0.6)),
+    "catmullrom": (CatmullRom(), 2.0, cubic(0, 0.5)),
+    "lanczos": (Lanczos(), 3.0, lambda x: np.sinc(x) * np.sinc(x / 3)),
 }
+# Their lobes are negative, and so are weights there.
+RINGING = ("mitchell", "another mitchell", "catmullrom", "lanczos")
 
 
 @pytest.mark.parametrize("name", FILTERS)
@@ -53,7 +71,7 @@ def test_weighted_samples_have_the_filter_for_their_density(name):
     # The rim may be passed by an ulp.
     inside = np.clip(offsets, -radius * (1 - 1e-9), radius * (1 - 1e-9))
     total, squares = (np.histogram2d(*inside.T, [edges, edges], weights=w)[0] for w in (weights, weights**2))
-    full = share * N > 20  # the corners of a Gaussian hold next to nothing
+    full = np.abs(share) * N > 20  # the corners of a Gaussian hold next to nothing
     error = np.sqrt(np.maximum(squares - total**2 / N, 1))
     z = ((total - share * N) / error)[full]
     p = 2 * stats.norm.sf(np.abs(z).max())
@@ -61,7 +79,28 @@ def test_weighted_samples_have_the_filter_for_their_density(name):
     assert stats.chi2.sf((z**2).sum(), z.size) > FALSE_ALARM
 
 
-@pytest.mark.parametrize("name", FILTERS)
+@pytest.mark.parametrize("name", ["gaussian", "wide gaussian", *RINGING])
+def test_heights_are_those_of_the_filter(name):
+    filter, radius, shape = FILTERS[name]
+    x = np.linspace(-radius * 1.2, radius * 1.2, 97)
+    heights = np.asarray(filter.build(np.float32).evaluate(jnp.asarray(x, jnp.float32)))
+    expected = np.where(np.abs(x) <= radius, shape(x), 0)
+    np.testing.assert_allclose(heights / heights[48], expected / expected[48], atol=1e-5)
+
+
+@pytest.mark.parametrize("name", RINGING)
+def test_weights_are_one_but_for_the_sign_and_its_share(name):
+    """Samples are drawn by |f|: all weights have the size of the ratio of its integral to that of f."""
+    filter, radius, shape = FILTERS[name]
+    x = np.linspace(-radius, radius, 100_001)
+    size = (np.trapezoid(np.abs(shape(x)), x) / np.trapezoid(shape(x), x)) ** 2
+    weights = sampled(built(filter), 0, uniform(50_000))[1]
+    assert weights.min() < 0
+    # Where f changes its sign, a step of the table holds all heights from 0 on.
+    assert np.quantile(np.abs(np.abs(weights) - size), 0.95) < 0.05 * size and np.abs(weights).max() < 5 * size
+
+
+@pytest.mark.parametrize("name", [name for name in FILTERS if name not in RINGING])
 def test_weights_vary_little(name):
     """Importance sampling: only the tails of a Gaussian leave a weight other than 1, most in the last of 1024 steps."""
     weights = sampled(built(FILTERS[name][0]), 0, uniform(50_000))[1]
@@ -93,11 +132,11 @@ def test_pixels_count_rows_of_the_crop_window():
     )
 
 
-@pytest.mark.parametrize("name", ["tent", "gaussian"])
+@pytest.mark.parametrize("name", ["tent", "gaussian", *RINGING])
 def test_filters_are_those_of_mitsuba(name):
     mi = pytest.importorskip("mitsuba")
     mi.set_variant("scalar_rgb")
-    theirs = mi.load_dict({"type": name})
+    theirs = mi.load_dict({"type": "mitchell", "B": 0.1, "C": 0.6} if name == "another mitchell" else {"type": name})
     filter, radius, shape = FILTERS[name]
     assert theirs.radius() == pytest.approx(radius)
     x = np.linspace(-radius, radius, 41)

@@ -9,9 +9,18 @@ from __future__ import annotations
 from pathjax.sensors.filters.box import Box
 from pathjax.sensors.filters.filter import Filter
 from pathjax.sensors.filters.gaussian import Gaussian
+from pathjax.sensors.filters.lanczos import Lanczos
+from pathjax.sensors.filters.mitchell import CatmullRom, Mitchell
 from pathjax.sensors.filters.tent import Tent
 
-__all__ = ["KINDS", "Box", "Filter", "Gaussian", "Tent"]
+__all__ = ["KINDS", "Box", "CatmullRom", "Filter", "Gaussian", "Lanczos", "Mitchell", "Tent"]
 
 # By the name that scene files give them.
-KINDS: dict[str, type[Filter]] = {"box": Box, "tent": Tent, "gaussian": Gaussian}
+KINDS: dict[str, type[Filter]] = {
+    "box": Box,
+    "tent": Tent,
+    "gaussian": Gaussian,
+    "mitchell": Mitchell,
+    "catmullrom": CatmullRom,
+    "lanczos": Lanczos,
+}
