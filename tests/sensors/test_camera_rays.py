@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pathjax.sensors import Perspective, ThinLens
+from pathjax.sensors import Orthographic, Perspective, ThinLens
 from pathjax.sensors.film import HDRFilm
 
 ORIGIN, TARGET, UP = [1.0, 2.0, -4.0], [0.3, 0.2, 0.5], [0.1, 1.0, 0.2]
@@ -41,10 +41,9 @@ def assert_mitsubas(record, width, height, crop=None, **more):
     film |= {"crop_offset_x": x, "crop_offset_y": y, "crop_width": w, "crop_height": h}
     sensor = mi.load_dict(
         {
-            "type": "thinlens" if isinstance(record, ThinLens) else "perspective",
+            "type": type(record).__name__.lower(),
             "to_world": mi.ScalarTransform4f(record.to_world.tolist()),
-            "fov": record.fov,
-            "fov_axis": record.fov_axis,
+            **{key: getattr(record, key) for key in ("fov", "fov_axis") if hasattr(record, key)},
             "near_clip": record.near_clip,
             "far_clip": record.far_clip,
             "film": film,
@@ -90,6 +89,19 @@ def test_clip_distances_run_along_the_axis():
 def test_thin_lens():
     record = ThinLens(look_at(), 50.0, aperture_radius=0.3, focus_distance=3.0)
     assert_mitsubas(record, 60, 40, aperture_radius=0.3, focus_distance=3.0)
+
+
+@pytest.mark.parametrize("scale", [(1, 1, 1), (2, 2, 2), (2, 3, 0.5), (-1.5, 1, 1)])
+@pytest.mark.parametrize("crop", [None, (10, 5, 20, 30)])
+def test_orthographic(scale, crop):
+    to_world = look_at() @ np.diag([*scale, 1.0])
+    assert_mitsubas(Orthographic(to_world, near_clip=0.5, far_clip=20.0), 60, 40, crop)
+
+
+def test_orthographic_rays_are_parallel_and_as_long_as_the_clip_distances_say():
+    _, d, t_max = rays_of(Orthographic(look_at(), near_clip=0.5, far_clip=20.0), 60, 40, *numbers())
+    np.testing.assert_allclose(d, np.broadcast_to(look_at()[:3, 2], d.shape), atol=1e-6)
+    np.testing.assert_allclose(t_max, 19.5)
 
 
 def test_thin_lens_rays_of_a_position_meet_in_the_plane_of_focus():
