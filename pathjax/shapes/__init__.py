@@ -15,6 +15,7 @@ import numpy as np
 from pathjax.shapes import coincident
 from pathjax.shapes.accel.build import Tree
 from pathjax.shapes.cube import Cube
+from pathjax.shapes.cylinder import Cylinder
 from pathjax.shapes.disk import Disk
 from pathjax.shapes.geometry import Geometry
 from pathjax.shapes.rectangle import Rectangle
@@ -26,6 +27,7 @@ from pathjax.textures import mesh_attribute
 __all__ = [
     "KINDS",
     "Cube",
+    "Cylinder",
     "Disk",
     "Geometry",
     "Lamp",
@@ -47,6 +49,7 @@ KINDS: dict[str, type[Shape]] = {
     "cube": Cube,
     **dict.fromkeys(FORMATS, Mesh),
     "serialized": SerializedMesh,
+    "cylinder": Cylinder,
 }
 
 

@@ -93,6 +93,13 @@ def unit_normal(vertices):
     return n / np.linalg.norm(n, axis=-1, keepdims=True)
 
 
+def close_pairs(points: np.ndarray, distance: float) -> np.ndarray:
+    """(M, 2) pairs of the points (N, K) that lie so close to each other."""
+    from scipy.spatial import cKDTree  # takes a sixth of a second, which `import pathjax` has not
+
+    return cKDTree(points).query_pairs(distance, output_type="ndarray")
+
+
 def precision(dtype):
     """Relative difference up to which coordinates may round to the same number, after transforms have rounded them."""
     return np.finfo(dtype).eps / 2 + 8 * np.finfo(np.float64).eps

@@ -66,12 +66,10 @@ class Spheres(Table):
     @classmethod
     def own_margins(cls, parts, dtype):
         """0 for spheres that no other one coincides with."""
-        from scipy.spatial import cKDTree  # takes a sixth of a second, which `import pathjax` has not
-
         balls = np.concatenate([part.balls for part in parts])
         reach = np.linalg.norm(balls[:, :3], axis=1) + balls[:, 3]
         margins = np.zeros(len(balls))
-        pairs = cKDTree(balls).query_pairs(coincident.precision(dtype) * reach.max(initial=0), output_type="ndarray")
+        pairs = coincident.close_pairs(balls, coincident.precision(dtype) * reach.max(initial=0))
         margins[pairs] = 2 * coincident.MARGIN * np.finfo(dtype).eps * reach[pairs]
         return margins
 
