@@ -4,8 +4,9 @@ from typing import TYPE_CHECKING
 
 import pathjax.compile  # noqa: F401  first: sets XLA up before a backend starts
 from pathjax.derivatives.jacobian import Jacobian, jacobian
+from pathjax.description.transform import Transform
 from pathjax.errors import InputError, InputWarning
-from pathjax.io.load import load_scene
+from pathjax.io.load import load_dict, load_scene
 from pathjax.rendering.aovs import render_aovs
 from pathjax.rendering.bounces import Bounces, render_bounces
 from pathjax.rendering.progressive.until import RenderResult, render_until
@@ -25,11 +26,13 @@ __all__ = [
     "RenderResult",
     "Scene",
     "Target",
+    "Transform",
     "__version__",
     "check_gradient",
     "closest_hit",
     "fit",
     "jacobian",
+    "load_dict",
     "load_scene",
     "parameters",
     "read_target",

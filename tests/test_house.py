@@ -111,7 +111,9 @@ def classes_of(*rooms: str) -> set[str]:
 
 
 # Records of a scene file are of kinds as their tables are. These are of no kind: there is one of each.
-KINDS = classes_of(*ROOMS_OF_KINDS, "description") - {"Element", "Document", "Fields", "Parameter", "Description"}
+KINDS = classes_of(*ROOMS_OF_KINDS, "description") - {
+    *("Element", "Document", "Fields", "Parameter", "Description", "Transform")
+}
 
 # Fields by which a parameter is named, and would be known for what it is.
 FIELDS = {

@@ -7,6 +7,8 @@ from dataclasses import dataclass, field
 from difflib import get_close_matches
 from pathlib import Path
 
+import numpy as np
+
 from pathjax.errors import InputError
 
 
@@ -16,16 +18,22 @@ class Element:
 
     tag: str
     attributes: dict[str, str]
-    file: str
-    line: int
+    file: str  # or the keys that lead to it in a dictionary
+    line: int  # 0: of a dictionary
     children: list[Element] = field(default_factory=list)
+    data: np.ndarray | None = None  # of an <array>, which no file can write
 
     @property
     def id(self) -> str:
         return self.attributes.get("id", "")
 
+    @property
+    def place(self) -> str:
+        """Where it stands, for messages."""
+        return f"{self.file}:{self.line}" if self.line else self.file
+
     def error(self, message: str) -> InputError:
-        return InputError(f"{self.file}:{self.line}: {message}")
+        return InputError(f"{self.place}: {message}")
 
     def __str__(self) -> str:
         for key in ("type", "name", "id"):

@@ -11,6 +11,7 @@ import numpy as np
 
 from pathjax.description import spectra
 from pathjax.description.elements import Document, Element, nearest, require_attributes
+from pathjax.description.transform import Transform
 from pathjax.errors import InputError
 from pathjax.kinds import Unused
 
@@ -42,7 +43,7 @@ class Fields:
             target = document.resolve(child)
             if target.tag in NOT_MODELLED:
                 raise child.error(f"{child}: participating media are not supported yet; take it out of {element}")
-            if child.tag not in (*VALUES, *OBJECTS, "ref"):
+            if child.tag not in (*VALUES, *OBJECTS, "ref") and child.data is None:
                 raise child.error(f"{child} is not supported inside {element}; use one of: {', '.join(VALUES)}, ref")
             if target is not child and target.tag not in OBJECTS:
                 raise child.error(f"{child} refers to {target}, which is not an object")
@@ -53,7 +54,7 @@ class Fields:
             if not name:
                 raise child.error(f'{child} inside {element} lacks name="...", the parameter that it sets')
             if name in self._values:
-                raise child.error(f'"{name}" is given twice; the first is at line {self._values[name].line}')
+                raise child.error(f'"{name}" is given twice; the first is at {self._values[name].place}')
             self._values[name] = child
 
     def where(self, name: str) -> Element:
@@ -187,8 +188,13 @@ class Fields:
         shown = np.clip(color, 0, at_most)
         if (shown != color).any():
             was = ", ".join(f"{c:.4g}" for c in color)
-            self.notes.append(f"{element.file}:{element.line}: {element} has the colour {was}, which is clipped")
+            self.notes.append(f"{element.place}: {element} has the colour {was}, which is clipped")
         return shown
+
+    def array(self, name: str, default=REQUIRED) -> np.ndarray:
+        """An array of any shape, which dictionaries alone can give."""
+        element = self._take(name, default, ("array",))
+        return default if element is None else element.data
 
     def texture(self, name: str) -> Element | None:
         """The <texture> that sets `name`, or None where it is something else, to be read by `color`."""
@@ -226,8 +232,8 @@ class Fields:
                 case "transform":
                     self.transform(name)
             if self.has(name):
-                place, why = self.where(name), unused.why and f": {unused.why}"
-                notes.append(f"{place.file}:{place.line}: {name} has no effect{why}")
+                why = unused.why and f": {unused.why}"
+                notes.append(f"{self.where(name).place}: {name} has no effect{why}")
         return notes
 
     def finish(self) -> None:
@@ -304,13 +310,11 @@ def transform(element: Element) -> np.ndarray:
 
 
 def _translate(step: Element) -> np.ndarray:
-    matrix = np.eye(4)
-    matrix[:3, 3] = triple(step, default=0.0)
-    return matrix
+    return Transform().translate(triple(step, default=0.0)).matrix
 
 
 def _scale(step: Element) -> np.ndarray:
-    return np.diag([*triple(step, default=1.0), 1.0])
+    return Transform().scale(triple(step, default=1.0)).matrix
 
 
 def _rotate(step: Element) -> np.ndarray:
@@ -319,26 +323,16 @@ def _rotate(step: Element) -> np.ndarray:
     length = np.linalg.norm(axis)
     if abs(length - 1) > 0.02:  # Mitsuba takes the axis as it is, and shears if it is not of unit length
         raise step.error(f"{step}: the axis must have length 1, has {length:g}")
-    x, y, z = axis / length
-    angle = math.radians(math.fmod(number(step, step.attributes["angle"]), 360))
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    matrix = np.eye(4)
-    matrix[:3, :3] += math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross
-    return matrix
+    return Transform().rotate(axis, number(step, step.attributes["angle"])).matrix
 
 
 def _lookat(step: Element) -> np.ndarray:
     require_attributes(step, required=("origin", "target"), optional=("up",))
-    origin, target, up = (_vector(step, step.attributes.get(key, "0, 0, 0")) for key in ("origin", "target", "up"))
-    forward = _unit(step, target - origin, "origin and target coincide")
-    if not up.any():  # any will do; this is the one that Mitsuba takes
-        x, y, z = forward
-        sign = math.copysign(1, z)
-        up = np.array([1 - sign * x * x / (sign + z), -sign * x * y / (sign + z), -sign * x])
-    left = _unit(step, np.cross(up, forward), "up is parallel to the line of sight")
-    matrix = np.eye(4)
-    matrix[:3] = np.stack([left, np.cross(forward, left), forward, origin], axis=1)
-    return matrix
+    vectors = [_vector(step, step.attributes.get(key, "0, 0, 0")) for key in ("origin", "target", "up")]
+    try:
+        return Transform().look_at(*vectors).matrix
+    except InputError as error:
+        raise step.error(f"{step}: {str(error).removeprefix('look_at: ')}") from None
 
 
 def _matrix(step: Element) -> np.ndarray:
@@ -359,13 +353,6 @@ def _vector(step: Element, text: str) -> np.ndarray:
     if len(values) != 3:
         raise step.error(f"{step}: {text.strip()[:40]!r} must be three numbers")
     return np.array(values)
-
-
-def _unit(step: Element, vector: np.ndarray, complaint: str) -> np.ndarray:
-    length = np.linalg.norm(vector)
-    if not 1e-12 < length < math.inf:
-        raise step.error(f"{step}: {complaint}")
-    return vector / length
 
 
 def _pairs_of_file(path: Path, element: Element) -> list[list[float]]:

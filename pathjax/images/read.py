@@ -30,7 +30,11 @@ def read_rgb(path: str | Path, raw: bool = False) -> np.ndarray:
     readers = {"OpenEXR": exr.read_colors, "Radiance HDR": hdr.read_colors}
     if reader := readers.get(file_format(path)):
         return reader(path)
-    stored = png.read_stored(path)
+    return decoded(png.read_stored(path), raw)
+
+
+def decoded(stored: np.ndarray, raw: bool) -> np.ndarray:
+    """float32 in [0, 1] of what PNG, JPEG and their like store, uint8 or uint16: linear light, or raw, the plain numbers."""
     maximum = np.iinfo(stored.dtype).max
     levels = np.arange(maximum + 1) / maximum
     return (levels if raw else png.srgb_to_linear(levels)).astype(np.float32)[stored]

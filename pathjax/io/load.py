@@ -16,6 +16,25 @@ from pathjax.scene.builder import build
 from pathjax.scene.scene import Scene
 
 
+def load_dict(
+    scene: Mapping[str, object], *, sensor: int | str = 0, dtype: DTypeLike = jnp.float32, split_rule: str = "sah"
+) -> Scene:
+    """Load a scene that a dictionary describes as Mitsuba's `load_dict` has it.
+
+    Arrays of NumPy or JAX stand for textures, {"type": "mesh", "vertices": (V, 3), "faces": (F, 3), ...} and objects of
+    trimesh for meshes, and `Transform`, Mitsuba's transforms and (4, 4) arrays for transforms. Keys at the top are ids.
+
+    Args:
+        scene: of "type": "scene".
+        sensor, dtype, split_rule: as in `load_scene`.
+    Raises:
+        InputError: what is wrong and what to do, with the keys that lead there.
+    Warns:
+        InputWarning: nothing in the scene emits light.
+    """
+    return _lit(build(loader.load_dict(scene, sensor), dtype, split_rule), "scene")
+
+
 def load_scene(
     file: str | os.PathLike,
     *,
@@ -43,7 +62,11 @@ def load_scene(
     parameters = dict(parameters or {})
     for name in parameters.keys() & keywords.keys():
         raise InputError(f"the parameter {name} is given twice, in parameters and as a keyword; give it once")
-    scene = build(loader.load(file, sensor, **parameters, **keywords), dtype, split_rule)
+    return _lit(build(loader.load(file, sensor, **parameters, **keywords), dtype, split_rule), file)
+
+
+def _lit(scene: Scene, file: str | os.PathLike) -> Scene:
+    """The scene; a warning where it is dark."""
     if dark := emitters.darkness(scene.emitters):
-        warnings.warn(f"{file}: {dark}, so images of it are black", InputWarning, stacklevel=2)
+        warnings.warn(f"{file}: {dark}, so images of it are black", InputWarning, stacklevel=3)
     return scene

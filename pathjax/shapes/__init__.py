@@ -21,7 +21,7 @@ from pathjax.shapes.geometry import Geometry
 from pathjax.shapes.rectangle import Rectangle
 from pathjax.shapes.shape import Lamps, Primitives, Shape, Table
 from pathjax.shapes.sphere import Sphere
-from pathjax.shapes.triangle import FORMATS, Mesh, SerializedMesh
+from pathjax.shapes.triangle import FORMATS, ArrayMesh, Mesh, SerializedMesh
 from pathjax.textures import mesh_attribute
 
 __all__ = [
@@ -49,6 +49,7 @@ KINDS: dict[str, type[Shape]] = {
     "cube": Cube,
     **dict.fromkeys(FORMATS, Mesh),
     "serialized": SerializedMesh,
+    "mesh": ArrayMesh,
     "cylinder": Cylinder,
 }
 

@@ -284,6 +284,17 @@ class SerializedMesh(Mesh):
         )
 
 
+class ArrayMesh(Mesh):
+    """A mesh of arrays, of a dictionary."""
+
+    @classmethod
+    def read(cls, loader, fields: Fields):
+        arrays = {name: fields.array(name) for name in ("vertices", "faces")}
+        arrays |= {name: fields.array(name, None) for name in ("normals", "uv")}
+        to_world, face_normals = fields.transform("to_world"), fields.boolean("face_normals", False)
+        return loader.mesh_of_arrays(fields, to_world=to_world, face_normals=face_normals, **arrays)
+
+
 def leaf_numbers(vertices):
     """(P, 3, 3) -> (P, 9), what a leaf keeps of each triangle: x of the vertices, y, z."""
     return np.swapaxes(np.asarray(vertices), 1, 2).reshape(-1, 9)

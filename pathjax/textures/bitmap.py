@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 from pathjax.core.math import at
 from pathjax.core.types import Surface
 from pathjax.images import read_rgb
+from pathjax.images.read import decoded
 from pathjax.kinds import Column, Instance, PerRow, Row, Shared, Table, Unused
 from pathjax.textures.texture import Texture
 
@@ -34,7 +35,8 @@ class Bitmap(Texture):
 
     @classmethod
     def read(cls, loader, fields, name):
-        texels = read_rgb(loader.find(fields, "filename"), raw=fields.boolean("raw", False))
+        raw, data = fields.boolean("raw", False), fields.array("data", None)
+        texels = read_rgb(loader.find(fields, "filename"), raw) if data is None else _texels(fields, data, raw)
         interpolation = fields.string("filter_type", "bilinear", choices=FILTERS)
         wrap = fields.string("wrap_mode", "repeat", choices=WRAPS)
         to_uv = cls.to_uv.read(loader, fields, "to_uv", name)
@@ -88,6 +90,18 @@ class Bitmap(Texture):
 def _joined(arrays: list[np.ndarray]) -> np.ndarray:
     """One after another; of one alone no copy is made, as it may be large."""
     return arrays[0] if len(arrays) == 1 else np.concatenate(arrays)
+
+
+def _texels(fields, data: np.ndarray, raw: bool) -> np.ndarray:
+    """(H, W, 3) float32 of an array: bytes and 16-bit integers are stored as in a PNG, real numbers are linear."""
+    if fields.has("filename"):
+        raise fields.error("data", "excludes filename; give one or the other")
+    if data.ndim not in (2, 3) or data.ndim == 3 and data.shape[2] not in (1, 3) or 0 in data.shape:
+        raise fields.error("data", f"must have the shape (H, W), (H, W, 1) or (H, W, 3), has {data.shape}")
+    colors = np.broadcast_to(data.reshape(*data.shape[:2], -1), (*data.shape[:2], 3))
+    if data.dtype in (np.uint8, np.uint16):
+        return decoded(colors, raw)
+    return np.asarray(colors, np.float32)
 
 
 def _wrapped(index, size, wrap):

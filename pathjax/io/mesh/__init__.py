@@ -59,6 +59,43 @@ def load(
         InputError: unreadable file, no triangles, an index out of range, a coordinate that is not finite in float32.
     """
     raw = _read(Path(path), kind, () if part is None else (part,))
+    flip = kind == "obj" if flip_tex_coords is None else flip_tex_coords
+    return _in_world(path, raw, to_world, face_normals, kind in SMOOTH, flip)
+
+
+def of_arrays(
+    place: str,
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    to_world: np.ndarray,
+    normals: np.ndarray | None = None,
+    uv: np.ndarray | None = None,
+    face_normals: bool = False,
+) -> tuple[Mesh, list[str]]:
+    """The same of arrays: vertices (V, 3), faces (F, 3) integers, normals (V, 3) and uv (V, 2). Without normals it is
+    flat.
+
+    place: for messages.
+    """
+    shapes = {"vertices": (vertices, 3), "faces": (faces, 3), "normals": (normals, 3), "uv": (uv, 2)}
+    for name, (array, width) in shapes.items():
+        rows = "F" if name == "faces" else "V"
+        if array is None:
+            continue
+        if array.ndim != 2 or array.shape[1] != width or rows == "V" and len(array) != len(vertices):
+            raise InputError(f"{place}: {name} must have the shape ({rows}, {width}), has {array.shape}")
+        if array.dtype.kind not in ("iu" if name == "faces" else "iuf"):
+            raise InputError(f"{place}: {name} must be {'integers' if name == 'faces' else 'numbers'}")
+    normals, uv = (None if array is None else array.astype(np.float64) for array in (normals, uv))
+    raw = Raw(vertices.astype(np.float64), faces.astype(np.int64).ravel(), normals=normals, uv=uv)
+    _check(place, raw)
+    return _in_world(place, raw, to_world, face_normals, smooth=False, flip=False)
+
+
+def _in_world(
+    path: str | Path, raw: Raw, to_world: np.ndarray, face_normals: bool, smooth: bool, flip: bool
+) -> tuple[Mesh, list[str]]:
+    """Of `load`. smooth: what has no normals is shaded smoothly; flip: v to 1 - v."""
     vertices = _transformed(path, raw.vertices, to_world)
     notes = list(raw.notes)
     attributes = dict(raw.attributes)
@@ -79,7 +116,7 @@ def load(
         notes.append(f"{dropped} degenerate triangles left out")
 
     normals, uv = None, raw.uv
-    if not face_normals and (raw.normals is not None or kind in SMOOTH):
+    if not face_normals and (raw.normals is not None or smooth):
         if raw.normals is None:
             given, lacking = np.empty_like(vertices), np.ones(len(vertices), bool)
         else:
@@ -93,8 +130,8 @@ def load(
                 notes.append(f"{np.unique(faces[lacking[faces]]).size} vertices without a normal got a smooth one")
         flat = np.zeros_like(faces, bool)  # corners that get the normal of their face, as vertices of their own
         if lacking.any():
-            smooth, cancel = _smooth_normals(vertices, faces, area_vectors)
-            given[lacking] = smooth[lacking]
+            means, cancel = _smooth_normals(vertices, faces, area_vectors)
+            given[lacking] = means[lacking]
             flat = (lacking & cancel)[faces]
         normals = given / np.linalg.norm(given, axis=1, keepdims=True)
         if flat.any():
@@ -107,7 +144,7 @@ def load(
             attributes = _by_kind(attributes, "vertex_", lambda values: np.concatenate([values, values[at]]))
             notes.append(f"{np.unique(at).size} vertices are flat, as the normals of the faces around them cancel")
 
-    if uv is not None and (kind == "obj" if flip_tex_coords is None else flip_tex_coords):
+    if uv is not None and flip:
         uv = uv * [1, -1] + [0, 1]
     made = Mesh(vertices, np.ascontiguousarray(faces), normals, uv, dropped, attributes)
     return made, [f"{path}: {note}" for note in notes]
@@ -127,6 +164,11 @@ def _read(path: Path, kind: str, part: tuple[int, ...]) -> Raw:
     except Exception as error:  # of the libraries, or brought about by a header that is not as the format says
         reason = f"{type(error).__name__}: {error}"[:200]
         raise InputError(f"{path}: cannot be read as {kind.upper()} ({reason})") from None
+    _check(path, raw)
+    return raw
+
+
+def _check(path: str | Path, raw: Raw) -> None:
     if len(raw.vertices) == 0 or len(raw.corners) == 0:
         raise InputError(f"{path}: the mesh is empty, it has no triangles")
     if raw.corners.min() < 0 or raw.corners.max() >= len(raw.vertices):
@@ -137,7 +179,6 @@ def _read(path: Path, kind: str, part: tuple[int, ...]) -> Raw:
     for name, values in (("normal", raw.normals), ("uv", raw.uv)):
         if values is not None and not np.isfinite(values).all():
             raise InputError(f"{path}: {name} {_first_bad(values)} is not finite")
-    return raw
 
 
 def _transformed(path: str | Path, vertices: np.ndarray, to_world: np.ndarray) -> np.ndarray:
@@ -163,9 +204,7 @@ def _area_vectors(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
         return polygons.cross(b - a, c - a)
 
 
-def _smooth_normals(
-    vertices: np.ndarray, faces: np.ndarray, area_vectors: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def _smooth_normals(vertices: np.ndarray, faces: np.ndarray, area_vectors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Sums of unit face normals weighted by the angle at the vertex (Thuermer and Wuethrich 1998).
 
     Returns:

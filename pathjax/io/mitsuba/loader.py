@@ -17,7 +17,7 @@ from pathjax.description.elements import Document, Element, nearest
 from pathjax.description.fields import NOT_MODELLED, VALUES, Fields
 from pathjax.errors import InputError
 from pathjax.io import mesh
-from pathjax.io.mitsuba import integrators, samplers
+from pathjax.io.mitsuba import dict_reader, integrators, samplers
 from pathjax.io.mitsuba.plugins import PLUGINS
 from pathjax.io.mitsuba.xml_reader import read
 from pathjax.kinds import Instance, Unused
@@ -37,6 +37,15 @@ def load(path: str | Path, sensor: int | str = 0, /, **parameters: object) -> d.
         InputError: a file cannot be read, or asks for what pathjax does not model.
     """
     return _Loader(read(path, parameters)).description(str(path), sensor)
+
+
+def load_dict(scene: Mapping, sensor: int | str = 0) -> d.Description:
+    """The same of a scene that a dictionary holds.
+
+    Raises:
+        InputError: what is wrong, with the keys that lead there.
+    """
+    return _Loader(dict_reader.read(scene)).description("scene", sensor)
 
 
 class _Loader:
@@ -66,14 +75,14 @@ class _Loader:
             root = self.document.root
             self.make(Element("scene", {"type": "scene"}, root.file, root.line, settings), {"scene": _Settings})
         for element in scene["integrator"][1:]:
-            first = f"{scene['integrator'][0].file}:{scene['integrator'][0].line}"
+            first = scene["integrator"][0].place
             raise element.error(f"{element}: one <integrator> is supported here; the first is at {first}")
         if not scene["sensor"]:
             raise self.document.root.error('the scene has no <sensor>; add <sensor type="perspective">')
         seen = _chosen(scene["sensor"], sensor)
         for element in scene["sensor"]:
             if element is not seen:
-                self.note(element, f"is left out, as the sensor at line {seen.line} is used; `sensor` chooses another")
+                self.note(element, f"is left out, as the sensor at {seen.place} is used; `sensor` chooses another")
 
         camera, film, spp, sampler = self.make(seen, sensors.KINDS, read=_sensor)
         if scene["integrator"]:
@@ -105,7 +114,7 @@ class _Loader:
 
     def note(self, element: Element, text: str) -> None:
         """What `info` should tell of an element."""
-        self.notes.append(f"{element.file}:{element.line}: {element} {text}")
+        self.notes.append(f"{element.place}: {element} {text}")
 
     def make(self, element: Element, kinds: Mapping[str, type], *context: object, read: Callable | None = None):
         """What the kind of the element's type reads; the file may hold nothing else but what has no effect.
@@ -165,6 +174,12 @@ class _Loader:
         self.notes += notes
         return made
 
+    def mesh_of_arrays(self, fields: Fields, **arrays: object) -> Mesh:
+        """Of `io.mesh.of_arrays`."""
+        made, notes = mesh.of_arrays(fields.element.place, **arrays)
+        self.notes += notes
+        return made
+
     def numbered(self, name: str) -> str:
         """`name0`, `name1`, ...; the next that is free."""
         return self.unique(next(each for k in self.counts[name] if (each := f"{name}{k}") not in self.names))
@@ -185,8 +200,7 @@ def _shape(loader: _Loader, fields: Fields, name: str) -> d.Shape | None:
     for element in fields.objects("emitter"):
         other = loader.on_shapes.setdefault(element, fields.element)
         if other is not fields.element:
-            first = f"{other.file}:{other.line}"
-            raise fields.element.error(f"{element} shines from {other} already, at {first}; give each its own")
+            raise fields.element.error(f"{element} shines from {other} already, at {other.place}; give each its own")
         emitter = loader.emitter(element, element.id or name, inside=True)
     inherited = fields.element.id or None
     nested = fields.objects("bsdf")

@@ -18,6 +18,9 @@ PLUGINS = {
         "normalmap null plastic polarizer pplastic principled principledthin retarder roughconductor roughdielectric "
         "roughplastic thindielectric twosided",
         "texture": "bitmap checkerboard mesh_attribute uniform volume",
+        "medium": "heterogeneous homogeneous",
+        "phase": "blendphase hg isotropic rayleigh sggx tabphase",
+        "volume": "constvolume gridvolume",
         "emitter": "area constant directional directionalarea envmap point projector spot sunsky timed_sunsky",
     }.items()
 }

@@ -37,13 +37,7 @@ def read(path: str | Path, parameters: Mapping[str, object]) -> Document:
     reader = _Reader(Path(path), {name: _as_text(value) for name, value in parameters.items()})
     root = reader.expand(_parse(Path(path), str(path)), chain=(Path(path).resolve(),))
     reader.check_parameters(str(path))
-    ids: dict[str, Element] = {}
-    for element in _walk(root):
-        if element.tag != "ref" and element.id:
-            if element.id in ids:
-                first = ids[element.id]
-                raise element.error(f'the id "{element.id}" is taken already, at {first.file}:{first.line}')
-            ids[element.id] = element
+    ids = by_id(root)
     for alias in reader.aliases:
         name = alias.attributes["as"]
         if alias.id not in ids:
@@ -52,6 +46,17 @@ def read(path: str | Path, parameters: Mapping[str, object]) -> Document:
             raise alias.error(f'the id "{name}" is taken already, at {ids[name].file}:{ids[name].line}')
         ids[name] = ids[alias.id]
     return Document(root, ids, tuple(reader.folders))
+
+
+def by_id(root: Element) -> dict[str, Element]:
+    """The elements that have an id; one that is given twice is an InputError."""
+    ids: dict[str, Element] = {}
+    for element in _walk(root):
+        if element.tag != "ref" and element.id:
+            if element.id in ids:
+                raise element.error(f'the id "{element.id}" is taken already, at {ids[element.id].place}')
+            ids[element.id] = element
+    return ids
 
 
 class _Reader:

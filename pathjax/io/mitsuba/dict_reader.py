@@ -1,0 +1,249 @@
+"""Scenes as Python dictionaries, in Mitsuba's form, to the elements that a scene file is made of.
+
+So each kind, bound and message is the same for both. The place of an element is the keys that lead to it.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Mapping
+from numbers import Integral, Real
+from pathlib import Path
+
+import numpy as np
+
+from pathjax import bsdfs, emitters, sensors, shapes, textures
+from pathjax.compile import is_traced
+from pathjax.description.elements import Document, Element, find_file, nearest
+from pathjax.errors import InputError
+from pathjax.io.mitsuba import integrators, samplers
+from pathjax.io.mitsuba.plugins import PLUGINS
+from pathjax.io.mitsuba.xml_reader import MAX_DEPTH, by_id
+from pathjax.sensors import film, filters
+
+VERSION = "3.0.0"
+VALUE_TYPES = ("rgb", "spectrum", "ref", "resources")
+
+
+def read(scene: Mapping) -> Document:
+    """Convert a scene.
+
+    Raises:
+        InputError: a value of a type that no scene holds, a dictionary within itself, an unknown type, an id given
+            twice; with the keys that lead there.
+    """
+    return _Reader().document(scene)
+
+
+def _kinds() -> dict[str, Mapping[str, object]]:
+    """The tables of all rooms by the tag of elements."""
+    return {
+        "integrator": integrators.KINDS,
+        "sensor": sensors.KINDS,
+        "sampler": samplers.KINDS,
+        "film": film.KINDS,
+        "rfilter": filters.KINDS,
+        "shape": shapes.KINDS,
+        "bsdf": bsdfs.KINDS,
+        "texture": textures.KINDS,
+        "emitter": emitters.KINDS,
+    }
+
+
+class _Reader:
+    """What all levels share: the dictionaries around the present one, and which keys lead to each object."""
+
+    def __init__(self):
+        self.kinds = _kinds()
+        self.around: list[object] = []
+        self.paths: dict[str, Element] = {}
+        self.folders = [Path()]
+
+    def document(self, scene: Mapping) -> Document:
+        if not isinstance(scene, Mapping) or scene.get("type") != "scene":
+            raise InputError('scene: must be a dictionary with "type": "scene", which holds all others by name')
+        root = Element("scene", {"version": VERSION}, "scene", 0, self.children(scene, "scene", top=True))
+        ids = by_id(root)
+        # Keys lead to objects, too: `shape.bsdf`.
+        return Document(root, self.paths | ids, tuple(self.folders))
+
+    def children(self, items: Mapping, place: str, top: bool = False) -> list[Element]:
+        """What a dictionary holds besides its type and its id."""
+        if len(self.around) >= MAX_DEPTH:
+            raise InputError(f"{place}: dictionaries are nested more than {MAX_DEPTH} deep")
+        self.around.append(items)
+        found = []
+        for key, value in items.items():
+            if not isinstance(key, str) or not key.isprintable() or not re.fullmatch(r"[^.\s]+", key):
+                raise InputError(f"{place}: a key must be a string without dots and spaces, is {_shown(key)}")
+            if key not in ("type", "id") and (made := self.value(key, value, f"{place}.{key}", top)) is not None:
+                found.append(made)
+        self.around.pop()
+        return found
+
+    def value(self, key: str, value: object, place: str, top: bool) -> Element | None:
+        if isinstance(value, Mapping):
+            if any(each is value for each in self.around):
+                raise InputError(f"{place}: this dictionary stands inside itself; refer to objects by their id")
+            kind = value.get("type")
+            if not isinstance(kind, str):
+                raise InputError(f'{place}: a dictionary needs a "type", the name of a kind; it has {_shown(kind)}')
+            if kind in VALUE_TYPES:
+                return getattr(self, f"_{kind}")(key, value, place)
+            return self.object(key, value, place, top)
+        if hasattr(value, "vertices") and hasattr(value, "faces"):  # of trimesh
+            return self.object(key, {"type": "mesh", "mesh": value}, place, top)
+        if hasattr(value, "matrix"):
+            return _transform(key, value.matrix, place)
+        if isinstance(value, bool | np.bool_):
+            return _element("boolean", key, place, str(bool(value)).lower())
+        if isinstance(value, Real):
+            return _number(key, value, place)
+        if isinstance(value, str | os.PathLike):
+            return _element("string", key, place, _string(value, place))
+        return self.array(key, _array(value, place), place)
+
+    def array(self, key: str, array: np.ndarray, place: str) -> Element:
+        """A number, a point, a matrix, or data."""
+        if not array.ndim:
+            return _number(key, array.item(), place)
+        if key.startswith("to_"):
+            return _transform(key, array, place)
+        if array.shape == (3,):
+            return _element("point", key, place, _text(array))
+        if array.ndim == 1:
+            raise InputError(f"{place}: must be one number or three, has {len(array)}")
+        return Element("array", {"name": key}, place, 0, data=array)
+
+    def object(self, key: str, value: Mapping, place: str, top: bool) -> Element:
+        """An object of the kind that `type` names. At the top its key is its id."""
+        tag = self.tag(value["type"], place)
+        attributes = {"type": value["type"]} | ({} if top else {"name": key})
+        name = value.get("id", key if top else None)
+        if name is not None:
+            attributes["id"] = _string(name, place)
+        if tag == "shape" and "mesh" in value:
+            value = {key: each for key, each in value.items() if key != "mesh"} | _of_trimesh(value["mesh"], place)
+        element = Element(tag, attributes, place, 0)
+        element.children = self.children(value, place)
+        if tag not in ("shape", "texture"):  # their arrays are what they consist of; elsewhere they are images
+            element.children = [_as_texture(child) for child in element.children]
+        self.paths[place.removeprefix("scene.")] = element
+        return element
+
+    def tag(self, kind: str, place: str) -> str:
+        found = [tag for tag, kinds in self.kinds.items() if kind in kinds]
+        if len(found) > 1:
+            raise InputError(f'{place}: "{kind}" is the name of kinds of {" and ".join(found)}; register other names')
+        found += [tag for tag, names in PLUGINS.items() if kind in names]
+        if not found:
+            known = [name for kinds in self.kinds.values() for name in kinds] + list(VALUE_TYPES)
+            raise InputError(f'{place}: no kind is named "{_string(kind, place)[:60]}"{nearest(kind, known)}')
+        return found[0]
+
+    # ---- what Mitsuba writes as dictionaries, and is no object
+
+    def _rgb(self, key: str, value: Mapping, place: str) -> Element:
+        given = _only(value, ("value",), place)
+        return _element("rgb", key, place, _text(_array(given["value"], place).reshape(-1)))
+
+    def _spectrum(self, key: str, value: Mapping, place: str) -> Element:
+        """Of one number, of pairs of wavelength and number, or of a file."""
+        if "filename" in value:
+            filename = _only(value, ("filename",), place)["filename"]
+            return Element("spectrum", {"name": key, "filename": _string(filename, place)}, place, 0)
+        array = _array(_only(value, ("value",), place)["value"], place)
+        if array.ndim == 2 and array.shape[1] == 2:
+            return _element("spectrum", key, place, ", ".join(f"{float(w)!r}:{float(x)!r}" for w, x in array))
+        if array.ndim:
+            raise InputError(f"{place}: a spectrum is a number or pairs of wavelength and number, not {array.shape}")
+        return _element("spectrum", key, place, repr(float(array)))
+
+    def _ref(self, key: str, value: Mapping, place: str) -> Element:
+        name = _only(value, ("id",), place)["id"]
+        return Element("ref", {"name": key, "id": _string(name, place)}, place, 0)
+
+    def _resources(self, key: str, value: Mapping, place: str) -> None:
+        """A folder in which files are searched."""
+        name, element = _only(value, ("path",), place)["path"], Element("path", {"name": key}, place, 0)
+        self.folders.append(find_file(_string(name, place), self.folders, element, folder=True))
+
+
+def _string(value: object, place: str) -> str:
+    if not isinstance(value, str | os.PathLike) or not str(value).isprintable():
+        raise InputError(f"{place}: must be a string of one line, is {_shown(value)}")
+    return str(value)
+
+
+def _shown(value: object) -> str:
+    """In one line of a message."""
+    return " ".join(repr(value).split())[:60]
+
+
+def _only(value: Mapping, keys: tuple[str, ...], place: str) -> Mapping:
+    """The dictionary, which has these keys besides its type and no others."""
+    for key in keys:
+        if key not in value:
+            raise InputError(f'{place}: {{"type": "{value["type"]}", ...}} lacks "{key}"')
+    for key in value:
+        if key not in ("type", *keys):
+            raise InputError(f'{place}: "{value["type"]}" takes {", ".join(keys)}, and no {_shown(key)}')
+    return value
+
+
+def _element(tag: str, key: str, place: str, text: str) -> Element:
+    return Element(tag, {"name": key, "value": text}, place, 0)
+
+
+def _number(key: str, value: object, place: str) -> Element:
+    if isinstance(value, Integral):
+        return _element("integer", key, place, str(int(value)))
+    return _element("float", key, place, repr(float(value)))
+
+
+def _text(array: np.ndarray) -> str:
+    """The numbers such that they are read as they are."""
+    return ", ".join(repr(float(x)) for x in array.ravel())
+
+
+def _transform(key: str, matrix: object, place: str) -> Element:
+    matrix = _array(matrix, place)
+    if matrix.shape not in ((3, 3), (4, 4)):
+        raise InputError(f"{place}: a transform is a pj.Transform or a (4, 4) matrix, has the shape {matrix.shape}")
+    step = Element("matrix", {"value": _text(matrix)}, place, 0)
+    return Element("transform", {"name": key}, place, 0, [step])
+
+
+def _array(value: object, place: str) -> np.ndarray:
+    """Numbers of a list, or of an array of NumPy, JAX or Dr.Jit."""
+    if is_traced(value):
+        raise InputError(f"{place}: is traced; load the scene with numbers, and set parameters by pj.with_parameters")
+    try:
+        array = np.asarray(value)
+    except Exception:  # whatever a foreign object, or a list of lists of different lengths, raises
+        array = np.asarray(None)
+    if array.dtype.kind not in "iuf":
+        kinds = "a number, a string, a list of numbers, an array, a transform or a dictionary"
+        raise InputError(f"{place}: a value of type {type(value).__name__} has no place in a scene; use {kinds}")
+    # Dr.Jit has one more axis, for the lanes that it computes at once.
+    if not isinstance(value, list | tuple | np.ndarray) and array.shape[-1:] == (1,):
+        array = array[..., 0]
+    return array
+
+
+def _as_texture(child: Element) -> Element:
+    """Of an array, the bitmap that holds it; `data` is what an object consists of."""
+    if child.tag != "array" or child.attributes["name"] == "data":
+        return child
+    data = Element("array", {"name": "data"}, child.file, 0, data=child.data)
+    return Element("texture", {"name": child.attributes["name"], "type": "bitmap"}, child.file, 0, [data])
+
+
+def _of_trimesh(mesh: object, place: str) -> dict[str, object]:
+    """Arrays of a `trimesh.Trimesh`, with its texture coordinates, whose v grows upwards."""
+    if not (hasattr(mesh, "vertices") and hasattr(mesh, "faces")):
+        raise InputError(f'{place}: "mesh" must be a trimesh.Trimesh, is of type {type(mesh).__name__}')
+    arrays: dict[str, object] = {"vertices": np.asarray(mesh.vertices), "faces": np.asarray(mesh.faces)}
+    uv = getattr(getattr(mesh, "visual", None), "uv", None)
+    return arrays if uv is None else arrays | {"uv": np.asarray(uv) * [1, -1] + [0, 1]}
