@@ -6,7 +6,7 @@ import pathjax.compile  # noqa: F401  first: sets XLA up before a backend starts
 from pathjax.derivatives.jacobian import Jacobian, jacobian
 from pathjax.description.transform import Transform
 from pathjax.errors import InputError, InputWarning
-from pathjax.io.load import load_dict, load_scene
+from pathjax.io.load import load_dict, load_scene, save_scene
 from pathjax.rendering.aovs import render_aovs
 from pathjax.rendering.bounces import Bounces, render_bounces
 from pathjax.rendering.progressive.until import RenderResult, render_until
@@ -40,6 +40,7 @@ __all__ = [
     "render_aovs",
     "render_bounces",
     "render_until",
+    "save_scene",
     "with_parameters",
 ]
 

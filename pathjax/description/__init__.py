@@ -6,8 +6,10 @@ Matrices are float64, (4, 4), acting on column vectors. `name` is the id that pa
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from pathjax.description.elements import Document, Element
 from pathjax.kinds import Instance
 
 
@@ -38,3 +40,6 @@ class Description:
     shapes: tuple[Shape, ...]
     emitters: tuple[Instance, ...] = ()  # those that stand outside of shapes
     notes: tuple[str, ...] = field(default=())  # what `info` should tell: dropped triangles, replaced samplers
+    # What was read, to be written again, and what each of its elements became: an `Instance`, a `Shape`, ...
+    document: Document | None = None
+    made: Mapping[Element, object] = field(default_factory=dict)

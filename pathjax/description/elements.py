@@ -47,6 +47,7 @@ class Document:
     root: Element  # <scene>; its children have includes expanded and `default`, `path` taken out
     ids: Mapping[str, Element]
     folders: tuple[Path, ...]  # searched in this order for what the file names
+    found: dict[Element, Path] = field(default_factory=dict)  # the files that elements name
 
     def resolve(self, element: Element) -> Element:
         """The element itself, or what it refers to if it is a <ref>."""
@@ -61,7 +62,8 @@ class Document:
 
     def find(self, filename: str, element: Element) -> Path:
         """The file that `element` names, or InputError."""
-        return find_file(filename, self.folders, element)
+        self.found[element] = find_file(filename, self.folders, element)
+        return self.found[element]
 
 
 def nearest(name: str, known: Mapping[str, object] | list[str]) -> str:

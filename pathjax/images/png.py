@@ -35,6 +35,14 @@ def write_png(path: str | Path, rgb: np.ndarray) -> None:
     write_whole(Path(path), lambda file: image.save(file, format="PNG"))
 
 
+def write_stored(path: str | Path, stored: np.ndarray) -> None:
+    """Write (H, W, 3) uint8 as they are."""
+    from PIL import Image
+
+    image = Image.fromarray(np.ascontiguousarray(stored, np.uint8))
+    write_whole(Path(path), lambda file: image.save(file, format="PNG"))
+
+
 def read_stored(path: str | Path) -> np.ndarray:
     """(H, W, 3) uint8 or uint16 of a PNG, JPEG, BMP or TGA as they are stored, before the curve of sRGB.
 

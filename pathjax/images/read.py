@@ -34,7 +34,7 @@ def read_rgb(path: str | Path, raw: bool = False) -> np.ndarray:
 
 
 def decoded(stored: np.ndarray, raw: bool) -> np.ndarray:
-    """float32 in [0, 1] of what PNG, JPEG and their like store, uint8 or uint16: linear light, or raw, the plain numbers."""
+    """float32 in [0, 1] of uint8 or uint16 that PNG, JPEG and their like store: linear light, or raw, the numbers."""
     maximum = np.iinfo(stored.dtype).max
     levels = np.arange(maximum + 1) / maximum
     return (levels if raw else png.srgb_to_linear(levels)).astype(np.float32)[stored]

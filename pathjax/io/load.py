@@ -5,14 +5,19 @@ from __future__ import annotations
 import os
 import warnings
 from collections.abc import Mapping
+from pathlib import Path
 
 import jax.numpy as jnp
+import numpy as np
 from jax.typing import DTypeLike
 
 from pathjax import emitters
+from pathjax.compile import is_traced
 from pathjax.errors import InputError, InputWarning
-from pathjax.io.mitsuba import loader
+from pathjax.io.mitsuba import loader, writer
 from pathjax.scene.builder import build
+from pathjax.scene.parameters import about
+from pathjax.scene.parameters import parameters as parameters_of
 from pathjax.scene.scene import Scene
 
 
@@ -63,6 +68,25 @@ def load_scene(
     for name in parameters.keys() & keywords.keys():
         raise InputError(f"the parameter {name} is given twice, in parameters and as a keyword; give it once")
     return _lit(build(loader.load(file, sensor, **parameters, **keywords), dtype, split_rule), file)
+
+
+def save_scene(scene: Scene, file: str | os.PathLike) -> None:
+    """Write a scene that was loaded as a scene file of Mitsuba, with the present values of its parameters.
+
+    Loaded again it is the same scene. Textures and meshes that were given as arrays, and meshes in formats that Mitsuba
+    does not read, become files beside it, `NAME_*.exr`, `.png` and `.ply`; other files are named where they are. What
+    exists is overwritten, but no file that the scene was loaded from.
+
+    Args:
+        file: ends in `.xml`.
+    Raises:
+        InputError: a file cannot be written, the scene's values are traced, or no scene file can say what has changed.
+    """
+    values = parameters_of(scene)
+    if any(is_traced(value) for value in values.values()):
+        raise InputError(f"{file}: the scene's parameters are traced; save it outside of jit and derivatives")
+    known = about(scene).description
+    writer.save(known, {name: np.asarray(value) for name, value in values.items()}, Path(file))
 
 
 def _lit(scene: Scene, file: str | os.PathLike) -> Scene:

@@ -241,6 +241,7 @@ class Mesh(Shape):
     dropped: int = 0  # degenerate triangles left out
     attributes: Mapping[str, np.ndarray] = field(default_factory=dict)  # "vertex_*" (V, 3), "face_*" (F, 3)
     table = Triangles
+    triangles = True
 
     @classmethod
     def read(cls, loader, fields: Fields):

@@ -16,6 +16,7 @@ import numpy as np
 from pathjax import bsdfs, emitters, sensors, shapes, textures
 from pathjax.compile import is_traced
 from pathjax.description.elements import Document, Element, find_file, nearest
+from pathjax.description.fields import TYPED
 from pathjax.errors import InputError
 from pathjax.io.mitsuba import integrators, samplers
 from pathjax.io.mitsuba.plugins import PLUGINS
@@ -23,6 +24,7 @@ from pathjax.io.mitsuba.xml_reader import MAX_DEPTH, by_id
 from pathjax.sensors import film, filters
 
 VERSION = "3.0.0"
+SPECTRA = (*TYPED, "blackbody", "regular", "irregular")
 VALUE_TYPES = ("rgb", "spectrum", "ref", "resources")
 
 
@@ -36,7 +38,7 @@ def read(scene: Mapping) -> Document:
     return _Reader().document(scene)
 
 
-def _kinds() -> dict[str, Mapping[str, object]]:
+def rooms() -> dict[str, Mapping[str, object]]:
     """The tables of all rooms by the tag of elements."""
     return {
         "integrator": integrators.KINDS,
@@ -55,18 +57,20 @@ class _Reader:
     """What all levels share: the dictionaries around the present one, and which keys lead to each object."""
 
     def __init__(self):
-        self.kinds = _kinds()
+        self.kinds = rooms()
         self.around: list[object] = []
         self.paths: dict[str, Element] = {}
+        self.referred: set[str] = set()
         self.folders = [Path()]
 
     def document(self, scene: Mapping) -> Document:
         if not isinstance(scene, Mapping) or scene.get("type") != "scene":
             raise InputError('scene: must be a dictionary with "type": "scene", which holds all others by name')
         root = Element("scene", {"version": VERSION}, "scene", 0, self.children(scene, "scene", top=True))
-        ids = by_id(root)
         # Keys lead to objects, too: `shape.bsdf`.
-        return Document(root, self.paths | ids, tuple(self.folders))
+        for path in self.referred & self.paths.keys():
+            self.paths[path].attributes.setdefault("id", path)
+        return Document(root, self.paths | by_id(root), tuple(self.folders))
 
     def children(self, items: Mapping, place: str, top: bool = False) -> list[Element]:
         """What a dictionary holds besides its type and its id."""
@@ -136,6 +140,7 @@ class _Reader:
         found = [tag for tag, kinds in self.kinds.items() if kind in kinds]
         if len(found) > 1:
             raise InputError(f'{place}: "{kind}" is the name of kinds of {" and ".join(found)}; register other names')
+        found += ["spectrum"] if kind in SPECTRA else []
         found += [tag for tag, names in PLUGINS.items() if kind in names]
         if not found:
             known = [name for kinds in self.kinds.values() for name in kinds] + list(VALUE_TYPES)
@@ -161,8 +166,9 @@ class _Reader:
         return _element("spectrum", key, place, repr(float(array)))
 
     def _ref(self, key: str, value: Mapping, place: str) -> Element:
-        name = _only(value, ("id",), place)["id"]
-        return Element("ref", {"name": key, "id": _string(name, place)}, place, 0)
+        name = _string(_only(value, ("id",), place)["id"], place)
+        self.referred.add(name)
+        return Element("ref", {"name": key, "id": name}, place, 0)
 
     def _resources(self, key: str, value: Mapping, place: str) -> None:
         """A folder in which files are searched."""

@@ -48,6 +48,15 @@ def load_dict(scene: Mapping, sensor: int | str = 0) -> d.Description:
     return _Loader(dict_reader.read(scene)).description("scene", sensor)
 
 
+def read_again(document: Document, element: Element, name: str) -> Instance:
+    """What one element says by itself. name: by which its parameters are known.
+
+    Raises:
+        InputError: what is wrong with it.
+    """
+    return _Loader(document).make(element, dict_reader.rooms()[element.tag], name)
+
+
 class _Loader:
     """What the handlers below share: names given so far, objects made so far, notes."""
 
@@ -57,7 +66,7 @@ class _Loader:
         self.names = set(document.ids)
         self.counts: defaultdict[str, Iterator[int]] = defaultdict(count)
         self.making: set[Element] = set()
-        self.made: dict[Element, object] = {}  # an element that is referenced twice is one object
+        self.made: dict[Element, object] = {}
         self.on_shapes: dict[Element, Element] = {}  # a light by reference, and the shape that it shines from
 
     def description(self, file: str, sensor: int | str = 0) -> d.Description:
@@ -110,7 +119,8 @@ class _Loader:
         for tag in NOT_MODELLED:  # what refers to them is refused
             for element in scene[tag]:
                 self.note(element, "is used by nothing")
-        return d.Description(file, camera, film, integrator, spp, sampler, shapes, lights, tuple(self.notes))
+        read = self.document, self.made
+        return d.Description(file, camera, film, integrator, spp, sampler, shapes, lights, tuple(self.notes), *read)
 
     def note(self, element: Element, text: str) -> None:
         """What `info` should tell of an element."""
@@ -136,13 +146,14 @@ class _Loader:
         self.making.remove(element)
         self.notes += fields.notes + fields.without_effect(kind.unused)
         fields.finish()
+        self.made[element] = made
         return made
 
     def shared(self, element: Element, name: str) -> Instance:
-        """A bsdf or texture; the same object each time. `name` is for one without an id."""
+        """A bsdf or texture; the same object each time, also by reference. `name` is for one without an id."""
         if element not in self.made:
             kinds = bsdfs.KINDS if element.tag == "bsdf" else textures.KINDS
-            self.made[element] = self.make(element, kinds, element.id or name)
+            self.make(element, kinds, element.id or name)
         return self.made[element]
 
     bsdf = shared
@@ -203,13 +214,8 @@ def _shape(loader: _Loader, fields: Fields, name: str) -> d.Shape | None:
             raise fields.element.error(f"{element} shines from {other} already, at {other.place}; give each its own")
         emitter = loader.emitter(element, element.id or name, inside=True)
     inherited = fields.element.id or None
-    nested = fields.objects("bsdf")
-    if nested:
-        bsdf = loader.bsdf(nested[0], nested[0].id or inherited or loader.numbered("bsdf"))
-    else:
-        # Mitsuba: a light that is given no bsdf reflects nothing
-        grey = 0.5 if emitter is None else 0.0
-        bsdf = bsdfs.Diffuse.instance(inherited or loader.numbered("bsdf"), reflectance=grey)
+    (nested,) = fields.objects("bsdf") or [_usual_bsdf(fields.element, lit=emitter is not None)]
+    bsdf = loader.bsdf(nested, nested.id or inherited or loader.numbered("bsdf"))
     if why := mesh_attribute.fault(bsdf, geometry.attributes):
         raise fields.element.error(f"{fields.element} {why}")
     if geometry.empty:
@@ -228,6 +234,13 @@ def _chosen(elements: list[Element], which: int | str) -> Element:
     known = f"0 to {len(elements) - 1}" + (f" or {', '.join(ids)}" if ids else "")
     place = elements[0]
     raise InputError(f"{place.file}: there is no sensor {which!r}; use {known}{nearest(str(which), ids)}")
+
+
+def _usual_bsdf(shape: Element, lit: bool) -> Element:
+    """What Mitsuba takes for the bsdf that a shape lacks: grey, or what reflects nothing where light comes from it."""
+    reflectance = Element("float", {"name": "reflectance", "value": "0" if lit else "0.5"}, shape.file, shape.line)
+    shape.children.append(Element("bsdf", {"type": "diffuse"}, shape.file, shape.line, [reflectance]))
+    return shape.children[-1]
 
 
 def _sensor(loader: _Loader, fields: Fields) -> tuple[sensors.Sensor, film.HDRFilm, int, str]:

@@ -45,7 +45,7 @@ def read(path: str | Path, parameters: Mapping[str, object]) -> Document:
         if name in ids:
             raise alias.error(f'the id "{name}" is taken already, at {ids[name].file}:{ids[name].line}')
         ids[name] = ids[alias.id]
-    return Document(root, ids, tuple(reader.folders))
+    return Document(root, ids, tuple(reader.folders), reader.found)
 
 
 def by_id(root: Element) -> dict[str, Element]:
@@ -70,6 +70,7 @@ class _Reader:
         self.elements = 0
         self.files = 1
         self.aliases: list[Element] = []
+        self.found: dict[Element, Path] = {}
 
     def expand(self, root: Element, chain: tuple[Path, ...]) -> Element:
         if root.tag != "scene":
@@ -104,6 +105,7 @@ class _Reader:
     def _include(self, element: Element, chain: tuple[Path, ...]) -> list[Element]:
         require_attributes(element, required=("filename",))
         path = find_file(element.attributes["filename"], [*self.folders, chain[-1].parent], element)
+        self.found[element] = path
         if path.resolve() in chain:
             raise element.error(f'the file "{path}" includes itself')
         self.files += 1

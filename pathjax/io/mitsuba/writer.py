@@ -1,0 +1,208 @@
+"""From a loaded scene to a scene file of Mitsuba, which gives the same scene again.
+
+The file is what was read, written anew: the same elements, of whatever kind, with includes and `$name`s expanded, files
+named from the new place, and other values for parameters that have changed since. Arrays become files beside it.
+"""
+
+from __future__ import annotations
+
+import itertools
+import os
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+
+from pathjax import description as d
+from pathjax.description.elements import Document, Element
+from pathjax.errors import InputError
+from pathjax.images import write_exr
+from pathjax.images.png import write_stored
+from pathjax.images.read import decoded
+from pathjax.io.mesh import ply_writer
+from pathjax.io.mitsuba.loader import read_again
+from pathjax.io.mitsuba.plugins import PLUGINS
+from pathjax.kinds import Instance
+from pathjax.system.files import check_writable, write_text
+
+
+def save(description: d.Description, values: Mapping[str, np.ndarray], path: Path) -> None:
+    """Write the scene file, and before it what it names.
+
+    Args:
+        values: of all parameters, by name.
+    Raises:
+        InputError: a file cannot be written, or would overwrite one that the scene was read from; or no scene file can
+            say what has changed.
+    """
+    if path.suffix.lower() != ".xml":
+        raise InputError(f"{path}: scenes are written as .xml")
+    sources = {description.file, *description.document.found.values()}
+    check_writable(path, sources)
+    writer = _Writer(description, values, path, sources)
+    text = writer.text(description.document.root)
+    for write in writer.files:
+        write()
+    write_text(path, text)
+
+
+class _Writer:
+    def __init__(self, description: d.Description, values: Mapping[str, np.ndarray], path: Path, sources: set):
+        self.document, self.made, self.values = description.document, description.made, values
+        self.path, self.sources = path, sources
+        self.files: list = []  # functions that write them
+        self.names: set[str] = set()
+
+    def text(self, element: Element, depth: int = 0) -> str:
+        """The element and what it holds as lines of XML."""
+        if element.tag == "shape" and self.made.get(element) is None and _has_arrays(element):
+            return ""  # a mesh of which no triangle is left
+        element = self.changed(element)
+        if element.tag == "ref":
+            element = Element("ref", element.attributes | {"id": self.document.ids[element.id].id}, element.file, 0)
+        attributes = self.attributes(element)
+        start = f"{'    ' * depth}<{element.tag}" + "".join(f" {key}={quoteattr(x)}" for key, x in attributes.items())
+        if not element.children:
+            return f"{start}/>\n"
+        # Of several sensors the one that is used comes first.
+        children = sorted(element.children, key=lambda child: child.tag == "sensor" and child not in self.made)
+        inside = "".join(self.text(child, depth + 1) for child in children)
+        return f"{start}>\n{inside}{'    ' * depth}</{element.tag}>\n"
+
+    def attributes(self, element: Element) -> dict[str, str]:
+        attributes = dict(element.attributes)
+        if found := self.document.found.get(element):
+            attributes["filename" if "filename" in attributes else "value"] = self.seen_from_there(found)
+        for value in attributes.values():
+            if "$" in value or not value.replace("\n", " ").replace("\t", " ").isprintable():
+                raise element.error(f"{element}: {value[:60]!r} cannot be written, as XML has no word for it here")
+        return attributes
+
+    def seen_from_there(self, found: Path) -> str:
+        there = Path(os.path.realpath(self.path)).parent
+        try:
+            return Path(os.path.relpath(os.path.realpath(found), there)).as_posix()
+        except ValueError:  # on another drive of Windows
+            return str(found.absolute())
+
+    # ---- parameters
+
+    def changed(self, element: Element) -> Element:
+        """The element with what has changed, and with files in the place of arrays."""
+        made = self.made.get(element)
+        geometry = getattr(made, "geometry", None)
+        if geometry is not None and geometry.triangles and element.attributes["type"] not in PLUGINS["shape"]:
+            return self.mesh(element, made)
+        if isinstance(made, Instance):
+            values = {key: self.values[f"{made.name}.{key}"] for key in self.different(made)}
+            element = self.with_values(element, made, values) if values else element
+        if _has_arrays(element):
+            name = made.name if isinstance(made, Instance) else element.tag
+            children = [self.image(child, element, name) for child in element.children]
+            return Element(element.tag, element.attributes, element.file, element.line, children)
+        return element
+
+    def different(self, made: Instance) -> list[str]:
+        """Parameters whose values are not those that were read."""
+        found = []
+        for key in made.values:
+            value = self.values.get(f"{made.name}.{key}")
+            if value is not None and not isinstance(made.values[key], Instance) and made.values[key] is not None:
+                read = np.broadcast_to(np.asarray(made.values[key], value.dtype), value.shape)
+                found += [key] if not np.array_equal(read, value) else []
+        return found
+
+    def with_values(self, element: Element, made: Instance, values: Mapping[str, np.ndarray]) -> Element:
+        """The element with these values of its parameters, read back and compared.
+
+        Where the file sets them by other names, as a metal's by that of its material, it states all parameters instead.
+        """
+        listed = {key: x for key, x in made.values.items() if f"{made.name}.{key}" in self.values}
+        every = listed | values
+        known = made.kind.declared.keys() | made.kind.unused.keys() | {"to_world"}
+        own = [child for child in element.children if child.attributes.get("name") in known or _is_object(child)]
+        for children, stated in ((element.children, values), (own, every)):
+            new = Element(element.tag, element.attributes, element.file, element.line)
+            new.children = [child for child in children if child.attributes.get("name") not in stated]
+            new.children += [_value(key, x, element) for key, x in stated.items() if not isinstance(x, Instance)]
+            if self.reads(new, made, every):
+                return new
+        names = ", ".join(f"{made.name}.{key}" for key in values)
+        raise element.error(f"{element}: no scene file can say {names} = {list(map(str, values.values()))}")
+
+    def reads(self, element: Element, made: Instance, values: Mapping[str, object]) -> bool:
+        """Whether a loader takes the element for an object with these values."""
+        document = Document(self.document.root, self.document.ids, self.document.folders)
+        try:
+            again = read_again(document, element, made.name)
+        except InputError:
+            return False
+        numbers = {key: x for key, x in values.items() if not isinstance(x, Instance)}
+        return again.kind is made.kind and all(
+            again.values[key] is not None and np.array_equal(np.asarray(again.values[key], np.asarray(x).dtype), x)
+            for key, x in numbers.items()
+        )
+
+    # ---- files
+
+    def image(self, child: Element, parent: Element, name: str) -> Element:
+        """Of an array, the <string> that names the file to which it goes."""
+        if child.tag != "array":
+            return child
+        if child.attributes["name"] != "data":
+            raise child.error(f"{child} of {parent}: no scene file holds such an array")
+        data = np.atleast_3d(child.data)
+        data = np.broadcast_to(data, (*data.shape[:2], 3))
+        if data.dtype == np.uint16:
+            says = {each.attributes.get("name"): each.attributes.get("value") for each in parent.children}
+            data = decoded(data, raw=says.get("raw") == "true")
+        file = self.file(name, ".png" if data.dtype == np.uint8 else ".exr")
+        write = write_stored if data.dtype == np.uint8 else _write_linear
+        self.files.append(lambda: write(file, data))
+        return Element("string", {"name": "filename", "value": file.name}, child.file, child.line)
+
+    def mesh(self, element: Element, shape: d.Shape) -> Element:
+        """Of a mesh that Mitsuba reads from no file, or not in its format, the PLY that holds it in world space."""
+        file, geometry = self.file(shape.name, ".ply"), shape.geometry
+        arrays = geometry.vertices, geometry.faces, geometry.normals, geometry.uv
+        self.files.append(lambda: ply_writer.write(file, *arrays))
+        gone = ("filename", "to_world", "face_normals", "flip_tex_coords")
+        children = [Element("string", {"name": "filename", "value": file.name}, element.file, element.line)]
+        if geometry.normals is None:
+            children.append(Element("boolean", {"name": "face_normals", "value": "true"}, element.file, element.line))
+        children += [x for x in element.children if x.tag != "array" and x.attributes.get("name") not in gone]
+        return Element("shape", element.attributes | {"type": "ply"}, element.file, element.line, children)
+
+    def file(self, name: str, suffix: str) -> Path:
+        """A new name beside the scene file."""
+        stem = "_".join([self.path.stem, re.sub(r"[^\w-]", "_", name)])
+        for number in itertools.count(1):
+            made = f"{stem}{f'_{number}' if number > 1 else ''}{suffix}"
+            if made not in self.names:
+                self.names.add(made)
+                check_writable(self.path.with_name(made), self.sources)
+                return self.path.with_name(made)
+
+
+def _has_arrays(element: Element) -> bool:
+    return any(child.tag == "array" for child in element.children)
+
+
+def _is_object(child: Element) -> bool:
+    return child.tag == "ref" or "type" in child.attributes
+
+
+def _value(key: str, value: object, element: Element) -> Element:
+    """The element that sets a parameter to exactly this value."""
+    value = np.asarray(value)
+    tag = {(): "float", (3,): "rgb"}.get(value.shape)
+    if tag is None:
+        raise element.error(f'{element}: "{key}" has the shape {value.shape}, which no scene file can say')
+    text = ", ".join(str(x) for x in value.ravel())
+    return Element(tag, {"name": key, "value": text}, element.file, element.line)
+
+
+def _write_linear(path: Path, data: np.ndarray) -> None:
+    write_exr(path, {name: data[..., i] for i, name in enumerate("RGB")}, {})
