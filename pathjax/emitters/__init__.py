@@ -20,6 +20,7 @@ from pathjax.emitters.area import Area
 from pathjax.emitters.constant import Constant
 from pathjax.emitters.directional import Directional
 from pathjax.emitters.emitter import Background, DiracEmitter, Emitter, SurfaceEmitter
+from pathjax.emitters.envmap import Envmap
 from pathjax.emitters.point import Point
 from pathjax.emitters.selection import Choice, Lights, choice, choose
 from pathjax.emitters.spot import Spot
@@ -37,6 +38,7 @@ __all__ = [
     "DiracEmitter",
     "Directional",
     "Emitter",
+    "Envmap",
     "Lights",
     "Point",
     "Spot",
@@ -49,6 +51,7 @@ __all__ = [
 KINDS: dict[str, type[Emitter]] = {
     "area": Area,
     "constant": Constant,
+    "envmap": Envmap,
     "point": Point,
     "spot": Spot,
     "directional": Directional,

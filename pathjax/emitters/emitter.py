@@ -27,6 +27,7 @@ class Emitter(Kind):
     on_surfaces: ClassVar[bool] = False  # stands inside a shape
     distant: ClassVar[bool] = False  # infinitely far
     dirac: ClassVar[bool] = False  # shines from one direction at each point
+    single: ClassVar[bool] = False  # a scene takes one of the kind
 
     @staticmethod
     @abstractmethod

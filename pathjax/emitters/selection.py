@@ -34,7 +34,8 @@ class Lights:
     def count(self) -> int:
         if self.lamps is not None:
             return self.lamps.area.shape[0]
-        return next(column.values.shape[0] for column in self.table.columns if column is not None)
+        by_row = (self.table.column(key) for key, declared in self.kind.declared.items() if not declared.shared)
+        return next(column.values.shape[0] for column in by_row if column is not None)
 
     @property
     def left_to_bsdfs(self) -> bool:
@@ -52,7 +53,9 @@ class Lights:
     def dark(self) -> bool:
         """Whether they emit nothing; of known values, not of traced ones."""
         colors = [key for key, d in self.kind.declared.items() if isinstance(d, Color) and d.radiance]
-        return bool(colors) and not any(np.asarray(self.table.column(key).values).any() for key in colors)
+        if not colors:
+            return not np.asarray(self.power()).any()
+        return not any(np.asarray(self.table.column(key).values).any() for key in colors)  # `power` would be compiled
 
 
 class AllRows:

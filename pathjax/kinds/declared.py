@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -110,6 +110,25 @@ class Direction(Declared):
         """The unit vector that points the same way; the square of no component overflows or underflows."""
         vector = vector / np.abs(vector).max()
         return vector / np.linalg.norm(vector)
+
+
+@dataclass(frozen=True)
+class Rotation(Declared):
+    """(3, 3), orthonormal: how `to_world` turns, or turns and mirrors; where it moves to and its scale are left out.
+
+    No parameter of the scene.
+    """
+
+    default: object = field(default_factory=lambda: np.eye(3))
+    shape = (3, 3)
+
+    def read(self, loader, fields, name, owner):
+        axes = fields.transform(name)[:3, :3]
+        axes = axes / np.cbrt(abs(np.linalg.det(axes)))
+        if not np.allclose(axes.T @ axes, np.eye(3), atol=4e-3):
+            raise fields.error(name, "shears or scales unevenly, where it may only turn and mirror")
+        u, _, vt = np.linalg.svd(axes)  # the rounding of files is left out too
+        return u @ vt
 
 
 @dataclass(frozen=True)

@@ -91,8 +91,8 @@ class Kind:
 
 
 def _column(declared: Declared, values: list, dtype, code: Callable | None) -> Column | None:
-    """Of one parameter, by row: None where no row has it."""
-    if isinstance(declared, Setting) or all(value is None for value in values):
+    """Of one parameter, by row: None where no row has it, and of what the kind's own builder fills."""
+    if isinstance(declared, Setting) or declared.shared or all(value is None for value in values):
         return None
     textured = [isinstance(value, Instance) for value in values]
     missing = [value is None or is_texture for value, is_texture in zip(values, textured, strict=True)]

@@ -704,6 +704,7 @@ WITHOUT_EFFECT = [
     ("cube", shape("{}", "cube"), ["face_normals"]),
     ("area", shape('<emitter type="area">{}</emitter>'), ["sampling_weight"]),
     ("constant", '<emitter type="constant">{}</emitter>', ["sampling_weight", "to_world"]),
+    ("envmap", f'<emitter type="envmap">{PICTURE}{{}}</emitter>', ["sampling_weight", "mis_compensation"]),
     ("twosided", with_bsdf("twosided", '{}<bsdf type="diffuse"/>'), ["allow_transmission"]),
     (
         "bitmap",

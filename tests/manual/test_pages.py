@@ -91,7 +91,7 @@ NEEDS = {
     "uniform": ['<float name="value" value="1"/>'],
     "mesh_attribute": ['<string name="name" value="vertex_color"/>'],
     "twosided": ['<bsdf type="diffuse"/>'],
-    "bitmap": ['<string name="filename" value="marks.png"/>'],
+    **dict.fromkeys(("bitmap", "envmap"), ['<string name="filename" value="marks.png"/>']),
     **dict.fromkeys(("aov", "moment", "stokes"), ['<integrator type="path"/>']),
 } | {kind: [f'<string name="filename" value="mesh.{kind}"/>'] for kind in MESHES}
 

@@ -99,17 +99,21 @@ class _Loader:
         else:
             integrator = d.Integrator()
             self.notes.append('no <integrator> is given; <integrator type="path"> is used')
+        single = [element for element in scene["emitter"] if _kind_of_light(element).single]
+        for element in single[1:]:
+            first = f"{single[0].file}:{single[0].line}"
+            raise element.error(f"{element}: a scene takes one of this type; the first is at {first}")
         lights = tuple(
             self.emitter(element, element.id or self.unnamed(element))
             for element in scene["emitter"]
-            if not _on_surfaces(element)
+            if not _kind_of_light(element).on_surfaces
         )
         shapes = [
             self.make(element, SHAPES, element.id or self.numbered("shape"), read=_shape) for element in scene["shape"]
         ]
         shapes = tuple(shape for shape in shapes if shape is not None)
         for element in scene["emitter"]:
-            if _on_surfaces(element) and element not in self.on_shapes:
+            if _kind_of_light(element).on_surfaces and element not in self.on_shapes:
                 self.note(element, "is used by nothing; put it, or a <ref> to it, inside the <shape> that shines")
                 self.emitter(element, element.id, inside=True)
         for element in scene["bsdf"] + scene["texture"]:
@@ -252,10 +256,9 @@ def _sensor(loader: _Loader, fields: Fields) -> tuple[sensors.Sensor, film.HDRFi
     return camera, made, spp, drawn[0].attributes["type"] if drawn else "independent"
 
 
-def _on_surfaces(element: Element) -> bool:
-    """Whether an emitter is of a kind that shines from a shape."""
-    kind = emitters.KINDS.get(element.attributes.get("type", ""))
-    return kind is not None and kind.on_surfaces
+def _kind_of_light(element: Element) -> type[emitters.Emitter]:
+    """Of an emitter; any of one whose type is unknown, which `emitter` refuses."""
+    return emitters.KINDS.get(element.attributes.get("type", ""), emitters.Emitter)
 
 
 class _Settings:

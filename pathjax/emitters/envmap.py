@@ -1,0 +1,169 @@
+"""A picture of all directions, in Mitsuba's latitudes and longitudes.
+
+Columns are azimuths, whose texels have their centres at (i + 1/2) / width of a turn from -z over x; they repeat. Rows
+are polar angles from +y: the first row is the zenith and the last one the nadir. Between centres radiance is bilinear.
+
+A patch between four texels is drawn in proportion to its luminance, integrated over its solid angle, by two searches:
+for its row among all rows, and for its column in that row. Within the patch all directions are equally likely.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import ClassVar
+
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float, Int
+
+from pathjax.compile import compute_once
+from pathjax.core.math import at, cos_sin_turns, luminance, safe_atan2, safe_sqrt, turns
+from pathjax.emitters.emitter import Background
+from pathjax.images import read_rgb
+from pathjax.kinds import Number, PerRow, Rotation, Row, Shared, Unused
+
+# Tabled probabilities are multiples of this, and random numbers odd multiples of half of it: so what is tabled is what
+# is drawn, exactly.
+_STEP = 2.0**-23
+# Rows of patches whose probabilities are made at once, so that little memory is used beside what is kept.
+_ROWS = 64
+
+
+class Envmap(Background):
+    """An `Instance` holds `texels` (H, W, 3), `scale` and `to_world`."""
+
+    texels = Shared()  # (H, W, 3) linear radiance
+    rows = Shared()  # (H,) probability of the patches above each row of texels, from 0 to 1
+    columns = Shared()  # (H - 1, W + 1) of those left of each texel in a row of patches, from 0 to 1
+    from_pole = Shared()  # (H,) 1 - |cos| of the polar angles of rows of texels
+    per_solid_angle = Shared()  # (H - 1,) probability of a row of patches over the solid angle of one of them, 1/sr
+    brightness = PerRow()  # () luminance of the mean over the sphere
+    scale = Number(1.0, bounds=(0, math.inf))
+    to_world = Rotation()
+    single = True
+    unused: ClassVar[Mapping[str, Unused]] = Background.unused | {
+        "mis_compensation": Unused("boolean", "how often a direction is sampled changes noise alone")
+    }
+
+    @classmethod
+    def read(cls, loader, fields, name):
+        file = loader.find(fields, "filename")
+        texels, where = read_rgb(file), fields.where("filename")
+        if not np.isfinite(texels).all():
+            y, x = np.argwhere(~np.isfinite(texels).all(-1))[0]
+            raise where.error(f"{file}: texel ({x}, {y}) is {texels[y, x].tolist()}; radiance must be finite")
+        if texels.min() < 0:
+            count = int((texels < 0).any(-1).sum())
+            least = f"{count} texels of negative radiance, down to {texels.min():g}"
+            loader.note(where, f"names a picture with {least}, which is taken as 0")
+            texels = np.maximum(texels, 0)
+        given = {key: cls.declared[key].read(loader, fields, key, name) for key in ("scale", "to_world")}
+        return cls.instance(name, texels=texels, **given)
+
+    @classmethod
+    def build(cls, instances, dtype, path, parameters, code):
+        (instance,) = instances
+        table = super().build(instances, dtype, path, parameters, code)
+        name = f"{instance.name}.radiance"
+        why = "a picture, whose texels are too many for one derivative each; its `scale` is a parameter"
+        parameters.refused[name] = f"{name} is {why}"
+        texels = np.asarray(instance.values["texels"], dtype)
+        if len(texels) == 1:  # zenith, nadir and what is between
+            texels = np.concatenate([texels, texels])
+        columns = {"texels": texels, **_probabilities(texels)}
+        for key, values in columns.items():
+            table = table.with_column(key, np.asarray(values, dtype))
+        return table
+
+    @staticmethod
+    def power(p) -> Float[Array, " R"]:
+        return p.brightness * p.scale
+
+    @staticmethod
+    def sample(p: Row, u: Float[Array, "2"], u_part: Float[Array, ""]) -> Float[Array, "3"]:
+        height, width, _ = p.texels.shape
+        y, above = _search(lambda i: at(p.rows, i), height - 1, u[0])
+        x, beside = _search(lambda i: at(p.columns, y, i), width, u[1])
+        # From the nearer pole, near which cosines have no digits left. A patch across the equator begins above it.
+        upper, lower = at(p.from_pole, y), at(p.from_pole, y + 1)
+        lower = jnp.where(2 * y == height - 2, 2 - lower, lower)
+        from_pole = upper + (lower - upper) * above
+        r, cos = safe_sqrt(from_pole * (2 - from_pole)), 1 - from_pole
+        cos = jnp.where(2 * y > height - 2, -cos, cos)
+        turn = (x.astype(u.dtype) + beside + jnp.asarray(0.5, u.dtype)) / width
+        cos_phi, sin_phi = cos_sin_turns(turn - jnp.floor(turn))
+        return p.to_world @ jnp.stack([r * sin_phi, cos, -r * cos_phi])
+
+    @staticmethod
+    def emitted(p: Row, d: Float[Array, "3"]) -> Float[Array, "3"]:
+        (y, x), (below, beside) = _patch(p, d)
+        width = p.texels.shape[1]
+        following = jnp.where(x + 1 < width, x + 1, 0)
+        upper = at(p.texels, y, x) * (1 - beside) + at(p.texels, y, following) * beside
+        lower = at(p.texels, y + 1, x) * (1 - beside) + at(p.texels, y + 1, following) * beside
+        return (upper * (1 - below) + lower * below) * p.scale
+
+    @staticmethod
+    def density(p: Row, d: Float[Array, "3"]) -> Float[Array, ""]:
+        (y, x), _ = _patch(p, d)
+        return at(p.per_solid_angle, y) * (at(p.columns, y, x + 1) - at(p.columns, y, x))
+
+
+def _patch(p: Row, d: Float[Array, "3"]) -> tuple[Int[Array, "2"], Float[Array, "2"]]:
+    """The patch of a direction: its row and column, and how far below and beside its first texel the direction lies."""
+    height, width, _ = p.texels.shape
+    v = d @ p.to_world
+    squared = v[0] * v[0] + v[2] * v[2]
+    # Nearer to a pole an azimuth is nothing but rounding; its derivative would overflow.
+    x, z = jnp.where(squared > jnp.finfo(d.dtype).eps ** 2, jnp.stack([v[0], v[2]]), 0)
+    polar = safe_atan2(safe_sqrt(x * x + z * z), v[1]) * ((height - 1) / math.pi)
+    beside = turns(x, -z) * width - jnp.asarray(0.5, d.dtype)
+    beside = jnp.where(beside < 0, beside + width, beside)
+    place = jnp.stack([polar, beside])
+    first = jnp.clip(place.astype(jnp.int32), 0, jnp.array([height - 2, width - 1], jnp.int32))
+    return compute_once((first, place - first))
+
+
+def _search(cdf, count: int, u: Float[Array, ""]) -> tuple[Int[Array, ""], Float[Array, ""]]:
+    """The last i < count with cdf(i) <= u, and where u lies between cdf(i) and cdf(i + 1), in [0, 1)."""
+    halvings = max(count - 1, 0).bit_length()
+
+    def halve(k, i):
+        further = i + jnp.left_shift(jnp.int32(1), halvings - 1 - k)
+        return jnp.where((further < count) & (cdf(jnp.minimum(further, count)) <= u), further, i)
+
+    i = lax.fori_loop(0, halvings, halve, jnp.int32(0))
+    low = cdf(i)
+    return i, jnp.minimum((u - low) / (cdf(i + 1) - low), 1 - _STEP)
+
+
+def _probabilities(texels: np.ndarray) -> dict[str, np.ndarray]:
+    """The tables of an image whose texels are given: all but the texels."""
+    height, width, _ = texels.shape
+    theta = np.linspace(0, np.pi, height)
+    # Of a row of patches: solid angle over that of a turn, and integrals of sin over it, weighted by 1 - t and by t.
+    solid = 2 * np.sin((theta[:-1] + theta[1:]) / 2) * np.sin(np.diff(theta) / 2)
+    lower = np.diff(np.sin(theta)) / np.diff(theta) - np.cos(theta[1:])
+    upper = solid - lower
+    columns, mass = np.empty((height - 1, width + 1), texels.dtype), np.empty(height - 1)
+    for first in range(0, height - 1, _ROWS):
+        rows = slice(first, min(first + _ROWS, height - 1))
+        bright = np.asarray(luminance(texels[first : rows.stop + 1]), np.float64)
+        bright += np.roll(bright, -1, axis=1)
+        patches = bright[:-1] * upper[rows, None] + bright[1:] * lower[rows, None]
+        columns[rows], mass[rows] = _cumulated(patches), patches.sum(1)
+    brightness = mass.sum() / (4 * width)
+    rows = _cumulated(np.where(mass.any(), mass, solid))
+    per_solid_angle = np.diff(rows) / (solid * (2 * np.pi / width))
+    made = {"rows": rows, "columns": columns, "per_solid_angle": per_solid_angle, "brightness": brightness[None]}
+    return made | {"from_pole": 2 * np.sin(np.minimum(theta, np.pi - theta) / 2) ** 2}
+
+
+def _cumulated(weights: np.ndarray) -> np.ndarray:
+    """(..., N) weights to probabilities (..., N + 1) of what comes before; multiples of _STEP, of none but 0 less."""
+    weights = np.where(weights.any(-1, keepdims=True), weights, 1)
+    cumulated, lit = np.cumsum(weights, -1), np.cumsum(weights > 0, -1)
+    steps = np.rint(cumulated / cumulated[..., -1:] * (1 / _STEP - lit[..., -1:])) + lit
+    return np.concatenate([np.zeros_like(steps[..., :1]), steps * _STEP], -1)
