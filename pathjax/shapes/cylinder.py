@@ -173,15 +173,24 @@ class Cylinder(Shape):
         s = [1 - sign * axis[0] ** 2 / (sign + axis[2]), -sign * axis[0] * axis[1] / (sign + axis[2]), -sign * axis[0]]
         local = np.eye(4)
         local[:3] = np.stack([radius * np.array(s), radius * np.cross(axis, s), p1 - p0, p0], axis=1)
-        to_world = fields.transform("to_world") @ local
+        made = cls.of(fields.transform("to_world") @ local)
+        if made is None:
+            raise fields.error("to_world", "scales unevenly across the axis or shears; a cylinder must stay round")
+        return made
+
+    @classmethod
+    def of(cls, to_world: np.ndarray) -> Cylinder | None:
+        """What the unit cylinder becomes, if it is round and its axis upright."""
         x, y, z = to_world[:3, :3].T
         with np.errstate(all="ignore"):
-            scale, along = np.linalg.norm(x), np.linalg.norm(z)
-            unit = np.stack([x / scale, y / scale, z / along])
+            radius, length = np.linalg.norm(x), np.linalg.norm(z)
+            unit = np.stack([x / radius, y / radius, z / length])
             round_enough = np.allclose(unit @ unit.T, np.eye(3), atol=1e-3)
-        if not round_enough or not (0 < np.float32(scale) < np.inf and 0 < np.float32(along) < np.inf):
-            raise fields.error("to_world", "scales unevenly across the axis or shears; a cylinder must stay round")
-        return cls(to_world)
+            sizes = np.float32([radius, length])
+        return cls(to_world) if round_enough and (sizes > 0).all() and (sizes < np.inf).all() else None
+
+    def placed(self, to_world):
+        return self.of(to_world @ self.to_world)
 
     def primitives(self, flip):
         x, y, z, start = self.to_world[:3].T

@@ -7,7 +7,7 @@ x^2 + y^2 <= 1 for a disk (an ellipse). One test stands for the two triangles of
 from __future__ import annotations
 
 from abc import abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import jax
@@ -52,6 +52,11 @@ class PlanarShape(Shape):
     @classmethod
     def read(cls, loader, fields: Fields):
         return cls(fields.transform("to_world"))
+
+    def placed(self, to_world):
+        with np.errstate(over="ignore", invalid="ignore"):
+            matrix = to_world @ self.to_world
+        return replace(self, to_world=matrix) if (np.abs(matrix) < 3e38).all() else None
 
     def primitives(self, flip):
         linear = self.to_world[:3, :3]

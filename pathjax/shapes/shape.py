@@ -60,6 +60,13 @@ class Shape(ABC):
         return False
 
     @abstractmethod
+    def placed(self, to_world: np.ndarray) -> Shape | None:
+        """The shape carried by a further (4, 4), as Mitsuba's instances are, of which normals stay on their side.
+
+        None: it would be no shape of its kind, or not finite.
+        """
+
+    @abstractmethod
     def primitives(self, flip: bool) -> Primitives:
         """flip: turn the normals around."""
 

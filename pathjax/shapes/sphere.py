@@ -189,14 +189,22 @@ class Sphere(Shape):
         local = np.eye(4)
         local[:3, 3] = fields.point("center", np.zeros(3))
         local[:3, :3] *= fields.float("radius", 1.0, above=0)
-        to_world = fields.transform("to_world") @ local
+        made = cls.of(fields.transform("to_world") @ local)
+        if made is None:
+            raise fields.error("to_world", "scales unevenly or shears; a sphere must stay a sphere")
+        return made
+
+    @classmethod
+    def of(cls, to_world: np.ndarray) -> Sphere | None:
+        """What the unit sphere becomes, if that is a sphere."""
         radius = float(np.linalg.norm(to_world[:3, 0]))
         with np.errstate(all="ignore"):
             unit = to_world[:3, :3] / radius
             round_enough = np.allclose(unit.T @ unit, np.eye(3), atol=1e-3)
-        if not round_enough or not 0 < np.float32(radius) < np.inf:
-            raise fields.error("to_world", "scales unevenly or shears; a sphere must stay a sphere")
-        return cls(to_world[:3, 3], radius, to_world)
+            return cls(to_world[:3, 3], radius, to_world) if round_enough and 0 < np.float32(radius) < np.inf else None
+
+    def placed(self, to_world):
+        return self.of(to_world @ self.to_world)
 
     @property
     def mirrored(self):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import jax
 import jax.numpy as jnp
@@ -260,6 +260,19 @@ class Mesh(Shape):
     @property
     def empty(self):
         return not len(self.faces)
+
+    def placed(self, to_world):
+        linear, faces, normals = to_world[:3, :3], self.faces, self.normals
+        with np.errstate(over="ignore", invalid="ignore"):
+            vertices = self.vertices @ linear.T + to_world[:3, 3]
+            if not np.isfinite(vertices.astype(np.float32)).all():
+                return None
+        if np.linalg.det(linear) < 0:  # which turns faces inside out
+            faces = faces[:, ::-1]
+        if normals is not None:
+            normals = normals @ np.linalg.inv(linear)
+            normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
+        return replace(self, vertices=vertices, faces=faces, normals=normals)
 
     def primitives(self, flip):
         faces = self.faces[:, ::-1] if flip else self.faces

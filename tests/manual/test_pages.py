@@ -88,6 +88,7 @@ MESHES = ("obj", "ply", "stl", "glb", "gltf", "serialized")
 NEEDS = {
     "perspective": ["", '<float name="fov" value="40"/>'],
     "thinlens": [f'<float name="aperture_radius" value="1"/>{fov}' for fov in ("", '<float name="fov" value="40"/>')],
+    "instance": ['<shape type="shapegroup"/>'],
     "uniform": ['<float name="value" value="1"/>'],
     "mesh_attribute": ['<string name="name" value="vertex_color"/>'],
     "twosided": ['<bsdf type="diffuse"/>'],

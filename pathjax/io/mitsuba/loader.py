@@ -17,7 +17,7 @@ from pathjax.description.elements import Document, Element, nearest
 from pathjax.description.fields import NOT_MODELLED, VALUES, Fields
 from pathjax.errors import InputError
 from pathjax.io import mesh
-from pathjax.io.mitsuba import dict_reader, integrators, samplers
+from pathjax.io.mitsuba import dict_reader, instances, integrators, samplers
 from pathjax.io.mitsuba.plugins import PLUGINS
 from pathjax.io.mitsuba.xml_reader import read
 from pathjax.kinds import Instance, Unused
@@ -67,6 +67,7 @@ class _Loader:
         self.counts: defaultdict[str, Iterator[int]] = defaultdict(count)
         self.making: set[Element] = set()
         self.made: dict[Element, object] = {}
+        self.copied = 0  # triangles of instances
         self.on_shapes: dict[Element, Element] = {}  # a light by reference, and the shape that it shines from
 
     def description(self, file: str, sensor: int | str = 0) -> d.Description:
@@ -108,10 +109,10 @@ class _Loader:
             for element in scene["emitter"]
             if not _kind_of_light(element).on_surfaces
         )
-        shapes = [
-            self.make(element, SHAPES, element.id or self.numbered("shape"), read=_shape) for element in scene["shape"]
-        ]
-        shapes = tuple(shape for shape in shapes if shape is not None)
+        shapes = tuple(shape for element in scene["shape"] for shape in self.shapes(element))
+        if self.copied:
+            size = self.copied * instances.BYTES / 1e6
+            self.notes.append(f"triangles of instances are copies: {self.copied} of them, about {size:.0f} MB")
         for element in scene["emitter"]:
             if _kind_of_light(element).on_surfaces and element not in self.on_shapes:
                 self.note(element, "is used by nothing; put it, or a <ref> to it, inside the <shape> that shines")
@@ -169,6 +170,31 @@ class _Loader:
             raise element.error(f"{element} shines from no surface; it stands directly in <scene>")
         kinds = {key: kind for key, kind in emitters.KINDS.items() if kind.on_surfaces == inside}
         return self.make(element, kinds, name)
+
+    def shapes(self, element: Element) -> list[d.Shape]:
+        """What an element of a scene or a group stands for: nothing, one, or those that an instance shows."""
+        kinds = SHAPES | instances.KINDS
+        match kinds.get(element.attributes.get("type", "")):
+            case instances.ShapeGroup:
+                self.group(element)
+                return []
+            case instances.Instance:
+                return self.make(element, kinds, element.id or self.numbered("shape"))
+        made = self.make(element, kinds, element.id or self.numbered("shape"), read=_shape)
+        return [] if made is None else [made]
+
+    def group(self, element: Element) -> list[d.Shape]:
+        """The shapes of a group, read once."""
+        if element not in self.made:
+            self.make(element, instances.KINDS)
+        return self.made[element]
+
+    def copy(self, element: Element, triangles: int) -> None:
+        """Count what instances copy."""
+        self.copied += triangles
+        if self.copied > instances.MOST_TRIANGLES:
+            size = self.copied * instances.BYTES / 1e9
+            raise element.error(f"{element} makes the copies of instances {self.copied} triangles, about {size:.0f} GB")
 
     def unnamed(self, element: Element) -> str:
         """Name of an emitter outside of shapes that has no id."""

@@ -1,0 +1,65 @@
+"""Instances: shapes of a group that stand in several places, each a copy with a row of its own in the tables."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import ClassVar
+
+import numpy as np
+
+from pathjax import description as d
+from pathjax.description.fields import Fields
+from pathjax.kinds import Unused
+from pathjax.shapes import Mesh, Shape
+
+# Above, the tables of a scene would not fit into the memory of usual machines, or its numbers into 32 bits.
+MOST_TRIANGLES = 1 << 28
+# Vertices, normals, uv, and what searches keep of a triangle.
+BYTES = 200
+
+
+class ShapeGroup:
+    """What its instances show. It is not seen itself."""
+
+    unused: ClassVar[Mapping[str, Unused]] = Shape.unused | {
+        "to_world": Unused("transform", "its shapes and its instances are placed each by their own")
+    }
+
+    @classmethod
+    def read(cls, loader, fields: Fields) -> list[d.Shape]:
+        """Its shapes, in its own space."""
+        made = []
+        for element in fields.objects("shape", limit=1 << 20):
+            if element.attributes.get("type") in KINDS:
+                raise element.error(f"{element} cannot stand inside {fields.element}; groups hold shapes alone")
+            shapes = loader.shapes(element)
+            if any(shape.emitter is not None for shape in shapes):
+                raise element.error(f"{element} emits light, which instances cannot; put it outside of the group")
+            made += shapes
+        return made
+
+
+class Instance:
+    unused = Shape.unused
+
+    @classmethod
+    def read(cls, loader, fields: Fields, name: str) -> list[d.Shape]:
+        to_world, groups = fields.transform("to_world"), fields.objects("shape")
+        if not groups or groups[0].attributes.get("type") != "shapegroup":
+            raise fields.element.error(f'{fields.element} needs a <ref> to a <shape type="shapegroup">')
+        shapes = [_placed(fields, shape, to_world, name) for shape in loader.group(groups[0])]
+        loader.copy(fields.element, sum(len(s.geometry.faces) for s in shapes if isinstance(s.geometry, Mesh)))
+        return shapes
+
+
+def _placed(fields: Fields, shape: d.Shape, to_world: np.ndarray, name: str) -> d.Shape:
+    placed = shape.geometry.placed(to_world)
+    if placed is None:
+        kind = type(shape.geometry).__name__.lower()
+        raise fields.error("to_world", f'makes of "{shape.name}" what is no {kind}: it scales unevenly, or overflows')
+    return replace(shape, name=f"{name}.{shape.name}", geometry=placed)
+
+
+# By the name that scene files give them.
+KINDS = {"shapegroup": ShapeGroup, "instance": Instance}
