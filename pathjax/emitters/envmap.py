@@ -13,6 +13,7 @@ import math
 from collections.abc import Mapping
 from typing import ClassVar
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -34,9 +35,10 @@ _ROWS = 64
 class Envmap(Background):
     """An `Instance` holds `texels` (H, W, 3), `scale` and `to_world`."""
 
-    texels = Shared()  # (H, W, 3) linear radiance
+    # Large tables are flat, since lanes would copy others each time.
+    texels = Shared()  # (H W 3,) linear radiance
     rows = Shared()  # (H,) probability of the patches above each row of texels, from 0 to 1
-    columns = Shared()  # (H - 1, W + 1) of those left of each texel in a row of patches, from 0 to 1
+    columns = Shared()  # ((H - 1) (W + 1),) of those left of each texel in a row of patches, from 0 to 1
     from_pole = Shared()  # (H,) 1 - |cos| of the polar angles of rows of texels
     per_solid_angle = Shared()  # (H - 1,) probability of a row of patches over the solid angle of one of them, 1/sr
     brightness = PerRow()  # () luminance of the mean over the sphere
@@ -60,7 +62,8 @@ class Envmap(Background):
             loader.note(where, f"names a picture with {least}, which is taken as 0")
             texels = np.maximum(texels, 0)
         given = {key: cls.declared[key].read(loader, fields, key, name) for key in ("scale", "to_world")}
-        return cls.instance(name, texels=texels, **given)
+        # Where the scene will use it, so that one copy of it is all there is.
+        return cls.instance(name, texels=np.asarray(jax.device_put(texels)), **given)
 
     @classmethod
     def build(cls, instances, dtype, path, parameters, code):
@@ -72,8 +75,7 @@ class Envmap(Background):
         texels = np.asarray(instance.values["texels"], dtype)
         if len(texels) == 1:  # zenith, nadir and what is between
             texels = np.concatenate([texels, texels])
-        columns = {"texels": texels, **_probabilities(texels)}
-        for key, values in columns.items():
+        for key, values in {"texels": texels.reshape(-1), **_probabilities(texels)}.items():
             table = table.with_column(key, np.asarray(values, dtype))
         return table
 
@@ -83,9 +85,9 @@ class Envmap(Background):
 
     @staticmethod
     def sample(p: Row, u: Float[Array, "2"], u_part: Float[Array, ""]) -> Float[Array, "3"]:
-        height, width, _ = p.texels.shape
-        y, above = _search(lambda i: at(p.rows, i), height - 1, u[0])
-        x, beside = _search(lambda i: at(p.columns, y, i), width, u[1])
+        height, width = _size(p)
+        y, above = _search(p.rows, 0, height - 1, u[0])
+        x, beside = _search(p.columns, y * (width + 1), width, u[1])
         # From the nearer pole, near which cosines have no digits left. A patch across the equator begins above it.
         upper, lower = at(p.from_pole, y), at(p.from_pole, y + 1)
         lower = jnp.where(2 * y == height - 2, 2 - lower, lower)
@@ -99,21 +101,33 @@ class Envmap(Background):
     @staticmethod
     def emitted(p: Row, d: Float[Array, "3"]) -> Float[Array, "3"]:
         (y, x), (below, beside) = _patch(p, d)
-        width = p.texels.shape[1]
+        width = _size(p)[1]
+
+        def texel(y, x):
+            first = 3 * (y * width + x)
+            return jnp.stack([at(p.texels, first + channel) for channel in range(3)])
+
         following = jnp.where(x + 1 < width, x + 1, 0)
-        upper = at(p.texels, y, x) * (1 - beside) + at(p.texels, y, following) * beside
-        lower = at(p.texels, y + 1, x) * (1 - beside) + at(p.texels, y + 1, following) * beside
+        upper = texel(y, x) * (1 - beside) + texel(y, following) * beside
+        lower = texel(y + 1, x) * (1 - beside) + texel(y + 1, following) * beside
         return (upper * (1 - below) + lower * below) * p.scale
 
     @staticmethod
     def density(p: Row, d: Float[Array, "3"]) -> Float[Array, ""]:
         (y, x), _ = _patch(p, d)
-        return at(p.per_solid_angle, y) * (at(p.columns, y, x + 1) - at(p.columns, y, x))
+        place = y * (_size(p)[1] + 1) + x
+        return at(p.per_solid_angle, y) * (at(p.columns, place + 1) - at(p.columns, place))
+
+
+def _size(p: Row) -> tuple[int, int]:
+    """Height and width of the picture."""
+    height = len(p.rows)
+    return height, len(p.columns) // (height - 1) - 1
 
 
 def _patch(p: Row, d: Float[Array, "3"]) -> tuple[Int[Array, "2"], Float[Array, "2"]]:
     """The patch of a direction: its row and column, and how far below and beside its first texel the direction lies."""
-    height, width, _ = p.texels.shape
+    height, width = _size(p)
     v = d @ p.to_world
     squared = v[0] * v[0] + v[2] * v[2]
     # Nearer to a pole an azimuth is nothing but rounding; its derivative would overflow.
@@ -126,17 +140,19 @@ def _patch(p: Row, d: Float[Array, "3"]) -> tuple[Int[Array, "2"], Float[Array, 
     return compute_once((first, place - first))
 
 
-def _search(cdf, count: int, u: Float[Array, ""]) -> tuple[Int[Array, ""], Float[Array, ""]]:
-    """The last i < count with cdf(i) <= u, and where u lies between cdf(i) and cdf(i + 1), in [0, 1)."""
+def _search(
+    cdf: Float[Array, " N"], first: Int[Array, ""] | int, count: int, u: Float[Array, ""]
+) -> tuple[Int[Array, ""], Float[Array, ""]]:
+    """The last i < count with cdf[first + i] <= u, and where u lies between that and the next, in [0, 1)."""
     halvings = max(count - 1, 0).bit_length()
 
     def halve(k, i):
         further = i + jnp.left_shift(jnp.int32(1), halvings - 1 - k)
-        return jnp.where((further < count) & (cdf(jnp.minimum(further, count)) <= u), further, i)
+        return jnp.where((further < count) & (at(cdf, first + jnp.minimum(further, count)) <= u), further, i)
 
     i = lax.fori_loop(0, halvings, halve, jnp.int32(0))
-    low = cdf(i)
-    return i, jnp.minimum((u - low) / (cdf(i + 1) - low), 1 - _STEP)
+    low, high = at(cdf, first + i), at(cdf, first + i + 1)
+    return i, jnp.minimum((u - low) / (high - low), 1 - _STEP)
 
 
 def _probabilities(texels: np.ndarray) -> dict[str, np.ndarray]:
@@ -157,8 +173,13 @@ def _probabilities(texels: np.ndarray) -> dict[str, np.ndarray]:
     brightness = mass.sum() / (4 * width)
     rows = _cumulated(np.where(mass.any(), mass, solid))
     per_solid_angle = np.diff(rows) / (solid * (2 * np.pi / width))
-    made = {"rows": rows, "columns": columns, "per_solid_angle": per_solid_angle, "brightness": brightness[None]}
-    return made | {"from_pole": 2 * np.sin(np.minimum(theta, np.pi - theta) / 2) ** 2}
+    return {
+        "rows": rows,
+        "columns": columns.ravel(),
+        "from_pole": 2 * np.sin(np.minimum(theta, np.pi - theta) / 2) ** 2,
+        "per_solid_angle": per_solid_angle,
+        "brightness": brightness[None],
+    }
 
 
 def _cumulated(weights: np.ndarray) -> np.ndarray:

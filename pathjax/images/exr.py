@@ -91,7 +91,7 @@ def read_colors(path: str | Path) -> np.ndarray:
         pixels = _read_channels(image, part, parts[part], indices)
         numbers = {_number(parts[part], i) for i in indices}
     if matrix is None:
-        return np.repeat(pixels, 3 // len(indices), axis=-1)
+        return pixels if len(indices) == 3 else np.repeat(pixels, 3, axis=-1)
     # Red, green or blue that is no more than the rounding of the stored numbers leaves of it is not there.
     rounding = np.finfo(np.float16).eps if "half" in numbers else _MATRIX_ROUNDING
     with np.errstate(invalid="ignore"):  # infinities of different signs
@@ -180,7 +180,9 @@ def _read_channels(image, part: int, spec, indices: Sequence[int]) -> np.ndarray
     # One read for each kind of number: read as another, an integer would be divided by the largest one.
     kinds = {_number(spec, i) for i in indices}
     stored = {kind: read_pixels(image, part, first, end, kind) for kind in kinds}
-    pixels = np.stack([stored[_number(spec, i)][..., i - first].astype(np.float32) for i in indices], axis=-1)
+    pixels = np.empty((spec.height, spec.width, len(indices)), np.float32)
+    for k, i in enumerate(indices):
+        pixels[..., k] = stored[_number(spec, i)][..., i - first]
     x, y = spec.x - spec.full_x, spec.y - spec.full_y
     if (x, y, spec.width, spec.height) == (0, 0, spec.full_width, spec.full_height):
         return pixels
