@@ -24,6 +24,7 @@ from pathjax.core.math import at, cos_sin_turns, luminance, safe_atan2, safe_sqr
 from pathjax.emitters.emitter import Background
 from pathjax.images import read_rgb
 from pathjax.kinds import Number, PerRow, Rotation, Row, Shared, Unused
+from pathjax.textures.bitmap import texels_of
 
 # Tabled probabilities are multiples of this, and random numbers odd multiples of half of it: so what is tabled is what
 # is drawn, exactly.
@@ -51,15 +52,15 @@ class Envmap(Background):
 
     @classmethod
     def read(cls, loader, fields, name):
-        file = loader.find(fields, "filename")
-        texels, where = read_rgb(file), fields.where("filename")
+        data, key = fields.array("data", None), "filename" if fields.has("filename") else "data"
+        texels = read_rgb(loader.find(fields, "filename")) if data is None else texels_of(fields, data, raw=False)
         if not np.isfinite(texels).all():
             y, x = np.argwhere(~np.isfinite(texels).all(-1))[0]
-            raise where.error(f"{file}: texel ({x}, {y}) is {texels[y, x].tolist()}; radiance must be finite")
+            raise fields.error(key, f"has {texels[y, x].tolist()} in its texel ({x}, {y}); radiance must be finite")
         if texels.min() < 0:
             count = int((texels < 0).any(-1).sum())
             least = f"{count} texels of negative radiance, down to {texels.min():g}"
-            loader.note(where, f"names a picture with {least}, which is taken as 0")
+            loader.note(fields.where(key), f"has {least}, which is taken as 0")
             texels = np.maximum(texels, 0)
         given = {key: cls.declared[key].read(loader, fields, key, name) for key in ("scale", "to_world")}
         # Where the scene will use it, so that one copy of it is all there is.

@@ -36,7 +36,7 @@ class Bitmap(Texture):
     @classmethod
     def read(cls, loader, fields, name):
         raw, data = fields.boolean("raw", False), fields.array("data", None)
-        texels = read_rgb(loader.find(fields, "filename"), raw) if data is None else _texels(fields, data, raw)
+        texels = read_rgb(loader.find(fields, "filename"), raw) if data is None else texels_of(fields, data, raw)
         interpolation = fields.string("filter_type", "bilinear", choices=FILTERS)
         wrap = fields.string("wrap_mode", "repeat", choices=WRAPS)
         to_uv = cls.to_uv.read(loader, fields, "to_uv", name)
@@ -92,7 +92,7 @@ def _joined(arrays: list[np.ndarray]) -> np.ndarray:
     return arrays[0] if len(arrays) == 1 else np.concatenate(arrays)
 
 
-def _texels(fields, data: np.ndarray, raw: bool) -> np.ndarray:
+def texels_of(fields, data: np.ndarray, raw: bool) -> np.ndarray:
     """(H, W, 3) float32 of an array: bytes and 16-bit integers are stored as in a PNG, real numbers are linear."""
     if fields.has("filename"):
         raise fields.error("data", "excludes filename; give one or the other")

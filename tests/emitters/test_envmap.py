@@ -272,7 +272,7 @@ def test_it_adds_to_other_lights(make_scene, sky, estimate, agree):
 def test_what_is_not_finite_is_refused(make_scene, sky, wrong):
     texels = picture(4, 6)
     texels[2, 5, 1] = wrong
-    with pytest.raises(pj.InputError, match=r"scene\d+.xml:\d+: .*texel \(5, 2\) is .*must be finite"):
+    with pytest.raises(pj.InputError, match=r"scene\d+.xml:\d+: .*texel \(5, 2\); radiance must be finite"):
         make_scene(FLOOR + sky(texels))
 
 
@@ -311,6 +311,17 @@ def test_a_black_picture_is_told(write_scene, sky):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         pj.load_scene(write_scene(FLOOR + sky(picture(2, 3))))
+
+
+def test_arrays_are_pictures_too():
+    texels = picture(4, 6)
+    camera = {"type": "perspective", "film": {"type": "hdrfilm", "width": 4, "height": 4}}
+    for key in ("data", "bitmap"):
+        scene = pj.load_dict({"type": "scene", "view": camera, "sky": {"type": "envmap", key: texels}})
+        np.testing.assert_array_equal(scene.emitters[0].table.column("texels").values, texels.ravel())
+        assert list(pj.parameters(scene)) == ["sky.scale"]
+    with pytest.raises(pj.InputError, match=r"must have the shape \(H, W\)"):
+        pj.load_dict({"type": "scene", "view": camera, "sky": {"type": "envmap", "data": np.ones((2, 2, 5))}})
 
 
 # ---- beside Mitsuba -------------------------------------------------------------------------------------------------

@@ -118,7 +118,8 @@ class _Reader:
             return _element("point", key, place, _text(array))
         if array.ndim == 1:
             raise InputError(f"{place}: must be one number or three, has {len(array)}")
-        return Element("array", {"name": key}, place, 0, data=array)
+        name = "data" if key == "bitmap" else key  # the same, where Mitsuba takes one of its bitmaps
+        return Element("array", {"name": name}, place, 0, data=array)
 
     def object(self, key: str, value: Mapping, place: str, top: bool) -> Element:
         """An object of the kind that `type` names. At the top its key is its id."""
