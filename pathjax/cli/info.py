@@ -34,7 +34,7 @@ def scene_facts(scene: Scene) -> dict:
     max_depth = int(scene.max_depth)
     parts = [part for table in scene.geometry.tables for part in table.searched()]
     height, width = film.image_shape(scene.film)
-    dark = emitters.darkness(scene.emitters)
+    dark = emitters.darkness(scene.emitters, bsdfs.occurs(scene.materials, "smooth"))
     return {
         "file": description.file,
         "image": {"width": width, "height": height, "filter": _type(scene.film.filter), "spp": description.spp},

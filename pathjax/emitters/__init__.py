@@ -117,11 +117,20 @@ def met_by_no_ray(emitters: tuple[Lights, ...]) -> list[str]:
     return [name(lights) for lights in emitters if issubclass(lights.kind, DiracEmitter)]
 
 
-def darkness(emitters: tuple[Lights, ...]) -> str | None:
-    """Why every image is black, in words; None where light may come. Of known values, not of traced ones."""
+def darkness(emitters: tuple[Lights, ...], smooth: bool) -> str | None:
+    """Why every image is black, in words; None where light may come. Of known values, not of traced ones.
+
+    smooth: whether some bsdf is; others reflect no light that no ray meets.
+    """
     if not emitters:
         return "there is no light"
-    return "the radiance of every light is 0" if all(lights.dark() for lights in emitters) else None
+    bright = [lights for lights in emitters if not lights.dark()]
+    if not bright:
+        return "the radiance of every light is 0"
+    if smooth or any(not lights.kind.dirac for lights in bright):
+        return None
+    names = " and ".join(map(name, bright))
+    return f"the {names} emitters shine on smooth glass and mirrors alone, which show no light without size"
 
 
 def even_lights(emitters: tuple[Lights, ...]) -> Lights | None:

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import DTypeLike
 
-from pathjax import emitters
+from pathjax import bsdfs, emitters
 from pathjax.compile import is_traced
 from pathjax.errors import InputError, InputWarning
 from pathjax.io.mitsuba import loader, writer
@@ -35,7 +35,7 @@ def load_dict(
     Raises:
         InputError: what is wrong and what to do, with the keys that lead there.
     Warns:
-        InputWarning: nothing in the scene emits light.
+        InputWarning: images will be black, as nothing in the scene emits light, or nothing reflects it.
     """
     return _lit(build(loader.load_dict(scene, sensor), dtype, split_rule), "scene")
 
@@ -62,7 +62,7 @@ def load_scene(
     Raises:
         InputError: what is wrong and what to do; in a file, also the file and the line.
     Warns:
-        InputWarning: nothing in the file emits light.
+        InputWarning: images will be black, as nothing in the file emits light, or nothing reflects it.
     """
     parameters = dict(parameters or {})
     for name in parameters.keys() & keywords.keys():
@@ -91,6 +91,6 @@ def save_scene(scene: Scene, file: str | os.PathLike) -> None:
 
 def _lit(scene: Scene, file: str | os.PathLike) -> Scene:
     """The scene; a warning where it is dark."""
-    if dark := emitters.darkness(scene.emitters):
+    if dark := emitters.darkness(scene.emitters, bsdfs.occurs(scene.materials, "smooth")):
         warnings.warn(f"{file}: {dark}, so images of it are black", InputWarning, stacklevel=3)
     return scene

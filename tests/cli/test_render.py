@@ -188,10 +188,16 @@ BALL = '<shape type="sphere"/>'
         ("", (), "there is no light"),
         ('<emitter type="constant"><rgb name="radiance" value="0"/></emitter>', (), "the radiance of every light is 0"),
         ('<emitter type="constant" id="sky"/>', ("--set", "sky.radiance=0"), "the radiance of every light is 0"),
+        (
+            '<emitter type="spot"/><emitter type="point"/>',
+            (),
+            "the point and spot emitters shine on smooth glass and mirrors alone, which show no light without size",
+        ),
     ],
 )
 def test_a_scene_without_light_is_told(run, write_scene, tmp_path, lights, arguments, says):
-    scene = write_scene(BALL + lights, res=4)
+    ball = BALL.replace("/>", '><bsdf type="dielectric"/></shape>') if "point" in lights else BALL
+    scene = write_scene(ball + lights, res=4)
     status, _, err = run("render", scene, *arguments, "-o", tmp_path / "a.exr")
     assert status == 0
     assert err.strip() == f"pathjax: {scene}: {says}, so the image will be black"
