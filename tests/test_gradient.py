@@ -920,7 +920,7 @@ def test_colours_of_every_scene_against_differences(shipped, derivatives, agree,
     for parameter in names:
         value = np.asarray(pj.parameters(scene)[parameter])
         low, high = named.find(scene, parameter).bounds
-        h = value / 2 if parameter.endswith(("radiance", "intensity")) else np.full(3, 0.02)
+        h = value / 2 if parameter.endswith(("radiance", "intensity")) else np.full(value.shape, 0.02)
         middle = np.clip(value, low + h, high - h)
         slope = slopes[parameter]
         if not np.array_equal(middle, value):

@@ -191,7 +191,7 @@ class Fields:
             self.notes.append(f"{element.place}: {element} has the colour {was}, which is clipped")
         return shown
 
-    def array(self, name: str, default=REQUIRED) -> np.ndarray:
+    def array(self, name: str, default=REQUIRED) -> np.ndarray | None:
         """An array of any shape, which dictionaries alone can give."""
         element = self._take(name, default, ("array",))
         return default if element is None else element.data

@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import jax
+import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
@@ -57,7 +58,7 @@ class Textures:
 
         def of(table):
             def look_up():
-                p = Row(table, lax.max(code[1], 0))
+                p = Row(table, jnp.maximum(code[1], 0))
                 m, uv = p.to_uv, surface.uv
                 if m is not None:
                     uv = m[:, 0] * uv[0] + m[:, 1] * uv[1] + m[:, 2]
@@ -67,7 +68,7 @@ class Textures:
 
         if len(self.tables) == 1:
             return of(self.tables[0])()
-        return lax.switch(lax.max(code[0], 0), [of(table) for table in self.tables])
+        return lax.switch(jnp.maximum(code[0], 0), [of(table) for table in self.tables])
 
 
 def build(instances: list[Instance], dtype, path: tuple, parameters: Parameters) -> tuple[Textures | None, dict]:

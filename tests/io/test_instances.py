@@ -61,6 +61,7 @@ def rays(n=300):
     return np.float32(o), np.float32(d / np.linalg.norm(d, axis=1, keepdims=True))
 
 
+@pytest.mark.slow
 def test_what_rays_meet_is_as_in_mitsuba(write):
     mi = pytest.importorskip("mitsuba")
     mi.set_variant("scalar_rgb")

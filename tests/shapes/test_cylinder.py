@@ -83,7 +83,9 @@ def reference(shapes, o, d):
     return np.stack(t, 1), np.stack(unsure, 1)
 
 
-@pytest.mark.parametrize("count", [1, 5, 60], ids=["one", "flat", "tree"])
+@pytest.mark.parametrize(
+    "count", [1, pytest.param(5, marks=pytest.mark.slow), pytest.param(60, marks=pytest.mark.slow)]
+)
 def test_rays_hit_as_float64_says(count):
     shapes = cylinders(count)
     o, d = rays(20_000)
@@ -171,7 +173,7 @@ def test_disks_close_a_cylinder_without_a_gap():
     assert (np.asarray(hit.t) < np.inf).all()
 
 
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("dtype", [np.float32, pytest.param(np.float64, marks=pytest.mark.slow)])
 def test_area_and_coordinates_are_those_of_the_surface(dtype, x64):
     with x64() if dtype == np.float64 else nullcontext():
         table = scene_of(*cylinders(3), dtype=dtype).geometry.tables[0]
@@ -223,6 +225,7 @@ def test_light_is_drawn_with_the_density_that_is_told():
         assert abs(values.mean() - expected) < 4 * values.std() / np.sqrt(len(values))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "inside",
     [

@@ -112,6 +112,12 @@ def test_checkerboard_starts_with_color0_and_repeats():
     np.testing.assert_allclose(colors[:, 0], np.float32([0.1, 0.9, 0.9, 0.1, 0.9, 0.1]))
 
 
+def test_kinds_stand_beside_each_other_in_float64(x64):
+    with x64():
+        made = [textures.Uniform.instance("u", value=0.3), checkerboard()]
+        np.testing.assert_allclose(lookup_all(made, [[0.2, 0.2]])[:, 0], [[0.3] * 3, [0.1, 0.2, 0.3]], rtol=1e-6)
+
+
 def test_a_uniform_texture_is_one_number_of_all_channels():
     testing.check_texture(textures.Uniform, value=0.3)
     made = [textures.Uniform.instance("u", value=0.3), checkerboard()]
