@@ -51,8 +51,10 @@ class Fields:
                 self._objects.append(child)
                 continue
             name = child.attributes.get("name")
+            if not name and target.tag == "texture":
+                name = f"_arg_{len(self._values)}"  # as Mitsuba calls it; `only_texture` takes it, nothing else does
             if not name:
-                raise child.error(f'{child} inside {element} lacks name="...", the parameter that it sets')
+                raise self._nameless(child)
             if name in self._values:
                 raise child.error(f'"{name}" is given twice; the first is at {self._values[name].place}')
             self._values[name] = child
@@ -203,6 +205,14 @@ class Fields:
         self._take(name, None, ("texture", "ref"))
         return self.document.resolve(self._values[name])
 
+    def only_texture(self) -> Element:
+        """The one <texture> in the element, by whatever name."""
+        names = [name for name, child in self._values.items() if self.document.resolve(child).tag == "texture"]
+        if len(names) != 1:
+            raise self.element.error(f"{self.element} needs one <texture> inside, and has {len(names)}")
+        self._taken.add(names[0])
+        return self.document.resolve(self._values[names[0]])
+
     def transform(self, name: str) -> np.ndarray:
         """(4, 4) float64: the element's steps in the order of the file; the identity if it is not given."""
         element = self._take(name, None, ("transform",))
@@ -240,12 +250,17 @@ class Fields:
         """Refuse what no call has asked for."""
         for name, child in self._values.items():
             if name not in self._taken:
+                if not child.attributes.get("name"):
+                    raise self._nameless(child)
                 known = ", ".join(self.known) or "none"
                 raise child.error(
                     f"{child} is not a parameter of {self.element}; it has: {known}{nearest(name, self.known)}"
                 )
         for child in self._objects:
             raise child.error(f"{child} has no place inside {self.element}")
+
+    def _nameless(self, child: Element) -> InputError:
+        return child.error(f'{child} inside {self.element} lacks name="...", the parameter that it sets')
 
     def _take(self, name: str, default: object, tags: tuple[str, ...]) -> Element | None:
         self.known.append(name)

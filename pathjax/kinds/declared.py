@@ -32,7 +32,7 @@ class Declared:
 
 @dataclass(frozen=True)
 class Number(Declared):
-    """A number, whose texture is the luminance of its colours."""
+    """A number; where it may be textured, also the mean of a colour, or the luminance of a texture, as in Mitsuba."""
 
     listed = True
 
@@ -40,6 +40,8 @@ class Number(Declared):
         if self.textured and (made := loader.texture(fields, name, owner)) is not None:
             return _in_range(fields, name, made, self.bounds)
         low, high = self.bounds
+        if self.textured and fields.where(name).tag in ("rgb", "spectrum"):
+            return float(fields.color(name, at_most=high).mean())
         return fields.float(name, self.default, at_least=low, at_most=high)
 
 
@@ -154,7 +156,7 @@ class Flag(Declared):
     dtype = bool
 
     def read(self, loader, fields, name, owner):
-        return fields.boolean(name, False) or None
+        return fields.boolean(name, bool(self.default)) or None
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import jax
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Int, Shaped
+from jaxtyping import Array, Float, Int, Shaped
 
 from pathjax.core.math import at, luminance
 from pathjax.core.types import Number, Surface
@@ -69,3 +69,11 @@ class Row:
             return color if constant.shape else luminance(color)
 
         return lax.cond(at(column.texture, self._row, 0) >= 0, look_up, lambda: constant)
+
+    def gradient(self, name: str) -> Float[Array, "2"]:
+        """How a number changes with u and v of the surface."""
+
+        def at_uv(uv):
+            return getattr(Row(self._table, self._row, self._surface._replace(uv=uv), self._textures), name)
+
+        return jax.jacfwd(at_uv)(self._surface.uv)

@@ -65,6 +65,7 @@ class _Loader:
         self.notes: list[str] = []
         self.names = set(document.ids)
         self.counts: defaultdict[str, Iterator[int]] = defaultdict(count)
+        self.named: set[tuple[str, str]] = set()  # types and names of bsdfs and textures
         self.making: set[Element] = set()
         self.made: dict[Element, object] = {}
         self.copied = 0  # triangles of instances
@@ -155,10 +156,17 @@ class _Loader:
         return made
 
     def shared(self, element: Element, name: str) -> Instance:
-        """A bsdf or texture; the same object each time, also by reference. `name` is for one without an id."""
+        """A bsdf or texture; the same object each time, also by reference.
+
+        name: for one without an id, with a number if it is that of another one of its type, as in masks inside masks.
+        """
         if element not in self.made:
             kinds = bsdfs.KINDS if element.tag == "bsdf" else textures.KINDS
-            self.make(element, kinds, element.id or name)
+            kind, name = element.attributes.get("type"), element.id or name
+            if (kind, name) in self.named:
+                name = self.numbered(name)
+            self.named.add((kind, name))
+            self.make(element, kinds, name)
         return self.made[element]
 
     bsdf = shared
