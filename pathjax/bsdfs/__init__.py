@@ -2,12 +2,14 @@
 
 A bsdf is a subclass of `BSDF`, which says what it must offer and what it may be capable of. A material has a front and
 a back, each a bsdf or nothing, which absorbs: a kind, which is the place of a table, and a row in that table. Where
-settings of bsdfs differ, they are in tables of their own.
+settings of bsdfs differ, they are in tables of their own. Where bsdfs hold others, a material is a tree, and `leaf`
+finds what scatters.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -16,15 +18,22 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from pathjax import textures
+from pathjax.bsdfs import tree
+from pathjax.bsdfs.blendbsdf import BlendBSDF
 from pathjax.bsdfs.bsdf import BSDF
+from pathjax.bsdfs.bumpmap import BumpMap
 from pathjax.bsdfs.conductor import Conductor
 from pathjax.bsdfs.dielectric import Dielectric
 from pathjax.bsdfs.diffuse import Diffuse
+from pathjax.bsdfs.mask import Mask
+from pathjax.bsdfs.normalmap import NormalMap
+from pathjax.bsdfs.null import Null
 from pathjax.bsdfs.plastic import Plastic
 from pathjax.bsdfs.roughconductor import RoughConductor
 from pathjax.bsdfs.twosided import TwoSided
+from pathjax.bsdfs.wrapper import Wrapper
 from pathjax.core.math import at
-from pathjax.core.types import BSDFSample, Surface
+from pathjax.core.types import BSDFSample, Frame, Surface
 from pathjax.kinds import Column, Instance, Parameters, Row, Table, ordered
 from pathjax.kinds import register as register_kind
 from pathjax.textures import Textures
@@ -32,10 +41,15 @@ from pathjax.textures import Textures
 __all__ = [
     "KINDS",
     "BSDF",
+    "BlendBSDF",
+    "BumpMap",
     "Conductor",
     "Dielectric",
     "Diffuse",
+    "Mask",
     "Materials",
+    "NormalMap",
+    "Null",
     "Plastic",
     "RoughConductor",
     "TwoSided",
@@ -49,7 +63,12 @@ KINDS: dict[str, type[BSDF]] = {
     "roughconductor": RoughConductor,
     "dielectric": Dielectric,
     "plastic": Plastic,
+    "null": Null,
     "twosided": TwoSided,
+    "blendbsdf": BlendBSDF,
+    "mask": Mask,
+    "bumpmap": BumpMap,
+    "normalmap": NormalMap,
 }
 # Place of the table of a kind, row in it, or place of a shape; -1: none.
 Index = Int[Array, ""]
@@ -65,8 +84,13 @@ def register(name: str):
 @dataclass(frozen=True)
 class Materials:
     tables: tuple[Table, ...]  # one for each kind of bsdf present
-    sides: Int[Array, "S 2 2"]  # of each shape: front and back; kind (-1: absorbs), row
+    sides: Int[Array, "S 2 code"]  # of each shape: front and back; kind (-1: absorbs), row; of trees a `tree.Node`
     textures: Textures | None  # in the place of parameters; None: there are none
+    # Of kinds that hold others, and which of them, by place, may be met after so many others on the way to a leaf, and
+    # on the way to what lets light pass. None of it in scenes without.
+    wrappers: tuple[Table, ...] = ()
+    levels: tuple[tuple[int, ...], ...] = field(default=(), metadata={"static": True})
+    passing: tuple[tuple[int, ...], ...] = field(default=(), metadata={"static": True})
 
 
 def build(bsdfs: list[Instance], dtype, path: tuple, parameters: Parameters) -> Materials:
@@ -74,23 +98,39 @@ def build(bsdfs: list[Instance], dtype, path: tuple, parameters: Parameters) -> 
 
     path: where the materials will be in the scene; parameters: to enter those of bsdfs and textures.
     """
-    sides = [bsdf.kind.sides(bsdf) for bsdf in bsdfs]
-    present = list(dict.fromkeys(side for pair in sides for side in pair if side is not None))
-    used = dict.fromkeys(v for side in present for v in side.values.values() if isinstance(v, Instance))
+    levels = tree.reached(bsdfs)
+    present = list(dict.fromkeys(each for level in levels for each in level))
+    used = dict.fromkeys(v for each in present for v in each.values.values() if isinstance(v, Instance))
     made, codes = textures.build(list(used), dtype, (*path, "textures"), parameters)
-    tables, places = [], {None: (-1, 0)}
-    for kind, rows in ordered(present, KINDS).items():
+    number, tables, wrappers, held = {None: (-1, 0)}, [], [], []
+    for kind, rows in sorted(ordered(present, KINDS).items(), key=lambda item: issubclass(item[0], Wrapper)):
+        place, those = ("wrappers", wrappers) if issubclass(kind, Wrapper) else ("tables", tables)
         for variant in sorted({kind.variant(row) for row in rows}):
             alike = [row for row in rows if kind.variant(row) == variant]
-            places |= {side: (len(tables), row) for row, side in enumerate(alike)}
-            tables.append(kind.build(alike, dtype, (*path, "tables", len(tables)), parameters, codes.get))
-    numbers = [[places[side] for side in pair] for pair in sides]
-    return Materials(tuple(tables), np.asarray(np.reshape(numbers, (-1, 2, 2)), np.int32), made)
+            number |= {each: (len(tables) + len(wrappers), row) for row, each in enumerate(alike)}
+            those.append(kind.build(alike, dtype, (*path, place, len(those)), parameters, codes.get))
+            if those is wrappers:
+                held.append(alike)
+    wrappers = [
+        table.with_column("nodes", np.stack([tree.nodes_of(each, number) for each in rows]))
+        for table, rows in zip(wrappers, held, strict=True)
+    ]
+
+    def places(of):
+        """By level, the wrappers among these."""
+        found = [{number[each][0] - len(tables) for each in level if of(each)} for level in levels]
+        return tuple(tuple(sorted(level)) for level in found if level)
+
+    code = [[(*number[side], turned) for side, turned in tree.sides(bsdf)] for bsdf in bsdfs]
+    width = 3 if wrappers else 2
+    sides = np.asarray(np.reshape(code, (-1, 2, 3)), np.int32)[..., :width]
+    walked, passing = places(tree.is_wrapper), places(lambda each: tree.is_wrapper(each) and tree.may_pass(each))
+    return Materials(tuple(tables), sides, made, tuple(wrappers), walked, passing)
 
 
 def occurs(materials: Materials, capability: str) -> bool:
     """Whether some kind present is capable of it: "smooth", "delta", ... of `BSDF`, or "moves_paths"."""
-    return any(_is(table, capability) for table in materials.tables)
+    return any(_is(table, capability) for table in (*materials.tables, *materials.wrappers))
 
 
 def has(materials: Materials, kind: Index, capability: str) -> Bool[Array, ""]:
@@ -115,8 +155,9 @@ def moving_bit(materials: Materials, kind: Index, row: Index) -> Index:
 
 
 def name(materials: Materials, kind: int) -> str:
-    """What scene files call a kind that is present."""
-    return next(name for name, each in KINDS.items() if each is materials.tables[kind].kind)
+    """What scene files call a kind that is present, those that hold others after the rest."""
+    table = (*materials.tables, *materials.wrappers)[kind]
+    return next(name for name, each in KINDS.items() if each is table.kind)
 
 
 def reflectances(materials: Materials) -> tuple[int, Column] | None:
@@ -131,10 +172,40 @@ def with_fresnel(materials: Materials, fresnel: str) -> Materials:
     return replace(materials, tables=tuple(tables))
 
 
-def select(materials: Materials, shape: Index, front: Bool[Array, ""]) -> tuple[Index, Index]:
-    """Kind and row of the side of a shape; where there is none, -1, those of some shape."""
-    kind, row = at(materials.sides, jnp.maximum(shape, 0), jnp.where(front, 0, 1))
-    return kind, row
+def select(materials: Materials, shape: Index, front: Bool[Array, ""]) -> Int[Array, " code"]:
+    """Kind and row of the side of a shape, or its node; where there is none, -1, those of some shape."""
+    return at(materials.sides, jnp.maximum(shape, 0), jnp.where(front, 0, 1))
+
+
+def leaf(
+    materials: Materials,
+    shape: Index,
+    surface: Surface,
+    frame: Frame,
+    wi: Float[Array, "3"],
+    u: Float[Array, ""] | None,
+    differentiated: bool = False,
+) -> tree.Leaf:
+    """What scatters at a point of a shape; see `tree.leaf`. u: None where no bsdf holds others."""
+    code = select(materials, shape, wi[2] > 0)
+    if materials.wrappers:
+        return tree.leaf(materials, code, surface, frame, wi, u, differentiated)
+    kind, row = code
+    return tree.Leaf(kind, row, frame, wi, None, ())
+
+
+def passing(materials: Materials, shape: Index, surface: Surface, front: Bool[Array, ""]) -> Float[Array, ""]:
+    """Share of light that a side of a shape lets straight on."""
+    passes = partial(has, materials, capability="passes")
+    code = select(materials, shape, front)
+    if materials.wrappers:
+        return tree.passing(materials, code, front, surface, passes)
+    return passes(code[0]).astype(surface.p.dtype)
+
+
+def is_tree(materials: Materials, shape: Index, front: Bool[Array, ""]) -> Bool[Array, ""]:
+    """Whether a side of a shape is a bsdf that holds others."""
+    return select(materials, shape, front)[0] >= len(materials.tables)
 
 
 def evaluate(

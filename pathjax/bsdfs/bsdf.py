@@ -28,6 +28,9 @@ class BSDF(Kind):
     branches: ClassVar[bool] = False  # has just two lobes, of which `sample(..., other=True)` gives what is not drawn
     anisotropic: ClassVar[bool] = False  # x of its frame is the way that u grows, else any
     lobes: ClassVar[bool] = False  # takes a third random number, to choose its lobe
+    passes: ClassVar[bool] = False  # light goes straight on, as if nothing were there
+    along_uv: ClassVar[bool] = False  # asks the surface how its point moves with u and v
+    turns_back: ClassVar[bool] = False  # what lies on the back sees what comes from there as its own front does
 
     @staticmethod
     @abstractmethod
@@ -61,3 +64,8 @@ class BSDF(Kind):
     def sides(cls, instance: Instance) -> tuple[Instance | None, Instance | None]:
         """What the front and the back of a surface of this bsdf are; None absorbs."""
         return instance, instance if cls.sided else None
+
+    @classmethod
+    def leaves(cls, instance: Instance) -> tuple[Instance, ...]:
+        """Of all that it may be, those that scatter."""
+        return (instance,)

@@ -1,19 +1,15 @@
-"""A reflector for each side of a surface; the same one twice where the file names one."""
+"""A bsdf for each side of a surface; the same one twice where the file names one."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import ClassVar
-
 from pathjax.bsdfs.bsdf import BSDF
-from pathjax.kinds import Instance, Unused
+from pathjax.kinds import Instance
 
 
 class TwoSided(BSDF):
-    """Mitsuba's `twosided`: no bsdf of its own, but where others go."""
+    """Mitsuba's `twosided`: no bsdf of its own, but where others go. Each sees light as it does on a front."""
 
-    # What lets light pass cannot stand inside here.
-    unused: ClassVar[Mapping[str, Unused]] = {"allow_transmission": Unused("boolean")}
+    turns_back = True
 
     @classmethod
     def read(cls, loader, fields, name):
@@ -22,9 +18,14 @@ class TwoSided(BSDF):
             raise fields.element.error(f"{fields.element} needs a <bsdf> inside")
         names = [name] if len(nested) == 1 else [loader.unique(f"{name}_{side}") for side in ("front", "back")]
         made = [loader.bsdf(element, side) for element, side in zip(nested, names, strict=True)]
+        through = fields.boolean("allow_transmission", False)
         for element, side in zip(nested, made, strict=True):
-            if side.kind.sided or side.kind is cls:
+            leaves = [leaf.kind for leaf in side.kind.leaves(side)]
+            if any(leaf.sided for leaf in leaves):
                 raise element.error(f"{element} cannot stand inside {fields.element}; it has two sides of its own")
+            if any(leaf.passes for leaf in leaves) and not through:
+                allow = '<boolean name="allow_transmission" value="true"/>'
+                raise element.error(f"{element} lets light through; {fields.element} takes it with {allow}")
         return cls.of(name, made[0], made[-1])
 
     @classmethod
@@ -33,4 +34,9 @@ class TwoSided(BSDF):
 
     @classmethod
     def sides(cls, instance):
-        return instance.values["front"], instance.values["back"]
+        front, back = instance.values["front"], instance.values["back"]
+        return front.kind.sides(front)[0], back.kind.sides(back)[0]
+
+    @classmethod
+    def leaves(cls, instance):
+        return tuple(leaf for each in instance.values.values() for leaf in each.kind.leaves(each))

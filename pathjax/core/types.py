@@ -43,6 +43,8 @@ class Surface(NamedTuple):
     uv: Float[Array, "2"]
     tangent: Float[Array, "3"] | None = None  # unit, the way u grows, across shading_n; None: no bsdf of the scene asks
     attributes: dict[str, Float[Array, "3"]] | None = None  # of the mesh, by name; None: no texture of the scene asks
+    # How p moves with u and with v, along the surface; 0 where that is not known. None: no bsdf of the scene asks.
+    along: tuple[Float[Array, "3"], Float[Array, "3"]] | None = None
 
 
 class BSDFSample(NamedTuple):

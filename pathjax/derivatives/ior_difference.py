@@ -72,7 +72,7 @@ def mean_and_differences(
     def step(state):
         number, shift, todo, now, weight, plus, sums = state
         now, weight = pixel.begun(scene, pixel_number, stream, number, now, weight, options)
-        u = bounce_numbers(scene, stream, number, now.depth)
+        u = bounce_numbers(scene, stream, number, path.vertices(now))
         now = path.extend(shifted(shift), choice, now, u, options)
 
         def end():

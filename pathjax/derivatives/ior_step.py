@@ -13,9 +13,8 @@ from pathjax.bsdfs import dielectric
 from pathjax.compile import native_map
 from pathjax.core.math import at, dot, safe_divide, spawn_ray
 from pathjax.derivatives import ior
-from pathjax.integrators import path
 from pathjax.integrators.random_numbers import bsdf_dimensions
-from pathjax.integrators.vertex import vertex
+from pathjax.integrators.vertex import sample, vertex
 from pathjax.scene.scene import Scene
 from pathjax.sensors import film
 from pathjax.shapes import geometry
@@ -77,8 +76,8 @@ def _motion(pixel_number, scene, row):
             ray, _, met, depth, _ = state
             hit = geometry.closest_hit(scene.geometry, ray)
             found = hit.primitive >= 0
-            here = vertex(varied, ray, hit)
-            drawn, d = path.bsdf_sample(varied, here, refracts)
+            here = vertex(varied, ray, hit, half[0] if scene.materials.wrappers else None)
+            drawn, d = sample(varied, here, refracts)
             on = found & drawn.delta & (here.kind >= 0)
             end = jnp.where(found, here.surface.p, ray.d)
             met = met | (found & bsdfs.has(varied.materials, here.kind, "moves_paths") & (here.row == row))

@@ -27,6 +27,7 @@ class Integrator:
     max_depth: int = -1  # -1: unbounded; 1: emission only
     rr_depth: int = 5
     hide_emitters: bool = False
+    free_passes: bool = False  # straight through a surface is no bounce that counts for max_depth
 
 
 @dataclass(frozen=True)

@@ -12,9 +12,9 @@ from jaxtyping import Array, Float, Int
 from pathjax import bsdfs
 from pathjax.core import sampler
 from pathjax.core.math import dot, spawn_ray
-from pathjax.integrators import path
 from pathjax.integrators.pixel import Work, camera_ray
 from pathjax.integrators.random_numbers import bounce_numbers
+from pathjax.integrators.vertex import sample as sample_bsdf
 from pathjax.integrators.vertex import vertex
 from pathjax.scene.scene import Scene
 from pathjax.shapes import geometry
@@ -49,10 +49,10 @@ def sample(scene: Scene, pixel: Int[Array, ""], stream: sampler.Word, number: sa
     ray, hit, passed = _first(scene, ray)
 
     def seen():
-        here = vertex(scene, ray, hit)
         u = bounce_numbers(scene, stream, number, jnp.int32(0))
+        here = vertex(scene, ray, hit, u.leaf)
         # The mean weight of a bsdf sample is the albedo, exact where all directions carry the same.
-        drawn, _ = path.bsdf_sample(scene, here, u.bsdf)
+        drawn, _ = sample_bsdf(scene, here, u.bsdf)
         transmits = bsdfs.has(scene.materials, here.kind, "transmissive")
         albedo = jnp.where(transmits, 1, jnp.where(here.kind >= 0, drawn.weight, 0))
         return FirstHit((passed + hit.t)[None], here.surface.shading_n, albedo)

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Float, Real
+from jaxtyping import Array, Bool, Float, Int, Real
 
 from pathjax import bsdfs, emitters
-from pathjax.core.math import spawn_ray, to_local
+from pathjax.core.math import spawn_ray
 from pathjax.core.types import EmitterSample
 from pathjax.emitters import Choice
 from pathjax.integrators.options import Options
 from pathjax.integrators.random_numbers import Bounce
-from pathjax.integrators.vertex import Vertex
+from pathjax.integrators.shadow import transmitted
+from pathjax.integrators.vertex import Vertex, evaluate
 from pathjax.scene.scene import Scene
 from pathjax.shapes import geometry
 
@@ -23,21 +24,30 @@ def occurs(scene: Scene, choice: Choice | None, options: Options) -> bool:
 
 
 def light_sample(
-    scene: Scene, choice: Choice, vertex: Vertex, u: Bounce, goes_on: Bool[Array, ""], options: Options
-) -> Float[Array, "3"]:
+    scene: Scene,
+    choice: Choice,
+    vertex: Vertex,
+    u: Bounce,
+    goes_on: Bool[Array, ""],
+    depth: Int[Array, ""],
+    options: Options,
+) -> tuple[Float[Array, "3"], Int[Array, ""] | None]:
     """One sample of what a vertex reflects of direct light: the integral over all lights of f Le |cos theta| V.
 
     Args:
         choice: how lights are chosen, of `emitters.choice`.
         goes_on: else the sample is of no use, and its shadow ray not traced.
+        depth: vertices so far.
+    Returns:
+        The sample, and how many vertices its light passed straight; None where there are no such.
     """
     materials = scene.materials
     smooth = bsdfs.has(materials, vertex.kind, "smooth")
+    passes = bsdfs.occurs(materials, "passes")
 
     def sample():
         drawn = emitters.sample(scene.emitters, scene.geometry, choice, vertex.surface.p, u.light, u.triangle)
-        wo = to_local(vertex.frame, drawn.d)
-        f, pdf_bsdf = bsdfs.evaluate(materials, vertex.kind, vertex.row, vertex.surface, vertex.wi, wo)
+        f, pdf_bsdf = evaluate(scene, vertex, drawn.d)
         possible = (drawn.pdf > 0) & (pdf_bsdf > 0)
         scale = _weight(drawn, pdf_bsdf, options) / jnp.where(possible, drawn.pdf, 1)
         contribution = f * drawn.Le * scale
@@ -45,10 +55,14 @@ def light_sample(
         useful = goes_on & smooth & possible & (options.derivative | jnp.any(contribution > 0))
         reach = jnp.where(useful, drawn.distance, -1)
         shadow_ray = spawn_ray(vertex.surface, drawn.d, vertex.hit.primitive)._replace(t_max=reach)
+        if passes:
+            most = scene.max_depth - 1 - depth
+            share, passed = transmitted(scene, shadow_ray, drawn.primitive, most, options.derivative)
+            return jnp.where(useful, contribution * share, 0), passed
         visible = useful & ~geometry.occluded(scene.geometry, shadow_ray, drawn.primitive)
-        return jnp.where(visible, contribution, 0)
+        return jnp.where(visible, contribution, 0), None
 
-    return lax.cond(smooth, sample, lambda: jnp.zeros_like(vertex.wi))
+    return lax.cond(smooth, sample, lambda: (jnp.zeros_like(vertex.wi), jnp.int32(0) if passes else None))
 
 
 def _weight(drawn: EmitterSample, pdf_bsdf: Float[Array, ""], options: Options) -> Float[Array, ""] | int:

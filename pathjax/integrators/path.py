@@ -4,7 +4,7 @@
 
     emission                      Le: light of what the path ends on, as far as bsdf sampling is to find it
     next_event.light_sample       T Le: light of a sampled light, reflected once
-    bsdf_sample                   T L: one direction stands for the integral, and the path goes on in it
+    vertex.sample                 T L: one direction stands for the integral, and the path goes on in it
     roulette.survival             few of the paths that carry little go on, for all of them
     splitting                     both branches of glass instead of one by chance, where that is asked for
     control.roulette              paths end in light that is known instead of in darkness, where that is asked for
@@ -23,13 +23,13 @@ from jaxtyping import Array, Bool, Float, Int
 
 from pathjax import bsdfs, emitters
 from pathjax.compile import compute_once
-from pathjax.core.math import dot, spawn_ray, to_world
-from pathjax.core.types import BSDFSample, Hit, Ray
+from pathjax.core.math import dot, spawn_ray
+from pathjax.core.types import Hit, Ray
 from pathjax.emitters import Choice
 from pathjax.integrators import next_event, roulette, splitting
 from pathjax.integrators.options import Options
 from pathjax.integrators.random_numbers import Bounce
-from pathjax.integrators.vertex import Vertex, vertex
+from pathjax.integrators.vertex import Vertex, sample, vertex
 from pathjax.scene.scene import Scene
 from pathjax.shapes import geometry
 
@@ -39,6 +39,7 @@ class Gain(NamedTuple):
 
     emission: Float[Array, "3"]  # of the term T^depth Le, depth being that of the path before the vertex
     light: Float[Array, "3"]  # of the next one: the light sample
+    passed: Int[Array, ""] | None = None  # and of so many further ones; None: nothing lets light pass
 
 
 class Path(NamedTuple):
@@ -48,9 +49,12 @@ class Path(NamedTuple):
     L: Float[Array, "3"] | Gain  # radiance gathered so far; a Gain: at the last vertex alone
     throughput: Float[Array, "3"]  # product of the weights so far
     pdf: Float[Array, ""]  # density [1/sr] of ray.d by bsdf sampling; inf from a camera or a Dirac lobe
-    depth: Int[Array, ""]  # vertices so far
+    # Straight on through what lets light pass pdf stays that of the vertex before, which light samples saw.
+    depth: Int[Array, ""]  # vertices so far; where passes are free, without these
     alive: Bool[Array, ""]  # once it is not, L is whole
     # None where nothing asks for it, so that nothing of it is compiled:
+    origin: Float[Array, "3"] | None = None  # the point whose `pdf` it is
+    passed: Int[Array, ""] | None = None  # free passes so far
     passive: Float[Array, ""] | None = None  # what refraction did to the throughput, which roulette takes out
     moving: Int[Array, ""] | None = None  # bit r % 31 is set once it met row r of the bsdfs that move paths
     expected: Float[Array, ""] | None = None  # what a control expects of it, all channels
@@ -58,17 +62,24 @@ class Path(NamedTuple):
     pending: Path | None = None  # (split_depth, ...) branches that wait, those alive; see `splitting`
 
 
+def vertices(path: Path) -> Int[Array, ""]:
+    """How many a path has behind it: the number of the next one."""
+    return path.depth if path.passed is None else path.depth + path.passed
+
+
 def start(scene: Scene, ray: Ray, options: Options) -> Path:
     """A path that has its camera ray."""
     one, zero3 = jnp.ones_like(ray.t_max), jnp.zeros_like(ray.o)
-    branches = bsdfs.occurs(scene.materials, "transmissive")
+    branches, passes = (bsdfs.occurs(scene.materials, each) for each in ("transmissive", "passes"))
     path = Path(
         ray,
-        Gain(zero3, zero3) if options.by_vertex else zero3,
+        Gain(zero3, zero3, jnp.int32(0) if passes else None) if options.by_vertex else zero3,
         zero3 + (scene.max_depth > 0),
         one * jnp.inf,
         jnp.int32(0),
         scene.max_depth > 0,
+        ray.o if passes else None,
+        jnp.int32(0) if scene.free_passes else None,
         one if branches else None,
         jnp.int32(0) if options.watch_moving else None,
         jnp.zeros_like(one) if options.controlled else None,
@@ -90,14 +101,19 @@ def extend(scene: Scene, choice: Choice | None, path: Path, u: Bounce, options: 
     """
     ray, first = path.ray, path.depth == 0
     hit = geometry.closest_hit(scene.geometry, ray)
-    here = vertex(scene, ray, hit) if scene.geometry.tables else None
+    here = vertex(scene, ray, hit, u.leaf, options.derivative) if scene.geometry.tables else None
     # What many results share is computed once.
     u, here = compute_once((u, here))
     path = path._replace(L=_with_emission(path.L, emission(scene, choice, path, hit, here, options)))
-    path = path._replace(depth=path.depth + 1)
-    if here is None:
-        return _ended(path)
-    goes_on = (hit.primitive >= 0) & (path.depth < scene.max_depth)
+    if scene.free_passes:
+        free = bsdfs.has(scene.materials, here.kind, "passes")
+        path = path._replace(depth=path.depth + jnp.where(free, 0, 1), passed=path.passed + jnp.where(free, 1, 0))
+        goes_on = (hit.primitive >= 0) & (free | (path.depth < scene.max_depth))
+    else:
+        path = path._replace(depth=path.depth + 1)
+        if here is None:
+            return _ended(path)
+        goes_on = (hit.primitive >= 0) & (path.depth < scene.max_depth)
     if control is not None:
         path, goes_on = lax.cond(
             goes_on,
@@ -128,9 +144,10 @@ def emission(
 
     def received():
         def at_surface():
-            surface = here.surface
-            arrival = hit._replace(t=dot(surface.p - path.ray.o, path.ray.d)) if options.derivative else hit
-            return emitters.hit(scene.emitters, shapes, choice, path.ray, arrival, surface)
+            surface, ray = here.surface, path.ray if path.origin is None else path.ray._replace(o=path.origin)
+            again = options.derivative or path.origin is not None
+            arrival = hit._replace(t=dot(surface.p - ray.o, ray.d)) if again else hit
+            return emitters.hit(scene.emitters, shapes, choice, ray, arrival, surface)
 
         def at_infinity():
             return emitters.background(scene.emitters, choice, path.ray.d)
@@ -151,10 +168,13 @@ def scatter(
     scene: Scene, choice: Choice | None, here: Vertex, u: Bounce, goes_on: Bool[Array, ""], options: Options, path: Path
 ) -> Path:
     """T L at a vertex: a light sample, and a direction in which the path goes on if roulette lets it."""
+    if here.weight is not None:
+        path = path._replace(throughput=path.throughput * here.weight)
     L = path.L
     if next_event.occurs(scene, choice, options):
-        L = _with_light(L, path.throughput * next_event.light_sample(scene, choice, here, u, goes_on, options))
-    drawn, d = compute_once(bsdf_sample(scene, here, u.bsdf))
+        light, passed = next_event.light_sample(scene, choice, here, u, goes_on, path.depth, options)
+        L = _with_light(L, path.throughput * light, passed)
+    drawn, d = compute_once(sample(scene, here, u.bsdf))
     if path.pending is not None:
         splits = splitting.takes_place(scene, here, path)
         drawn = drawn._replace(weight=jnp.where(splits, drawn.pdf, 1) * drawn.weight)
@@ -174,18 +194,14 @@ def scatter(
         alive=carries & (u.roulette < survival),
         passive=passive,
     )
+    if path.origin is not None:
+        passes = bsdfs.has(scene.materials, here.kind, "passes")
+        on = on._replace(
+            pdf=jnp.where(passes, path.pdf, on.pdf), origin=jnp.where(passes, path.origin, here.surface.p)
+        )
     if path.moving is not None:
         on = on._replace(moving=path.moving | bsdfs.moving_bit(scene.materials, here.kind, here.row))
     return on if path.pending is None else splitting.split(scene, here, u.bsdf, splits, path, on)
-
-
-def bsdf_sample(scene: Scene, here: Vertex, u: Float[Array, " numbers"]) -> tuple[BSDFSample, Float[Array, "3"]]:
-    """A sample, whose weight estimates the integral of f |cos theta|, and its direction in world space.
-
-    u: of `Bounce.bsdf`.
-    """
-    drawn = bsdfs.sample(scene.materials, here.kind, here.row, here.surface, here.wi, u)
-    return drawn, to_world(here.frame, drawn.wo)
 
 
 def _ended(path: Path) -> Path:
@@ -193,8 +209,8 @@ def _ended(path: Path) -> Path:
 
 
 def _with_emission(L, emitted):
-    return Gain(emitted, jnp.zeros_like(emitted)) if isinstance(L, Gain) else L + emitted
+    return L._replace(emission=emitted, light=jnp.zeros_like(emitted)) if isinstance(L, Gain) else L + emitted
 
 
-def _with_light(L, light):
-    return L._replace(light=light) if isinstance(L, Gain) else L + light
+def _with_light(L, light, passed):
+    return L._replace(light=light, passed=passed) if isinstance(L, Gain) else L + light

@@ -87,7 +87,7 @@ def over_vertices(work: Work, scene: Scene, choice: Choice | None, add: Callable
         number, now, weight, sums = state
         now, weight = begun(scene, pixel, stream, number, now, weight, options)
         depth = now.depth
-        u = bounce_numbers(scene, stream, number, depth, options.sampler)
+        u = bounce_numbers(scene, stream, number, path.vertices(now), options.sampler)
         now = path.extend(scene, choice, now, u, options, control)
         sums = add(sums, depth, now, weight)
         return number + jnp.where(now.alive, 0, 1).astype(number.dtype), now, weight, sums

@@ -16,6 +16,7 @@ from pathjax.scene.scene import Scene
 
 # Hashed numbers of lobes begin here: the others are two for each depth, and depths end at `scene.UNBOUNDED`, 2^30.
 _LOBES = 1 << 31
+_LEAVES = _LOBES + (1 << 30)
 
 
 class Bounce(NamedTuple):
@@ -25,6 +26,7 @@ class Bounce(NamedTuple):
     bsdf: Float[Array, " numbers"]  # 2 or 3, `bsdf_dimensions`
     triangle: Float[Array, ""]  # chooses within a mesh that emits
     roulette: Float[Array, ""]
+    leaf: Float[Array, ""] | None = None  # chooses among bsdfs that hold others; None: there are none
 
 
 def camera_numbers(
@@ -47,7 +49,10 @@ def bounce_numbers(
     if bsdf_dimensions(scene.materials) == 3:
         lobe = sampler.hashed(key, jnp.uint32(_LOBES) + depth.astype(jnp.uint32), 1).astype(dtype)
         bsdf = jnp.concatenate([bsdf, lobe])
-    return Bounce(u[:2], bsdf, rest[0], rest[1])
+    leaf = None
+    if scene.materials.wrappers:
+        leaf = sampler.hashed(key, jnp.uint32(_LEAVES) + depth.astype(jnp.uint32), 1)[0].astype(dtype)
+    return Bounce(u[:2], bsdf, rest[0], rest[1], leaf)
 
 
 def bsdf_dimensions(materials: bsdfs.Materials) -> int:

@@ -24,12 +24,13 @@ from jaxtyping import Array, Float
 from pathjax import bsdfs, emitters
 from pathjax.compile import native_map
 from pathjax.core import sampler
-from pathjax.core.math import spawn_ray, to_local, to_world
+from pathjax.core.math import dot, spawn_ray
 from pathjax.core.types import Number, Ray
 from pathjax.emitters import Choice
 from pathjax.integrators.pixel import camera_ray
 from pathjax.integrators.random_numbers import bounce_numbers
-from pathjax.integrators.vertex import vertex
+from pathjax.integrators.shadow import transmitted
+from pathjax.integrators.vertex import evaluate, sample, vertex
 from pathjax.scene.scene import Scene
 from pathjax.sensors import film
 from pathjax.shapes import geometry
@@ -45,43 +46,51 @@ def radiance(scene: Scene, choice: Choice | None, ray: Ray, numbers: Callable) -
     shapes, materials = scene.geometry, scene.materials
 
     def bounce(state):
-        ray, L, throughput, pdf, passive, depth, _ = state
-        u = numbers(depth)
+        ray, L, throughput, pdf, origin, passive, depth, passed, _ = state
+        u = numbers(depth + passed)
         hit = geometry.closest_hit(shapes, ray)
         found = hit.primitive >= 0
-        here = vertex(scene, ray, hit)
-        bsdf = here.kind, here.row, here.surface, here.wi
-        goes_on = found & (here.kind >= 0) & (depth + 1 < scene.max_depth)
+        here = vertex(scene, ray, hit, u.leaf)
+        passes = bsdfs.has(materials, here.kind, "passes")
+        free = passes & scene.free_passes
+        depth, passed = jnp.where(free, depth, depth + 1), jnp.where(free, passed + 1, passed)
+        goes_on = found & (here.kind >= 0) & (free | (depth < scene.max_depth))
 
         # Emission, of the surface or of the background.
-        lamp, pdf_lamp = emitters.hit(scene.emitters, shapes, choice, ray, hit, here.surface)
+        from_origin, arrival = ray._replace(o=origin), hit._replace(t=dot(here.surface.p - origin, ray.d))
+        lamp, pdf_lamp = emitters.hit(scene.emitters, shapes, choice, from_origin, arrival, here.surface)
         sky, pdf_sky = emitters.background(scene.emitters, choice, ray.d)
         Le, pdf_light = jnp.where(found, lamp, sky), jnp.where(found, pdf_lamp, pdf_sky)
         L = L + throughput * Le * share(pdf, pdf_light)
 
+        if here.weight is not None:
+            throughput = throughput * here.weight
+
         # Light sample. A Dirac lobe reflects none of it.
         if choice is not None and bsdfs.occurs(materials, "smooth"):
             light = emitters.sample(scene.emitters, shapes, choice, here.surface.p, u.light, u.triangle)
-            f, pdf_bsdf = bsdfs.evaluate(materials, *bsdf, to_local(here.frame, light.d))
+            f, pdf_bsdf = evaluate(scene, here, light.d)
             shadow_ray = spawn_ray(here.surface, light.d, hit.primitive)._replace(t_max=light.distance)
             lit = goes_on & bsdfs.has(materials, here.kind, "smooth") & (light.pdf > 0) & (pdf_bsdf > 0)
-            lit &= ~geometry.occluded(shapes, shadow_ray, light.primitive)
+            arrives, _ = transmitted(scene, shadow_ray, light.primitive, scene.max_depth - 1 - depth, False)
             direct = f * light.Le / jnp.where(lit, light.pdf, 1) * share(jnp.where(lit, light.density, 1), pdf_bsdf)
-            L = L + jnp.where(lit, throughput * direct, 0)
+            L = L + jnp.where(lit, throughput * arrives * direct, 0)
 
         # Bsdf sample.
-        drawn = bsdfs.sample(materials, *bsdf, u.bsdf)
+        drawn, d = sample(scene, here, u.bsdf)
         throughput, passive = throughput * drawn.weight, passive * drawn.passive
 
         # Roulette, by the share of light that is left, which refraction does not change.
-        depth = depth + 1
         survival = jnp.where(depth >= scene.rr_depth, jnp.clip(jnp.max(throughput) / passive, 0.05, 0.95), 1)
         alive = goes_on & (drawn.pdf > 0) & jnp.any(throughput > 0) & (u.roulette < survival)
-        ray = spawn_ray(here.surface, to_world(here.frame, drawn.wo), hit.primitive)
-        return ray, L, throughput / survival, jnp.where(drawn.delta, jnp.inf, drawn.pdf), passive, depth, alive
+        # What goes straight on comes from where it came from.
+        pdf = jnp.where(passes, pdf, jnp.where(drawn.delta, jnp.inf, drawn.pdf))
+        origin = jnp.where(passes, origin, here.surface.p)
+        ray = spawn_ray(here.surface, d, hit.primitive)
+        return ray, L, throughput / survival, pdf, origin, passive, depth, passed, alive
 
     zero, one = jnp.zeros_like(ray.o), jnp.ones_like(ray.t_max)
-    state = ray, zero, zero + 1, one * jnp.inf, one, jnp.int32(0), scene.max_depth > 0
+    state = ray, zero, zero + 1, one * jnp.inf, ray.o, one, jnp.int32(0), jnp.int32(0), scene.max_depth > 0
     return lax.while_loop(lambda state: state[-1], bounce, state)[1]
 
 

@@ -13,8 +13,8 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from pathjax import bsdfs
-from pathjax.core.math import at, spawn_ray, to_world
-from pathjax.integrators.vertex import Vertex
+from pathjax.core.math import at, spawn_ray
+from pathjax.integrators.vertex import Vertex, sample
 from pathjax.scene.scene import Scene
 
 
@@ -38,9 +38,9 @@ def split(scene: Scene, here: Vertex, u: Float[Array, " numbers"], splits: Bool[
     """
 
     def with_other(path, on):
-        other = bsdfs.sample_other(scene.materials, here.row, here.surface, here.wi, u)
+        other, d = sample(scene, here, u, other=True)
         branch = on._replace(
-            ray=spawn_ray(here.surface, to_world(here.frame, other.wo), here.hit.primitive),
+            ray=spawn_ray(here.surface, d, here.hit.primitive),
             throughput=path.throughput * other.weight * other.pdf,  # roulette comes at the next vertex
             passive=path.passive * other.passive,
             alive=other.pdf > 0,

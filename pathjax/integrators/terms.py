@@ -21,6 +21,7 @@ def sums(work: Work, scene: Scene, choice: Choice | None, depth: int, options: O
 
     def add(sums, k, now, weight):
         emission, light = compute_once((weight * now.L.emission, weight * now.L.light))
-        return sums + jnp.where(rows == k, emission, jnp.where(rows == k + 1, light, 0))
+        beyond = k + 1 if now.L.passed is None else k + 1 + now.L.passed
+        return sums + jnp.where(rows == k, emission, jnp.where(rows == beyond, light, 0))
 
     return over_vertices(work, scene, choice, add, jnp.zeros((depth, 3), scene.camera.origin.dtype), options)

@@ -33,9 +33,8 @@ def build(description: desc.Description, dtype=jnp.float32, split_rule: str = "s
         raise InputError('dtype = float64, which is off in JAX; call jax.config.update("jax_enable_x64", True) first')
     parameters = Parameters()
     materials = bsdfs.build([shape.bsdf for shape in description.shapes], dtype, ("materials",), parameters)
-    geometry, lamps, trees = shapes.build(
-        description.shapes, dtype, split_rule, tangents=bsdfs.occurs(materials, "anisotropic")
-    )
+    asked = {"tangents": bsdfs.occurs(materials, "anisotropic"), "along": bsdfs.occurs(materials, "along_uv")}
+    geometry, lamps, trees = shapes.build(description.shapes, dtype, split_rule, **asked)
     given = [*(shape.emitter for shape in description.shapes), *description.emitters]
     lights, geometry = emitters.build(given, lamps, geometry, dtype, ("emitters",), parameters)
     integrator = description.integrator
@@ -50,6 +49,7 @@ def build(description: desc.Description, dtype=jnp.float32, split_rule: str = "s
         np.int32(integrator.rr_depth),
         integrator.hide_emitters,
         About(description, parameters.known, parameters.refused, trees),
+        integrator.free_passes and bsdfs.occurs(materials, "passes"),
     )
     # NumPy up to here: `jnp.asarray` compiles a program for every shape that it meets.
     return jax.device_put(scene)

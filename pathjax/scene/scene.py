@@ -32,6 +32,7 @@ class Scene:
     rr_depth: Int[Array, ""]  # vertices before roulette begins
     hide_emitters: bool = field(metadata={"static": True})  # from the camera
     about: About | None = field(metadata={"static": True})  # None: within kernels
+    free_passes: bool = field(default=False, metadata={"static": True})  # straight through a surface is no vertex
     # Parameters that `with_parameters` set to traced values, by name. They carry the derivative, and tables hold the
     # same numbers detached: so a derivative that comes by a table is one that was asked for by other means.
     varied: dict[str, Array] = field(default_factory=dict)

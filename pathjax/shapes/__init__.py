@@ -72,11 +72,14 @@ class _Part(NamedTuple):
     lamp: bool
 
 
-def build(shapes, dtype, rule: str, tangents: bool = False) -> tuple[Geometry, list[Lamp], dict[str, Tree]]:
+def build(
+    shapes, dtype, rule: str, tangents: bool = False, along: bool = False
+) -> tuple[Geometry, list[Lamp], dict[str, Tree]]:
     """Tables of primitives, which lack the numbers of their lights; what emits; hierarchies by `kind`, for reports.
 
     Args:
-        shapes: of `description.Shape`; rule: of `accel.build`; tangents: whether a bsdf asks for them.
+        shapes: of `description.Shape`; rule: of `accel.build`.
+        tangents, along: whether a bsdf asks for those of `Surface`.
     """
     order = dict.fromkeys(kind.table for kind in KINDS.values())
     by_table: dict[type[Table], list[_Part]] = {table: [] for table in order}
@@ -89,7 +92,8 @@ def build(shapes, dtype, rule: str, tangents: bool = False) -> tuple[Geometry, l
             kept = {name: values for name, values in geometry.attributes.items() if name in asked}
             geometry = replace(geometry, attributes=kept)
         primitives = geometry.primitives(shape.flip_normals)
-        part = _Part(number, primitives, shape.bsdf.kind.sided, shape.emitter is not None)
+        glass = any(leaf.kind.sided for leaf in shape.bsdf.kind.leaves(shape.bsdf))
+        part = _Part(number, primitives, glass, shape.emitter is not None)
         by_table[shape.geometry.table].append(part)
     by_table = {table: parts for table, parts in by_table.items() if parts}
 
@@ -103,7 +107,7 @@ def build(shapes, dtype, rule: str, tangents: bool = False) -> tuple[Geometry, l
         tables.append(made)
         trees |= built
     lamps.sort(key=lambda lamp: (shapes[lamp.shape].geometry.comes_last, lamp.shape))
-    geometry = Geometry(tuple(tables), np.asarray(shape_of, np.int32), None, tangents)
+    geometry = Geometry(tuple(tables), np.asarray(shape_of, np.int32), None, tangents, along)
     return geometry, lamps, {kind: tree for kind, tree in trees.items() if tree is not None}
 
 

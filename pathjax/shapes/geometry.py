@@ -16,7 +16,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from pathjax.compile import compute_once, one_by_one
-from pathjax.core.math import at, dot, frame_from_normal, integer_like, smaller
+from pathjax.core.math import at, dot, frame_from_normal, integer_like, safe_divide, smaller
 from pathjax.core.types import Hit, Ray, Surface
 from pathjax.shapes.accel import traverse as bvh
 from pathjax.shapes.shape import Lamps, LampSample, Searched, Table
@@ -32,6 +32,7 @@ class Geometry:
     shape: Int[Array, " P"]  # of each primitive, its place in the scene file
     light: Int[Array, " P"] | None  # number of its light; -1: emits nothing. None: lights are not built yet
     tangents: bool = field(default=False, metadata={"static": True})  # whether `surface` tells them
+    along: bool = field(default=False, metadata={"static": True})
 
 
 def firsts(geometry: Geometry) -> list[int]:
@@ -101,6 +102,8 @@ def surface(geometry: Geometry, ray: Ray, hit: Hit) -> Surface:
                 seen = seen._replace(tangent=_tangent(table.along_u(row, seen), seen.shading_n))
             if names and seen.attributes is None:
                 seen = seen._replace(attributes=dict.fromkeys(names, jnp.zeros_like(seen.p)))
+            if geometry.along:
+                seen = seen._replace(along=_along(lambda o: table.surface(row, o, ray.d, hit.t), ray.o, seen.n))
             return seen
 
         return see
@@ -114,6 +117,18 @@ def _tangent(along_u, n):
     squared = dot(across, across)
     found = squared > 0
     return jnp.where(found, across * lax.rsqrt(jnp.where(found, squared, 1)), frame_from_normal(n).s)
+
+
+def _along(surface, o, n):
+    """Derivatives of the point in u and in v, detached, from how both change as the ray moves sideways."""
+    across = frame_from_normal(n)
+
+    def moved(direction):
+        return jax.jvp(lambda o: (lambda seen: (seen.p, seen.uv))(surface(o)), (o,), (direction,))[1]
+
+    (p_s, uv_s), (p_t, uv_t) = lax.stop_gradient((moved(across.s), moved(across.t)))
+    scale = safe_divide(1, uv_s[0] * uv_t[1] - uv_s[1] * uv_t[0])
+    return (uv_t[1] * p_s - uv_s[1] * p_t) * scale, (uv_s[0] * p_t - uv_t[0] * p_s) * scale
 
 
 def emits(geometry: Geometry, hit: Hit) -> Bool[Array, ""]:

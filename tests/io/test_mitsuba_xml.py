@@ -415,7 +415,21 @@ def test_conductor_is_an_ideal_mirror_unless_told_otherwise(read):
         ("twosided", "", "needs a <bsdf> inside"),
         ("twosided", '<bsdf type="dielectric"/>', "cannot stand inside"),
         ("twosided", '<bsdf type="frosted"/>', '<bsdf type="frosted"> is not supported; use one of'),
-        ("twosided", '<bsdf type="twosided"><bsdf type="diffuse"/></bsdf>', "cannot stand inside"),
+        ("twosided", '<bsdf type="mask"><bsdf type="diffuse"/></bsdf>', "lets light through; <bsdf"),
+        ("twosided", '<bsdf type="mask"><bsdf type="dielectric"/></bsdf>', "cannot stand inside"),
+        ("mask", "", "needs a <bsdf> inside, and has 0"),
+        ("mask", '<bsdf type="diffuse"/>' * 2, "at most 1 <bsdf>"),
+        ("mask", '<bsdf type="diffuse"/><float name="opacity" value="1.1"/>', "at least 0 and at most 1, is 1.1"),
+        ("mask", '<bsdf type="diffuse"/><rgb name="opacity" value="0, 2, 0"/>', "must lie between 0 and 1"),
+        ("blendbsdf", '<bsdf type="diffuse"/><float name="weight" value="0.5"/>', "needs 2 <bsdf>s inside, and has 1"),
+        ("blendbsdf", '<bsdf type="diffuse"/>' * 3, "at most 2 <bsdf>"),
+        ("blendbsdf", '<bsdf type="diffuse"/>' * 2, 'needs <float name="weight" ...>'),
+        ("blendbsdf", '<bsdf type="diffuse"/>' * 2 + '<float name="weight" value="-0.1"/>', "must be at least 0"),
+        ("bumpmap", '<bsdf type="diffuse"/>', "needs one <texture> inside, and has 0"),
+        ("bumpmap", '<bsdf type="diffuse"/>' + '<texture type="checkerboard"/>' * 2, "needs one <texture>"),
+        ("normalmap", '<bsdf type="diffuse"/>', 'needs <texture name="normalmap" ...>'),
+        ("normalmap", '<bsdf type="diffuse"/><texture type="checkerboard"/>', "needs <texture name="),
+        ("null", '<rgb name="reflectance" value="1"/>', "is not a parameter"),
         ("twosided", '<bsdf type="diffuse"/>' * 3, "at most 2 <bsdf>"),
     ],
 )
@@ -705,7 +719,6 @@ WITHOUT_EFFECT = [
     ("area", shape('<emitter type="area">{}</emitter>'), ["sampling_weight"]),
     ("constant", '<emitter type="constant">{}</emitter>', ["sampling_weight", "to_world"]),
     ("envmap", f'<emitter type="envmap">{PICTURE}{{}}</emitter>', ["sampling_weight", "mis_compensation"]),
-    ("twosided", with_bsdf("twosided", '{}<bsdf type="diffuse"/>'), ["allow_transmission"]),
     (
         "bitmap",
         with_bsdf("diffuse", f'<texture type="bitmap" name="reflectance">{PICTURE}{{}}</texture>'),
@@ -783,7 +796,7 @@ def test_mitsuba_takes_what_has_no_effect(mitsuba, picture, tmp_path, place, nam
 def test_integrators_that_estimate_the_same_are_path_and_noted(read, integrator, words):
     limits = '<integer name="max_depth" value="3"/><integer name="rr_depth" value="2"/>'
     scene = read(integrator.format(limits))
-    assert scene.integrator == d.Integrator(max_depth=3, rr_depth=2)
+    assert scene.integrator == d.Integrator(max_depth=3, rr_depth=2, free_passes="volpath" in integrator)
     assert any(words in note for note in scene.notes)
 
 

@@ -91,8 +91,11 @@ NEEDS = {
     "instance": ['<shape type="shapegroup"/>'],
     "uniform": ['<float name="value" value="1"/>'],
     "mesh_attribute": ['<string name="name" value="vertex_color"/>'],
-    "twosided": ['<bsdf type="diffuse"/>'],
     **dict.fromkeys(("bitmap", "envmap"), ['<string name="filename" value="marks.png"/>']),
+    **dict.fromkeys(("twosided", "mask"), ['<bsdf type="diffuse"/>']),
+    "blendbsdf": ['<bsdf type="diffuse"/><bsdf type="diffuse"/><float name="weight" value="0.5"/>'],
+    "bumpmap": ['<bsdf type="diffuse"/><texture type="checkerboard"/>'],
+    "normalmap": ['<bsdf type="diffuse"/><rgb name="normalmap" value="0.5, 0.5, 1"/>'],
     **dict.fromkeys(("aov", "moment", "stokes"), ['<integrator type="path"/>']),
 } | {kind: [f'<string name="filename" value="mesh.{kind}"/>'] for kind in MESHES}
 

@@ -6,6 +6,7 @@ A kind says with `read` what `Description.integrator` an element stands for.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import ClassVar
 
 from pathjax import description as d
@@ -31,12 +32,13 @@ class Path:
 
 
 class VolPath(Path):
-    """Without media, which are refused, Mitsuba's `volpath` estimates what `path` does."""
+    """Without media, which are refused, Mitsuba's `volpath` estimates what `path` does, but for depths."""
 
     @classmethod
     def read(cls, loader, fields):
-        loader.note(fields.element, "without media is the same as path, which is used")
-        return super().read(loader, fields)
+        same = "without media is the same as path, which is used"
+        loader.note(fields.element, f"{same}; what goes straight on through a surface takes no depth")
+        return replace(super().read(loader, fields), free_passes=True)
 
 
 class VolPathMIS(VolPath):

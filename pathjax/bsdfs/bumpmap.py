@@ -1,0 +1,27 @@
+"""Textures of heights."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from pathjax.bsdfs.turned import Heights, Mapped, Scale
+from pathjax.core.math import cross, dot
+from pathjax.core.types import Surface
+from pathjax.kinds import Row
+
+
+class BumpMap(Mapped):
+    """Shading as if the surface had the heights of a texture, times `scale`, on it (Blinn 1978)."""
+
+    heights = Heights()
+    scale = Scale(1.0)
+    along_uv = True
+
+    @staticmethod
+    def normal(p: Row, surface: Surface, to_local) -> Float[Array, "3"]:
+        """That of the raised surface, but for how the normal below changes from place to place."""
+        by_u, by_v = p.scale * p.gradient("heights")
+        (u_x, u_y, _), (v_x, v_y, _) = (to_local(d) for d in surface.along)
+        n = cross(jnp.stack([u_x, u_y, by_u]), jnp.stack([v_x, v_y, by_v]))
+        return jnp.where(dot(n, to_local(surface.n)) < 0, -n, n)

@@ -1,0 +1,23 @@
+"""Surfaces of which a part is cut out, or that let a share of the light through."""
+
+from __future__ import annotations
+
+from pathjax.bsdfs.null import Null
+from pathjax.bsdfs.wrapper import Choosing
+from pathjax.kinds import Number, Row
+
+NOTHING = Null.instance("nothing")
+
+
+class Mask(Choosing):
+    """What stands inside for the share `opacity`, nothing for the rest."""
+
+    opacity = Number(0.5, bounds=(0, 1), textured=True)
+
+    @classmethod
+    def holding(cls, name, *held, **values):
+        return super().holding(name, NOTHING, *held, **values)
+
+    @staticmethod
+    def share(p: Row):
+        return p.opacity

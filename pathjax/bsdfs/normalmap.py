@@ -1,0 +1,26 @@
+"""Textures of normals."""
+
+from __future__ import annotations
+
+from jaxtyping import Array, Float
+
+from pathjax.bsdfs.turned import Mapped, Normals
+from pathjax.core.types import Surface
+from pathjax.kinds import Row
+
+
+class NormalMap(Mapped):
+    """Shading by the normals of a texture, whose channels c hold 2 c - 1: along u, across, and along the normal."""
+
+    normalmap = Normals(None)
+
+    @classmethod
+    def read(cls, loader, fields, name):
+        made = super().read(loader, fields, name)
+        if made.values["normalmap"] is None:
+            raise fields.element.error(f'{fields.element} needs <texture name="normalmap" ...>')
+        return made
+
+    @staticmethod
+    def normal(p: Row, surface: Surface, to_local) -> Float[Array, "3"]:
+        return 2 * p.normalmap - 1

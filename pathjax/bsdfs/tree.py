@@ -1,0 +1,214 @@
+"""Bsdfs that hold bsdfs: which one of them scatters at a point, and in what frame.
+
+A material is a tree, whose leaves scatter. It is not evaluated as a mixture: after a hit one uniform number walks from
+the root to a leaf, as in PBRT-4, and light samples and bsdf samples both see that leaf alone. Given the leaf each
+estimator is unbiased, so their mean is that of the mixture, at the price of one bsdf.
+
+What no wrapper stands in is none of this; of a plain `twosided` the sides are told apart when the scene is built.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from pathjax.bsdfs.wrapper import Turning, Wrapper
+from pathjax.core.math import at, cross, dot, normalize, safe_divide, smaller, to_local, to_world
+from pathjax.core.types import Frame, Surface
+from pathjax.kinds import Instance, Row
+
+# Kind, row, and whether it is seen from its back as if that were its front. Kinds number the tables of leaves, then
+# those of wrappers; -1 absorbs.
+Node = Int[Array, "3"]
+# Least probability of either where the choice is differentiated: what has no share has a derivative all the same.
+MIN_CHANCE = 0.1
+
+
+# ---- while a scene is built -----------------------------------------------------------------------------------------
+
+
+def is_wrapper(instance: Instance) -> bool:
+    return issubclass(instance.kind, Wrapper)
+
+
+def sides(instance: Instance) -> list[tuple[Instance | None, bool]]:
+    """What lies on its front and on its back, and whether that is seen as a front."""
+    front, back = instance.kind.sides(instance)
+    return [(front, False), (back, instance.kind.turns_back)]
+
+
+def reached(instances: list[Instance]) -> list[list[Instance]]:
+    """All that scatters or holds others, level by level: on the sides of some bsdfs, of those that these hold, ..."""
+    levels = []
+    while instances:
+        level = list(dict.fromkeys(side for each in instances for side, _ in sides(each) if side is not None))
+        levels.append(level)
+        instances = [held for each in level if is_wrapper(each) for held in each.values["held"]]
+    return levels
+
+
+def may_pass(instance: Instance) -> bool:
+    return any(leaf.kind.passes for leaf in instance.kind.leaves(instance))
+
+
+def nodes_of(instance: Instance, number: dict) -> np.ndarray:
+    """(2, bsdfs held, 3); number: leaf or wrapper -> its kind and row."""
+    held = [[(*number[side], turned) for side, turned in sides(each)] for each in instance.values["held"]]
+    return np.swapaxes(np.array(held, np.int32), 0, 1)
+
+
+# ---- at a vertex ----------------------------------------------------------------------------------------------------
+
+
+class Turn(NamedTuple):
+    """How a frame was turned; where it was not, it has turned by nothing."""
+
+    n: Float[Array, "3"]  # the normal before, on the side of the one after
+    roughness: Float[Array, ""]  # squared, of the facets that would have normals like that; 0: they cast no shadows
+
+
+class Leaf(NamedTuple):
+    """What scatters at a vertex."""
+
+    kind: Int[Array, ""]
+    row: Int[Array, ""]
+    frame: Frame
+    wi: Float[Array, "3"]  # in the frame
+    # Share over probability of what was chosen: 1 but for its derivative. None: nothing was to be chosen.
+    weight: Float[Array, ""] | None
+    turns: tuple[Turn, ...]
+
+
+def leaf(
+    materials,
+    node: Node,
+    surface: Surface,
+    frame: Frame,
+    wi: Float[Array, "3"],
+    u: Float[Array, ""],
+    differentiated: bool = False,
+) -> Leaf:
+    """Walk from a node down to a leaf.
+
+    Args:
+        frame, wi: around the shading normal.
+        u: uniform in [0, 1).
+        differentiated: choose also what has no share, since that may have a derivative; the mean is the same.
+    """
+    upright, weight, turns = frame, jnp.ones_like(wi[2]), ()
+    node, frame, wi, turns = _entered(node, frame, wi, turns)
+    for level in materials.levels:
+        for place in level:
+            table = materials.wrappers[place]
+            here = node[0] == len(materials.tables) + place
+            p = Row(table, jnp.where(here, node[1], 0), surface, materials.textures)
+            if issubclass(table.kind, Turning):
+                same = upright, frame, wi, jnp.zeros_like(weight)
+                before = frame.n
+                turn = partial(_turned, table.kind, p, surface, upright, frame, wi)
+                upright, frame, wi, roughness = lax.cond(here, turn, lambda same=same: same)
+                turns = (*turns, Turn(before, roughness))
+                node = jnp.where(here, _held(p, wi[2] > 0)[0], node)
+            else:
+                choice = partial(_choice, table.kind, p, wi[2] > 0, u, weight, differentiated)
+                node, u, weight = lax.cond(here, choice, lambda same=(node, u, weight): same)
+            node, frame, wi, turns = _entered(node, frame, wi, turns)
+    return Leaf(node[0], node[1], frame, wi, weight, turns)
+
+
+def _entered(node, frame, wi, turns):
+    """What is met next, mirrored where a back is seen as a front."""
+    side = jnp.where(node[2] == 1, -1, 1).astype(wi.dtype)
+    turns = tuple(turn._replace(n=turn.n * side) for turn in turns)
+    node = jnp.stack([node[0], node[1], jnp.zeros_like(node[2])])
+    return node, frame._replace(n=frame.n * side), jnp.stack([wi[0], wi[1], wi[2] * side]), turns
+
+
+def _held(p, front):
+    return at(p.nodes, jnp.where(front, 0, 1))
+
+
+def _choice(kind, p, front, u, weight, differentiated):
+    """One of two, the number for the next choice, and the weight."""
+    share = kind.share(p)
+    chance = lax.stop_gradient(share)
+    if differentiated:
+        chance = jnp.clip(chance, MIN_CHANCE, 1 - MIN_CHANCE)
+    first, second = _held(p, front)
+    takes_second = u < chance
+    weight = weight * jnp.where(takes_second, safe_divide(share, chance), safe_divide(1 - share, 1 - chance))
+    u = jnp.where(takes_second, safe_divide(u, chance), safe_divide(u - chance, 1 - chance))
+    return jnp.where(takes_second, second, first), u, weight
+
+
+def _turned(kind, p, surface, upright, frame, wi):
+    """The frame around the turned normal. upright: the same frame, but never mirrored, to which textures refer."""
+    x, y, z = lax.stop_gradient(kind.normal(p, surface, partial(to_local, upright)))
+    if (flips := p.flip_invalid_normals) is not None:
+        away = flips & (wi[2] * (wi[0] * x + wi[1] * y + wi[2] * z) <= 0)
+        x, y = jnp.where(away, -x, x), jnp.where(away, -y, y)
+    n = normalize(jnp.stack([x, y, z]))
+    up = jnp.stack([*jnp.zeros_like(n[:2]), jnp.ones_like(x)])
+    n = jnp.where(dot(n, n) > 0, n, up)
+    s = normalize(jnp.stack([1 - n[0] * n[0], -n[0] * n[1], -n[0] * n[2]]))
+    t = cross(n, s)
+    turned = [Frame(*(to_world(each, v) for v in (s, t, n))) for each in (upright, frame)]
+    roughness = jnp.zeros_like(x)
+    if (shadows := p.use_shadowing_function) is not None:
+        slope = safe_divide(1 - n[2] * n[2], n[2] * n[2])
+        roughness = jnp.where(shadows, smaller(slope / 8, jnp.ones_like(slope)), 0)
+    return *turned, jnp.stack([dot(s, wi), dot(t, wi), dot(n, wi)]), roughness
+
+
+def seen_by_turned(turns: tuple[Turn, ...], n: Float[Array, "3"], d: Float[Array, "3"]) -> Float[Array, ""]:
+    """Share of light from d that counts where the frame was turned to the normal n.
+
+    None that comes from the front of one of the normals and the back of another, and less of what comes along the
+    surface (Conty Estevez, Lecocq and Stein 2019, "A microfacet-based shadowing function to solve the bump terminator
+    problem").
+    """
+    share, below = jnp.ones_like(d[0]), dot(d, n)
+    for turn in reversed(turns):
+        cos = dot(d, turn.n)
+        squared = cos * cos
+        tan2 = (1 - squared) / jnp.where(squared > 0, squared, 1)
+        lit = 2 / (1 + jnp.sqrt(1 + turn.roughness * tan2))
+        share, below = jnp.where(cos * below > 0, share * lit, 0), cos
+    return share
+
+
+# ---- on the way of light --------------------------------------------------------------------------------------------
+
+
+def passing(
+    materials, node: Node, front: Bool[Array, ""], surface: Surface, passes: Callable, level: int = 0
+) -> Float[Array, ""]:
+    """Share of light that goes straight on: the probability with which `leaf` comes to a leaf that passes.
+
+    Args:
+        front: which side is seen.
+        passes: whether leaves of a kind do.
+    """
+    kind, row, turned = node
+    front = front | (turned == 1)
+    share = ((kind < len(materials.tables)) & passes(kind)).astype(surface.p.dtype)
+    for place in materials.passing[level] if level < len(materials.passing) else ():
+        table = materials.wrappers[place]
+        here = kind == len(materials.tables) + place
+
+        def through(table=table, here=here):
+            p = Row(table, jnp.where(here, row, 0), surface, materials.textures)
+            shares = [passing(materials, held, front, surface, passes, level + 1) for held in _held(p, front)]
+            if len(shares) == 1:
+                return shares[0]
+            second = table.kind.share(p)
+            return (1 - second) * shares[0] + second * shares[1]
+
+        share = lax.cond(here, through, lambda share=share: share)
+    return share

@@ -1,0 +1,49 @@
+"""What bump maps and normal maps have in common: none of what they say is a parameter of the scene."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from pathjax.bsdfs.wrapper import Turning
+from pathjax.kinds import Color, Flag, Instance, Number
+
+REFUSED = "turns shading frames, and derivatives do not follow these; change it in the scene file"
+
+
+@dataclass(frozen=True)
+class Heights(Number):
+    """The one texture in an element, whatever it is called."""
+
+    textured: bool = True
+    listed = False
+
+    def read(self, loader, fields, name, owner):
+        return loader.shared(fields.only_texture(), owner)
+
+
+@dataclass(frozen=True)
+class Scale(Number):
+    listed = False
+
+
+@dataclass(frozen=True)
+class Normals(Color):
+    listed = False
+
+
+class Mapped(Turning):
+    flip_invalid_normals = Flag(True)
+    use_shadowing_function = Flag(True)
+
+    @classmethod
+    def build(cls, instances, dtype, path, parameters, code):
+        table = super().build(instances, dtype, path, parameters, code)
+        for instance in instances:
+            names = [f"{instance.name}.{key}" for key in cls.declared]
+            for texture in instance.values.values():
+                if isinstance(texture, Instance):
+                    names += [f"{texture.name}.{key}" for key in texture.kind.declared]
+            for name in names:
+                parameters.known.pop(name, None)
+                parameters.refused[name] = f"{name} {REFUSED}"
+        return table
