@@ -30,6 +30,7 @@ from pathjax.bsdfs.normalmap import NormalMap
 from pathjax.bsdfs.null import Null
 from pathjax.bsdfs.plastic import Plastic
 from pathjax.bsdfs.roughconductor import RoughConductor
+from pathjax.bsdfs.roughplastic import RoughPlastic
 from pathjax.bsdfs.twosided import TwoSided
 from pathjax.bsdfs.wrapper import Wrapper
 from pathjax.core.math import at
@@ -52,6 +53,7 @@ __all__ = [
     "Null",
     "Plastic",
     "RoughConductor",
+    "RoughPlastic",
     "TwoSided",
     "register",
 ]
@@ -64,6 +66,7 @@ KINDS: dict[str, type[BSDF]] = {
     "dielectric": Dielectric,
     "plastic": Plastic,
     "null": Null,
+    "roughplastic": RoughPlastic,
     "twosided": TwoSided,
     "blendbsdf": BlendBSDF,
     "mask": Mask,

@@ -10,9 +10,9 @@ from pathjax.bsdfs import fresnel
 from pathjax.bsdfs.bsdf import BSDF
 from pathjax.bsdfs.dielectric import IndexOfRefraction
 from pathjax.bsdfs.ior import IOR
-from pathjax.core.math import larger, safe_divide, smaller
+from pathjax.core.math import larger, safe_divide
 from pathjax.core.types import BSDFSample
-from pathjax.core.warp import square_to_cosine_hemisphere, square_to_cosine_hemisphere_pdf
+from pathjax.core.warp import chosen, square_to_cosine_hemisphere, square_to_cosine_hemisphere_pdf
 from pathjax.kinds import Color, Flag, Row
 
 # Lobes are chosen as if neither reflectance were below this: one that is black has a derivative all the same.
@@ -46,15 +46,13 @@ class Plastic(BSDF):
         """The mirror direction by about the share that the coat has in the light, else by the cosine."""
         mirrors = reflectance(wi, p.int_ior / p.ext_ior)
         chance = chance_of_coat(p, mirrors)
-        coat = u[0] < chance
-        # Below the chance, and above it, u[0] is uniform too.
-        rest = smaller(safe_divide(u[0] - chance, 1 - chance), jnp.ones_like(chance))
-        diffuse = square_to_cosine_hemisphere(jnp.stack([jnp.where(coat, 0, rest), u[1]]))
+        coat, u = chosen(u, chance)
+        diffuse = square_to_cosine_hemisphere(u)
         f, pdf = Plastic.evaluate(p, wi, diffuse)
+        one = jnp.ones_like(pdf)
         wo = jnp.where(coat, jnp.stack([-wi[0], -wi[1], wi[2]]), diffuse)
-        mirrored = p.specular_reflectance * safe_divide(mirrors, chance)
-        weight = jnp.where(coat, mirrored, f * safe_divide(jnp.ones_like(pdf), pdf))
-        return BSDFSample(wo, weight, jnp.where(coat, chance, pdf), coat, jnp.ones_like(pdf))
+        weight = jnp.where(coat, p.specular_reflectance * safe_divide(mirrors, chance), f * safe_divide(one, pdf))
+        return BSDFSample(wo, weight, jnp.where(coat, chance, pdf), coat, one)
 
 
 def reflectance(w: Float[Array, "3"], eta: Float[Array, ""]) -> Float[Array, ""]:

@@ -5,9 +5,20 @@ from __future__ import annotations
 import math
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
-from pathjax.core.math import cos_sin_octant, cos_sin_turns, safe_sqrt
+from pathjax.core.math import cos_sin_octant, cos_sin_turns, safe_divide, safe_sqrt, smaller
+
+
+def chosen(u: Float[Array, " numbers"], chance: Float[Array, ""]) -> tuple[Bool[Array, ""], Float[Array, " numbers"]]:
+    """Whether the first of two is chosen, by u[0], and u with a number in place of u[0] that is uniform in either case.
+
+    chance: of the first one. What is unlikely gets few digits.
+    """
+    first = u[0] < chance
+    rest = safe_divide(u[0] - jnp.where(first, 0, chance), jnp.where(first, chance, 1 - chance))
+    below_1 = 1 - jnp.finfo(u.dtype).epsneg
+    return first, jnp.concatenate([smaller(rest, below_1)[None], u[1:]])
 
 
 def square_to_disk(u: Float[Array, "2"]) -> Float[Array, "2"]:

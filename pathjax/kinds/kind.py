@@ -87,7 +87,12 @@ class Kind:
                     moves = declared.moves_paths
                     parameters.known[name] = Parameter(*where, declared.shape, declared.bounds, key, moves)
         settings = tuple((key, instances[0].values[key]) for key, d in cls.declared.items() if isinstance(d, Setting))
-        return Table(tuple(columns), cls, settings)
+        return cls.derived(Table(tuple(columns), cls, settings))
+
+    @classmethod
+    def derived(cls, table: Table) -> Table:
+        """The table with columns that follow from others; whoever changes parameters of a scene calls it."""
+        return table
 
 
 def _column(declared: Declared, values: list, dtype, code: Callable | None) -> Column | None:

@@ -16,6 +16,11 @@ class Parameter:
     field: str = ""  # what its kind calls it
     moves_paths: bool = False  # as the IOR of smooth glass does; others change what paths carry
 
+    @property
+    def table(self) -> tuple[str | int, ...]:
+        """Path to the table of its kind, which holds `columns[place].values`."""
+        return self.path[:-3]
+
 
 @dataclass(frozen=True, eq=False)
 class Parameters:

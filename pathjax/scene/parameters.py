@@ -56,6 +56,9 @@ def with_values(scene: Scene, values: Mapping[str, jax.Array], parameters: Mappi
     for name, value in values.items():
         path, index = parameters[name].path, parameters[name].index
         scene = put(scene, path, get(scene, path).at[index].set(value))
+    for path in dict.fromkeys(parameters[name].table for name in values):
+        table = get(scene, path)
+        scene = put(scene, path, table.kind.derived(table))
     return scene
 
 
