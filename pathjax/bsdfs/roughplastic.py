@@ -28,6 +28,14 @@ class RoughPlastic(Plastic):
     unused: ClassVar[Mapping[str, Unused]] = Rough.unused
 
     @classmethod
+    def read(cls, loader, fields, name):
+        made = super().read(loader, fields, name)
+        if made.values["int_ior"] < made.values["ext_ior"]:
+            why = "some light would be reflected totally before it enters, which is not modelled for rough coats"
+            raise fields.error("int_ior", f"must not be below ext_ior: {why}")
+        return made
+
+    @classmethod
     def derived(cls, table):
         alpha, inside, outside = (table.column(name).values for name in ("alpha", "int_ior", "ext_ior"))
         return table.with_column("coat", coat.coats(dict(table.settings)["distribution"], alpha, inside / outside))

@@ -154,6 +154,11 @@ def test_a_coat_follows_its_parameters(make_scene):
                 np.testing.assert_allclose(ours.values, expected.values, atol=1e-5)
 
 
+def test_a_coat_that_reflects_totally_from_outside_is_refused(make_scene):
+    with pytest.raises(pj.InputError, match='"int_ior" .* must not be below ext_ior'):
+        plate(make_scene, 0.1, 0.9)
+
+
 @slow
 def test_derivatives_of_an_image_are_those_of_independent_images(make_scene, estimate, derivatives, agree):
     """Central differences, of images of other seeds; the steps' own error is below the noise."""
