@@ -29,6 +29,7 @@ from pathjax.bsdfs.mask import Mask
 from pathjax.bsdfs.normalmap import NormalMap
 from pathjax.bsdfs.null import Null
 from pathjax.bsdfs.plastic import Plastic
+from pathjax.bsdfs.principled import Principled
 from pathjax.bsdfs.roughconductor import RoughConductor
 from pathjax.bsdfs.roughplastic import RoughPlastic
 from pathjax.bsdfs.twosided import TwoSided
@@ -52,6 +53,7 @@ __all__ = [
     "NormalMap",
     "Null",
     "Plastic",
+    "Principled",
     "RoughConductor",
     "RoughPlastic",
     "TwoSided",
@@ -67,6 +69,7 @@ KINDS: dict[str, type[BSDF]] = {
     "plastic": Plastic,
     "null": Null,
     "roughplastic": RoughPlastic,
+    "principled": Principled,
     "twosided": TwoSided,
     "blendbsdf": BlendBSDF,
     "mask": Mask,
@@ -159,8 +162,10 @@ def moving_bit(materials: Materials, kind: Index, row: Index) -> Index:
 
 def name(materials: Materials, kind: int) -> str:
     """What scene files call a kind that is present, those that hold others after the rest."""
+    names = {each: name for name, each in KINDS.items()}
+    # A kind that a file does not name is a form of one that it does.
     table = (*materials.tables, *materials.wrappers)[kind]
-    return next(name for name, each in KINDS.items() if each is table.kind)
+    return next(names[each] for each in table.kind.__mro__ if each in names)
 
 
 def reflectances(materials: Materials) -> tuple[int, Column] | None:
