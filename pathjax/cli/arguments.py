@@ -44,6 +44,11 @@ def parser() -> argparse.ArgumentParser:
     info.add_argument("--tail", type=_real, metavar="E", help=tail)
     info.add_argument("--json", action="store_true", help="print one JSON object on stdout")
 
+    convert = subparsers.add_parser("convert", help="write a scene, or glTF or a mesh, as a scene file of Mitsuba")
+    _add_scene(convert)
+    convert.add_argument("output", metavar="OUT.xml", help="textures and meshes that it needs are written beside it")
+    convert.add_argument("--json", action="store_true", help="print one JSON object on stdout")
+
     bench = subparsers.add_parser("bench", help="speed against error")
     bench.add_argument("scenes", nargs="+", metavar="SCENE.xml")
     bench.add_argument("-D", dest="defines", action="append", default=[], type=_pair, metavar="name=value")

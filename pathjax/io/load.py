@@ -70,7 +70,7 @@ def load_scene(
     return _lit(build(loader.load(file, sensor, **parameters, **keywords), dtype, split_rule), file)
 
 
-def save_scene(scene: Scene, file: str | os.PathLike) -> None:
+def save_scene(scene: Scene, file: str | os.PathLike) -> list[Path]:
     """Write a scene that was loaded as a scene file of Mitsuba, with the present values of its parameters.
 
     Loaded again it is the same scene. Textures and meshes that were given as arrays, and meshes in formats that Mitsuba
@@ -79,6 +79,8 @@ def save_scene(scene: Scene, file: str | os.PathLike) -> None:
 
     Args:
         file: ends in `.xml`.
+    Returns:
+        all files that were written, the scene file last.
     Raises:
         InputError: a file cannot be written, the scene's values are traced, or no scene file can say what has changed.
     """
@@ -86,7 +88,7 @@ def save_scene(scene: Scene, file: str | os.PathLike) -> None:
     if any(is_traced(value) for value in values.values()):
         raise InputError(f"{file}: the scene's parameters are traced; save it outside of jit and derivatives")
     known = about(scene).description
-    writer.save(known, {name: np.asarray(value) for name, value in values.items()}, Path(file))
+    return writer.save(known, {name: np.asarray(value) for name, value in values.items()}, Path(file))
 
 
 def _lit(scene: Scene, file: str | os.PathLike) -> Scene:

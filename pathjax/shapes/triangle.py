@@ -304,7 +304,7 @@ class ArrayMesh(Mesh):
     @classmethod
     def read(cls, loader, fields: Fields):
         arrays = {name: fields.array(name) for name in ("vertices", "faces")}
-        arrays |= {name: fields.array(name, None) for name in ("normals", "uv")}
+        arrays |= {name: fields.array(name, None) for name in ("normals", "uv", "vertex_color", "face_color")}
         to_world, face_normals = fields.transform("to_world"), fields.boolean("face_normals", False)
         return loader.mesh_of_arrays(fields, to_world=to_world, face_normals=face_normals, **arrays)
 

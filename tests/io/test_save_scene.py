@@ -179,6 +179,16 @@ def test_other_folders_find_the_same_files(shipped, tmp_path, monkeypatch):
     same(scene, pj.load_scene("er/saved.xml"))
 
 
+def test_attributes_of_meshes_come_back(again):
+    random = np.random.default_rng(1)
+    kite = {"type": "mesh", "vertices": np.eye(3), "faces": [[0, 1, 2]]}
+    for name, count in (("vertex_color", 3), ("face_color", 1)):
+        texture = {"type": "mesh_attribute", "name": name}
+        shape = kite | {name: random.random((count, 3)), "bsdf": {"type": "diffuse", "reflectance": texture}}
+        scene = pj.load_dict(dictionary() | {"kite": shape})
+        same(scene, again(scene, f"{name}.xml"))
+
+
 def test_a_mesh_of_which_nothing_is_left_is_left_out(again):
     flat = {"type": "mesh", "vertices": np.ones((3, 3)), "faces": [[0, 1, 2]]}
     scene = pj.load_dict(dictionary() | {"flat": flat})

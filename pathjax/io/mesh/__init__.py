@@ -71,23 +71,28 @@ def of_arrays(
     normals: np.ndarray | None = None,
     uv: np.ndarray | None = None,
     face_normals: bool = False,
+    **attributes: np.ndarray | None,
 ) -> tuple[Mesh, list[str]]:
     """The same of arrays: vertices (V, 3), faces (F, 3) integers, normals (V, 3) and uv (V, 2). Without normals it is
     flat.
 
-    place: for messages.
+    place: for messages; attributes: "vertex_*" (V, 3) and "face_*" (F, 3).
     """
+    attributes = {name: array for name, array in attributes.items() if array is not None}
     shapes = {"vertices": (vertices, 3), "faces": (faces, 3), "normals": (normals, 3), "uv": (uv, 2)}
+    shapes |= {name: (array, 3) for name, array in attributes.items()}
     for name, (array, width) in shapes.items():
-        rows = "F" if name == "faces" else "V"
+        rows = "F" if name.startswith("face") else "V"
         if array is None:
             continue
-        if array.ndim != 2 or array.shape[1] != width or rows == "V" and len(array) != len(vertices):
+        if array.ndim != 2 or array.shape[1] != width or len(array) != len(faces if rows == "F" else vertices):
             raise InputError(f"{place}: {name} must have the shape ({rows}, {width}), has {array.shape}")
         if array.dtype.kind not in ("iu" if name == "faces" else "iuf"):
             raise InputError(f"{place}: {name} must be {'integers' if name == 'faces' else 'numbers'}")
     normals, uv = (None if array is None else array.astype(np.float64) for array in (normals, uv))
-    raw = Raw(vertices.astype(np.float64), faces.astype(np.int64).ravel(), normals=normals, uv=uv)
+    attributes = {name: array.astype(np.float64) for name, array in attributes.items()}
+    corners = faces.astype(np.int64).ravel()
+    raw = Raw(vertices.astype(np.float64), corners, normals=normals, uv=uv, attributes=attributes)
     _check(place, raw)
     return _in_world(place, raw, to_world, face_normals, smooth=False, flip=False)
 

@@ -28,14 +28,16 @@ SPECTRA = (*TYPED, "blackbody", "regular", "irregular")
 VALUE_TYPES = ("rgb", "spectrum", "ref", "resources")
 
 
-def read(scene: Mapping) -> Document:
+def read(scene: Mapping, name: str = "scene") -> Document:
     """Convert a scene.
 
+    Args:
+        name: of the scene, where the keys begin that are places.
     Raises:
         InputError: a value of a type that no scene holds, a dictionary within itself, an unknown type, an id given
             twice; with the keys that lead there.
     """
-    return _Reader().document(scene)
+    return _Reader(name).document(scene)
 
 
 def rooms() -> dict[str, Mapping[str, object]]:
@@ -56,7 +58,8 @@ def rooms() -> dict[str, Mapping[str, object]]:
 class _Reader:
     """What all levels share: the dictionaries around the present one, and which keys lead to each object."""
 
-    def __init__(self):
+    def __init__(self, name: str):
+        self.name = name
         self.kinds = rooms()
         self.around: list[object] = []
         self.paths: dict[str, Element] = {}
@@ -65,8 +68,9 @@ class _Reader:
 
     def document(self, scene: Mapping) -> Document:
         if not isinstance(scene, Mapping) or scene.get("type") != "scene":
-            raise InputError('scene: must be a dictionary with "type": "scene", which holds all others by name')
-        root = Element("scene", {"version": VERSION}, "scene", 0, self.children(scene, "scene", top=True))
+            must = 'must be a dictionary with "type": "scene", which holds all others by name'
+            raise InputError(f"{self.name}: {must}")
+        root = Element("scene", {"version": VERSION}, self.name, 0, self.children(scene, self.name, top=True))
         # Keys lead to objects, too: `shape.bsdf`.
         for path in self.referred & self.paths.keys():
             self.paths[path].attributes.setdefault("id", path)
@@ -134,7 +138,7 @@ class _Reader:
         element.children = self.children(value, place)
         if tag not in ("shape", "texture"):  # their arrays are what they consist of; elsewhere they are images
             element.children = [_as_texture(child) for child in element.children]
-        self.paths[place.removeprefix("scene.")] = element
+        self.paths[place.removeprefix(f"{self.name}.")] = element
         return element
 
     def tag(self, kind: str, place: str) -> str:
@@ -248,9 +252,13 @@ def _as_texture(child: Element) -> Element:
 
 
 def _of_trimesh(mesh: object, place: str) -> dict[str, object]:
-    """Arrays of a `trimesh.Trimesh`, with its texture coordinates, whose v grows upwards."""
+    """Arrays of a `trimesh.Trimesh`, with its texture coordinates, whose v grows upwards, and colours of vertices."""
     if not (hasattr(mesh, "vertices") and hasattr(mesh, "faces")):
         raise InputError(f'{place}: "mesh" must be a trimesh.Trimesh, is of type {type(mesh).__name__}')
     arrays: dict[str, object] = {"vertices": np.asarray(mesh.vertices), "faces": np.asarray(mesh.faces)}
-    uv = getattr(getattr(mesh, "visual", None), "uv", None)
-    return arrays if uv is None else arrays | {"uv": np.asarray(uv) * [1, -1] + [0, 1]}
+    visual = getattr(mesh, "visual", None)
+    if getattr(visual, "kind", None) == "vertex":
+        arrays["vertex_color"] = np.asarray(visual.vertex_colors)[:, :3] / 255
+    if (uv := getattr(visual, "uv", None)) is not None:
+        arrays["uv"] = np.asarray(uv) * [1, -1] + [0, 1]
+    return arrays

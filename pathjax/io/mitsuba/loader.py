@@ -16,7 +16,7 @@ from pathjax import description as d
 from pathjax.description.elements import Document, Element, nearest
 from pathjax.description.fields import NOT_MODELLED, VALUES, Fields
 from pathjax.errors import InputError
-from pathjax.io import mesh
+from pathjax.io import bare, mesh
 from pathjax.io.mitsuba import dict_reader, instances, integrators, samplers
 from pathjax.io.mitsuba.plugins import PLUGINS
 from pathjax.io.mitsuba.xml_reader import read
@@ -28,7 +28,7 @@ from pathjax.textures import mesh_attribute
 
 
 def load(path: str | Path, sensor: int | str = 0, /, **parameters: object) -> d.Description:
-    """Read a scene file and the meshes and images that it names.
+    """Read a scene file and the meshes and images that it names; or a bare mesh, which gets what it lacks.
 
     Args:
         sensor: which of several to use: its number, or its id.
@@ -36,7 +36,12 @@ def load(path: str | Path, sensor: int | str = 0, /, **parameters: object) -> d.
     Raises:
         InputError: a file cannot be read, or asks for what pathjax does not model.
     """
-    return _Loader(read(path, parameters)).description(str(path), sensor)
+    if Path(path).suffix.lower() not in bare.SUFFIXES:
+        return _Loader(read(path, parameters)).description(str(path), sensor)
+    scene, notes = bare.scene(Path(path), parameters)
+    loader = _Loader(dict_reader.read(scene, str(path)))
+    loader.notes += notes
+    return loader.description(str(path), sensor)
 
 
 def load_dict(scene: Mapping, sensor: int | str = 0) -> d.Description:
@@ -103,8 +108,7 @@ class _Loader:
             self.notes.append('no <integrator> is given; <integrator type="path"> is used')
         single = [element for element in scene["emitter"] if _kind_of_light(element).single]
         for element in single[1:]:
-            first = f"{single[0].file}:{single[0].line}"
-            raise element.error(f"{element}: a scene takes one of this type; the first is at {first}")
+            raise element.error(f"{element}: a scene takes one of this type; the first is at {single[0].place}")
         lights = tuple(
             self.emitter(element, element.id or self.unnamed(element))
             for element in scene["emitter"]

@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from xml.sax.saxutils import quoteattr
 
@@ -28,11 +28,13 @@ from pathjax.kinds import Instance
 from pathjax.system.files import check_writable, write_text
 
 
-def save(description: d.Description, values: Mapping[str, np.ndarray], path: Path) -> None:
+def save(description: d.Description, values: Mapping[str, np.ndarray], path: Path) -> list[Path]:
     """Write the scene file, and before it what it names.
 
     Args:
         values: of all parameters, by name.
+    Returns:
+        all files that were written, the scene file last.
     Raises:
         InputError: a file cannot be written, or would overwrite one that the scene was read from; or no scene file can
             say what has changed.
@@ -43,17 +45,17 @@ def save(description: d.Description, values: Mapping[str, np.ndarray], path: Pat
     check_writable(path, sources)
     writer = _Writer(description, values, path, sources)
     text = writer.text(description.document.root)
-    for write in writer.files:
+    for write in writer.files.values():
         write()
     write_text(path, text)
+    return [*writer.files, path]
 
 
 class _Writer:
     def __init__(self, description: d.Description, values: Mapping[str, np.ndarray], path: Path, sources: set):
         self.document, self.made, self.values = description.document, description.made, values
         self.path, self.sources = path, sources
-        self.files: list = []  # functions that write them
-        self.names: set[str] = set()
+        self.files: dict[Path, Callable[[], None]] = {}  # and what writes each
 
     def text(self, element: Element, depth: int = 0) -> str:
         """The element and what it holds as lines of XML."""
@@ -160,14 +162,13 @@ class _Writer:
             data = decoded(data, raw=says.get("raw") == "true")
         file = self.file(name, ".png" if data.dtype == np.uint8 else ".exr")
         write = write_stored if data.dtype == np.uint8 else _write_linear
-        self.files.append(lambda: write(file, data))
+        self.files[file] = lambda: write(file, data)
         return Element("string", {"name": "filename", "value": file.name}, child.file, child.line)
 
     def mesh(self, element: Element, shape: d.Shape) -> Element:
         """Of a mesh that Mitsuba reads from no file, or not in its format, the PLY that holds it in world space."""
         file, geometry = self.file(shape.name, ".ply"), shape.geometry
-        arrays = geometry.vertices, geometry.faces, geometry.normals, geometry.uv
-        self.files.append(lambda: ply_writer.write(file, *arrays))
+        self.files[file] = lambda: ply_writer.write(file, geometry)
         gone = ("filename", "to_world", "face_normals", "flip_tex_coords")
         children = [Element("string", {"name": "filename", "value": file.name}, element.file, element.line)]
         if geometry.normals is None:
@@ -179,11 +180,10 @@ class _Writer:
         """A new name beside the scene file."""
         stem = "_".join([self.path.stem, re.sub(r"[^\w-]", "_", name)])
         for number in itertools.count(1):
-            made = f"{stem}{f'_{number}' if number > 1 else ''}{suffix}"
-            if made not in self.names:
-                self.names.add(made)
-                check_writable(self.path.with_name(made), self.sources)
-                return self.path.with_name(made)
+            made = self.path.with_name(f"{stem}{f'_{number}' if number > 1 else ''}{suffix}")
+            if made not in self.files:
+                check_writable(made, self.sources)
+                return made
 
 
 def _has_arrays(element: Element) -> bool:

@@ -1,0 +1,93 @@
+"""Bare meshes as scenes, with what a scene needs besides: a camera, light, a film."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from pathjax.description.transform import Transform
+from pathjax.errors import InputError
+from pathjax.io import mesh
+
+# By the end of the file's name.
+SUFFIXES = (".obj", ".ply", ".stl")
+WIDTH, ASPECT, SPP = 768, 4 / 3, 64
+FOV = 35.0  # degrees, of the camera that frames the object
+TOWARDS = np.array([0.45, 0.35, 1.0])  # that camera, from the object: y is up, and z its front
+
+
+def scene(path: Path, parameters: Mapping[str, object]) -> tuple[dict, list[str]]:
+    """A scene for `load_dict`, and notes.
+
+    Args:
+        parameters: `res`, the width of the image in pixels.
+    Raises:
+        InputError: the file cannot be read, or holds nothing to be seen; another parameter.
+    """
+    for name in parameters:
+        if name != "res":
+            raise InputError(f'{path}: the scene has no parameter "{name}"; it has: res')
+    objects, notes = _mesh(path)
+    shapes = [each for each in objects.values() if each["type"] == "mesh"]
+    if not shapes:
+        raise InputError(f"{path}: holds no triangles")
+    cameras = {name: each for name, each in objects.items() if "aspect" in each}
+    if not cameras:
+        cameras = {"camera": _framing(np.concatenate([each["vertices"] for each in shapes]), path)}
+        notes.append(f"{path}: has no camera; one that frames it is used")
+    width = _whole(parameters.get("res", WIDTH), path)
+    cameras = {name: _with_film(camera, width) for name, camera in cameras.items()}
+    lit = any("emitter" in each or each["type"] in ("point", "spot", "directional") for each in objects.values())
+    if not lit:
+        objects["sky"] = {"type": "constant"}
+        notes.append(f"{path}: has no light; a sky of radiance 1 is used")
+    return {"type": "scene", "integrator": {"type": "path"}, **objects, **cameras}, notes
+
+
+def _mesh(path: Path) -> tuple[dict[str, dict], list[str]]:
+    """A grey object, or one of the colours of its vertices."""
+    made, notes = mesh.load(path, path.suffix.lower()[1:], np.eye(4))
+    arrays = {"vertices": made.vertices, "faces": made.faces, "normals": made.normals, "uv": made.uv}
+    if made.empty:
+        raise InputError(f"{path}: holds no triangle that has an area")
+    color = made.attributes.get("vertex_color")
+    bsdf: dict = {"type": "diffuse"}
+    if color is not None and 0 <= color.min() <= color.max() <= 1:  # false where one is NaN
+        arrays["vertex_color"] = color
+        bsdf["reflectance"] = {"type": "mesh_attribute", "name": "vertex_color"}
+    shape = {name: array for name, array in arrays.items() if array is not None}
+    return {"mesh": {"type": "mesh", **shape, "bsdf": {"type": "twosided", "bsdf": bsdf}}}, notes
+
+
+def _framing(vertices: np.ndarray, path: Path) -> dict:
+    """A camera from the front, somewhat above, whose view the sphere around the box of all vertices fits into."""
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    center, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
+    if not 0 < radius < math.inf:
+        raise InputError(f"{path}: has no extent, or one that is not finite")
+    distance = radius / math.sin(math.radians(FOV / 2))
+    origin = center + TOWARDS * (distance / np.linalg.norm(TOWARDS))
+    to_world = Transform().look_at(origin, center, [0, 1, 0])
+    clip = {"near_clip": distance / 1000, "far_clip": distance * 1000}
+    return {"type": "perspective", "to_world": to_world, "fov": FOV, "fov_axis": "smaller", **clip, "aspect": ASPECT}
+
+
+def _with_film(camera: dict, width: int) -> dict:
+    """The camera with a film of its aspect ratio."""
+    height = max(round(width / (camera["aspect"] or ASPECT)), 1)
+    camera = {key: each for key, each in camera.items() if key != "aspect"}
+    camera["film"] = {"type": "hdrfilm", "width": width, "height": height}
+    return camera | {"sampler": {"type": "independent", "sample_count": SPP}}
+
+
+def _whole(value: object, path: Path) -> int:
+    try:
+        number = int(str(value))
+    except ValueError:
+        number = 0
+    if number < 1:
+        raise InputError(f"{path}: res must be a whole number of pixels, is {str(value)[:40]!r}")
+    return number
