@@ -134,6 +134,19 @@ def test_an_array_is_a_texture(tmp_path, convert):
     same(pj.load_dict(with_reflectance(data)), from_file)
 
 
+def test_an_environment_may_be_an_array(tmp_path):
+    image = np.random.default_rng(1).random((4, 8, 3), np.float32)
+    write_exr(tmp_path / "sky.exr", {name: image[..., i] for i, name in enumerate("RGB")}, {})
+    file, data, bitmap = (
+        pj.load_dict(scene(ball={"type": "sphere"}) | {"sky": {"type": "envmap", **given}})
+        for given in ({"filename": tmp_path / "sky.exr"}, {"data": image}, {"bitmap": image})
+    )
+    same(data, file)
+    same(bitmap, file)
+    pj.save_scene(data, tmp_path / "saved.xml")
+    same(pj.load_scene(tmp_path / "saved.xml"), file)
+
+
 def test_bytes_of_a_texture_are_stored_values(tmp_path):
     write_png(tmp_path / "i.png", np.random.default_rng(1).random((3, 5, 3)))
     from PIL import Image
