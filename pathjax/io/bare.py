@@ -1,4 +1,4 @@
-"""Bare meshes as scenes, with what a scene needs besides: a camera, light, a film."""
+"""glTF and bare meshes as scenes, with what a scene needs besides: a camera, light, a film."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ import numpy as np
 
 from pathjax.description.transform import Transform
 from pathjax.errors import InputError
-from pathjax.io import mesh
+from pathjax.io import gltf, mesh
 
 # By the end of the file's name.
-SUFFIXES = (".obj", ".ply", ".stl")
+SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl")
 WIDTH, ASPECT, SPP = 768, 4 / 3, 64
 FOV = 35.0  # degrees, of the camera that frames the object
-TOWARDS = np.array([0.45, 0.35, 1.0])  # that camera, from the object: y is up, and z its front
+TOWARDS = np.array([0.45, 0.35, 1.0])  # that camera, from the object: y is up, z its front, as in glTF
 
 
 def scene(path: Path, parameters: Mapping[str, object]) -> tuple[dict, list[str]]:
@@ -30,7 +30,7 @@ def scene(path: Path, parameters: Mapping[str, object]) -> tuple[dict, list[str]
     for name in parameters:
         if name != "res":
             raise InputError(f'{path}: the scene has no parameter "{name}"; it has: res')
-    objects, notes = _mesh(path)
+    objects, notes = gltf.scene(path) if path.suffix.lower() in (".glb", ".gltf") else _mesh(path)
     shapes = [each for each in objects.values() if each["type"] == "mesh"]
     if not shapes:
         raise InputError(f"{path}: holds no triangles")

@@ -32,7 +32,7 @@ PLACING = ("EXT_mesh_gpu_instancing", "KHR_node_visibility")
 
 
 @dataclass(frozen=True)
-class _File:
+class File:
     path: Path
     header: dict
     chunk: bytes | None  # the binary part of a GLB
@@ -68,8 +68,17 @@ class _File:
         names = [unquote(uri), uri]  # the second: written by programs that do not know of percent-encoding
         found = next((file for name in names if (file := self.path.parent / name).is_file()), None)
         if found is None:
-            raise InputError(f"{self.path}: its buffer {unquote(uri)[:200]} is not beside it")
+            raise InputError(f"{self.path}: {unquote(uri)[:200]}, which it names, is not beside it")
         return found.read_bytes()
+
+    def image(self, number: int) -> bytes | None:
+        """An image file, whole."""
+        this = self.entry("images", number)
+        if "bufferView" not in this:
+            return self._fetch(this["uri"])
+        view = self.entry("bufferViews", this["bufferView"])
+        start = view.get("byteOffset", 0)
+        return self.buffer(view["buffer"])[start : start + view["byteLength"]]
 
     def accessor(self, number: int) -> np.ndarray:
         """(count, width): float64, or where integers are meant as such, integers."""
@@ -101,23 +110,13 @@ class _File:
 
 
 def read(path: Path) -> Raw:
-    file = _opened(path, path.read_bytes())
+    file = opened(path)
     header = file.header
-    refused = [name for name in header.get("extensionsRequired", []) if not HARMLESS.fullmatch(name)]
-    refused += sorted({name for node in header.get("nodes", []) for name in node.get("extensions", {})} & set(PLACING))
-    refused += ["skins"] if header.get("skins") else []
-    if any(not {"bufferView", "sparse"} & accessor.keys() for accessor in header.get("accessors", [])):
-        refused.append("accessors without data")
-    if any(primitive.get("targets") for mesh in header.get("meshes", []) for primitive in mesh["primitives"]):
-        refused.append("morph targets")
-    if refused:
-        raise file.refuse(", ".join(refused))
-
     parts = []
-    for node, matrix in _placed(file):
+    for node, matrix in placed(file):
         for primitive in file.entry("meshes", node["mesh"])["primitives"] if "mesh" in node else ():
             if primitive.get("mode", TRIANGLES) >= TRIANGLES:
-                parts.append(_part(file, primitive, matrix))
+                parts.append(triangles_of(file, primitive, matrix))
     notes = ["its materials, cameras and lights are not read"]
     if "KHR_texture_transform" in header.get("extensionsUsed", []):
         notes.append("transforms of its materials' textures are not applied to uv")
@@ -131,7 +130,29 @@ def read(path: Path) -> Raw:
     return _joined(parts, tuple(notes))
 
 
-def _opened(path: Path, data: bytes) -> _File:
+def opened(path: Path, known: re.Pattern = HARMLESS) -> File:
+    """The file.
+
+    known: extensions that it may require.
+
+    Raises:
+        InputError: it requires others, or has what would change its triangles and is not modelled.
+    """
+    file = _parsed(path, path.read_bytes())
+    header = file.header
+    refused = [name for name in header.get("extensionsRequired", []) if not known.fullmatch(name)]
+    refused += sorted({name for node in header.get("nodes", []) for name in node.get("extensions", {})} & set(PLACING))
+    refused += ["skins"] if header.get("skins") else []
+    if any(not {"bufferView", "sparse"} & accessor.keys() for accessor in header.get("accessors", [])):
+        refused.append("accessors without data")
+    if any(primitive.get("targets") for mesh in header.get("meshes", []) for primitive in mesh["primitives"]):
+        refused.append("morph targets")
+    if refused:
+        raise file.refuse(", ".join(refused))
+    return file
+
+
+def _parsed(path: Path, data: bytes) -> File:
     chunk = None
     if data[:4] == b"glTF":
         _, version, total = struct.unpack_from("<4s2I", data)
@@ -149,10 +170,10 @@ def _opened(path: Path, data: bytes) -> _File:
     version = header.get("asset", {}).get("version", "2.0")
     if not version.startswith("2."):
         raise InputError(f"{path}: glTF of version {version[:20]} is not supported; export glTF 2.0")
-    return _File(path, header, chunk)
+    return File(path, header, chunk)
 
 
-def _placed(file: _File) -> Iterator[tuple[dict, np.ndarray]]:
+def placed(file: File) -> Iterator[tuple[dict, np.ndarray]]:
     """The nodes of the default scene, or where there are no scenes all, each with the matrix that places it."""
     nodes = file.header.get("nodes", [])
     if file.header.get("scenes"):
@@ -187,8 +208,8 @@ def _local(node: dict) -> np.ndarray:
     return matrix
 
 
-def _part(file: _File, primitive: dict, matrix: np.ndarray) -> Raw:
-    """A primitive of a mesh, in the space of the scene."""
+def triangles_of(file: File, primitive: dict, matrix: np.ndarray, uv: int = 0) -> Raw:
+    """A primitive of a mesh, in the space of the scene. uv: which of its texture coordinates."""
     attributes, mode = primitive["attributes"], primitive.get("mode", TRIANGLES)
     vertices = file.accessor(attributes["POSITION"]).astype(np.float64)
     index = file.accessor(primitive["indices"])[:, 0] if "indices" in primitive else np.arange(len(vertices))
@@ -225,7 +246,7 @@ def _part(file: _File, primitive: dict, matrix: np.ndarray) -> Raw:
     if np.linalg.det(linear) < 0:  # the format says that a mirroring node reverses the winding
         faces = faces[:, ::-1]
     vertices = vertices @ linear.T + matrix[:3, 3]
-    return Raw(vertices, faces.ravel(), normals=normals, uv=attribute("TEXCOORD_0", 2))
+    return Raw(vertices, faces.ravel(), normals=normals, uv=attribute(f"TEXCOORD_{uv}", 2))
 
 
 def _flat(part: Raw) -> Raw:

@@ -28,7 +28,7 @@ from pathjax.textures import mesh_attribute
 
 
 def load(path: str | Path, sensor: int | str = 0, /, **parameters: object) -> d.Description:
-    """Read a scene file and the meshes and images that it names; or a bare mesh, which gets what it lacks.
+    """Read a scene file and the meshes and images that it names; or glTF or a bare mesh, which get what they lack.
 
     Args:
         sensor: which of several to use: its number, or its id.

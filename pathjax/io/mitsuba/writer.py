@@ -141,11 +141,12 @@ class _Writer:
             again = read_again(document, element, made.name)
         except InputError:
             return False
-        numbers = {key: x for key, x in values.items() if not isinstance(x, Instance)}
-        return again.kind is made.kind and all(
-            again.values[key] is not None and np.array_equal(np.asarray(again.values[key], np.asarray(x).dtype), x)
-            for key, x in numbers.items()
-        )
+        for key, value in values.items():
+            x, declared = np.asarray(value), made.kind.declared[key]
+            read = declared.standing_in() if again.values.get(key) is None else again.values[key]
+            if not np.array_equal(np.broadcast_to(np.asarray(read, x.dtype), x.shape), x):
+                return False
+        return True
 
     # ---- files
 

@@ -299,7 +299,7 @@ def changed(**entries):
         (changed().replace(b'"count": 4', b'"count": 5'), "is shorter than its accessor"),
         (changed().replace(b'"byteOffset": 0', b'"byteOffset":-4'), "is shorter than its accessor"),
         (Gltf().gltf("https://example.org/square.bin"), "the address https://example.org/square.bin is not supported"),
-        (Gltf().gltf("nowhere%20else.bin"), "its buffer nowhere else.bin is not beside it"),
+        (Gltf().gltf("nowhere%20else.bin"), "nowhere else.bin, which it names, is not beside it"),
         (Gltf().gltf("data:;base64,AAAA"), "buffer 0 is shorter"),
     ],
 )

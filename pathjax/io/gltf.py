@@ -1,0 +1,291 @@
+"""Whole scenes of glTF 2.0, with materials, cameras and lights, as dictionaries for `load_dict`.
+
+Materials become `principled`: roughness and metalness mean the same there. A candela counts as 1 W/sr, a lux as 1 W/m^2
+and emission of 1 as a radiance of 1: so the format relates them, and images have no other unit.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import re
+from pathlib import Path
+
+import numpy as np
+
+from pathjax.description.transform import Transform
+from pathjax.errors import InputError
+from pathjax.images.read import decoded
+from pathjax.io.mesh import gltf
+from pathjax.io.mesh.raw import Raw
+
+WRAPS = {10497: "repeat", 33648: "mirror", 33071: "clamp"}
+NEAREST = 9728
+# Extensions that are modelled: what a file may require.
+KNOWN = re.compile(
+    "KHR_(lights_punctual|mesh_quantization|texture_transform|materials_(ior|emissive_strength|unlit))|EXT_texture_webp"
+)
+MOST_PIXELS = 10**9
+
+
+def scene(path: Path) -> tuple[dict[str, dict], list[str]]:
+    """Objects of a scene by name, and notes on what is left out.
+
+    Raises:
+        InputError: the file is damaged, a part of it is missing, or it requires what is not modelled.
+    """
+    try:
+        return _Scene(gltf.opened(path, KNOWN)).objects()
+    except InputError:
+        raise
+    except Exception as error:  # brought about by a header that is not as the format says
+        raise InputError(f"{path}: cannot be read as glTF ({type(error).__name__}: {error})"[:300]) from None
+
+
+class _Scene:
+    def __init__(self, file: gltf.File):
+        self.file = file
+        self.notes: dict[str, None] = {}  # each once
+        self.made: dict[str, dict] = {}
+        self.materials: dict[tuple[int | None, bool], str] = {}  # by number, and whether vertices have colours
+        self.pictures: dict[int, np.ndarray] = {}
+
+    def objects(self) -> tuple[dict[str, dict], list[str]]:
+        header = self.file.header
+        for name in sorted(set(header.get("extensionsUsed", []))):
+            if not KNOWN.fullmatch(name):
+                self.note(f"its extension {name} is left out")
+        if header.get("animations"):
+            self.note("its animations are left out; objects are where its nodes place them")
+        if len(header.get("scenes", [])) > 1:
+            self.note(f"scene {header.get('scene', 0)} of its {len(header['scenes'])} is read")
+        for node, matrix in gltf.placed(self.file):
+            if "camera" in node:
+                self.add(node, "camera", self.camera(self.file.entry("cameras", node["camera"]), matrix))
+            if light := node.get("extensions", {}).get("KHR_lights_punctual"):
+                self.add(node, "light", self.light(light["light"], matrix))
+            for primitive in self.file.entry("meshes", node["mesh"])["primitives"] if "mesh" in node else ():
+                self.add(node, "mesh", self.mesh(primitive, matrix))
+        return self.made, [f"{self.file.path}: {note}" for note in self.notes]
+
+    def note(self, text: str) -> None:
+        self.notes[text] = None
+
+    def add(self, node: dict, kind: str, made: dict | None) -> None:
+        if made is not None:
+            self.made[self.free(node.get("name") or kind)] = made
+
+    def free(self, name: str) -> str:
+        """The name as a key, and with a number where it is taken."""
+        name = re.sub(r"[^\w-]+", "_", name) or "_"
+        return next(each for k in range(len(self.made) + 1) if (each := f"{name}_{k}" if k else name) not in self.made)
+
+    # ---- where it is seen from, and lit
+
+    def camera(self, camera: dict, matrix: np.ndarray) -> dict:
+        """With `aspect` in place of a film."""
+        seen = camera[camera["type"]]
+        to_world = _looking(matrix)
+        clip = {"near_clip": float(seen["znear"] or 1e-2), "far_clip": float(seen.get("zfar", 1e4))}
+        if camera["type"] == "perspective":
+            fov = {"fov": math.degrees(seen["yfov"]), "fov_axis": "y"}
+            return {"type": "perspective", "to_world": to_world, **fov, **clip, "aspect": seen.get("aspectRatio")}
+        aspect = seen["xmag"] / seen["ymag"]
+        to_world = to_world.scale([abs(seen["xmag"]), abs(seen["xmag"]), 1])
+        return {"type": "orthographic", "to_world": to_world, **clip, "aspect": abs(aspect)}
+
+    def light(self, number: int, matrix: np.ndarray) -> dict:
+        lights = self.file.header["extensions"]["KHR_lights_punctual"]["lights"]
+        if not 0 <= number < len(lights):
+            raise InputError(f"{self.file.path}: light {number} does not exist; there are {len(lights)}")
+        light, to_world = lights[number], _looking(matrix)
+        color = _rgb(np.array(light.get("color", [1, 1, 1])) * light.get("intensity", 1.0))
+        if "range" in light:
+            self.note("the range of its lights is left out; they reach everywhere")
+        if light["type"] == "directional":
+            return {"type": "directional", "irradiance": color, "direction": to_world.matrix[:3, 2]}
+        if light["type"] == "point":
+            return {"type": "point", "intensity": color, "position": to_world.matrix[:3, 3]}
+        cone = {"innerConeAngle": 0.0, "outerConeAngle": math.pi / 4} | light["spot"]
+        angles = {
+            "beam_width": math.degrees(cone["innerConeAngle"]),
+            "cutoff_angle": math.degrees(cone["outerConeAngle"]),
+        }
+        return {"type": "spot", "intensity": color, "to_world": to_world, **angles}
+
+    # ---- surfaces
+
+    def mesh(self, primitive: dict, matrix: np.ndarray) -> dict | None:
+        if primitive.get("mode", gltf.TRIANGLES) < gltf.TRIANGLES:
+            self.note("its points and lines are left out")
+            return None
+        number = primitive.get("material")
+        material = {} if number is None else self.file.entry("materials", number)
+        part = gltf.triangles_of(self.file, primitive, matrix, self.coordinates(material))
+        made = {"type": "mesh", "vertices": part.vertices, "faces": part.corners.reshape(-1, 3)}
+        made |= {name: value for name, value in (("normals", part.normals), ("uv", part.uv)) if value is not None}
+        if (colors := self.colors(primitive, part)) is not None:
+            made["vertex_color"] = colors
+        kind = number, colors is not None
+        if kind not in self.materials:
+            name = self.free(material.get("name") or "material")
+            self.made[name], self.materials[kind] = self.bsdf(material, colored=colors is not None), name
+        made["bsdf"] = {"type": "ref", "id": self.materials[kind]}
+        if (radiance := self.emission(material)) is not None:
+            made["emitter"] = {"type": "area", "radiance": radiance}
+        return made
+
+    def colors(self, primitive: dict, part: Raw) -> np.ndarray | None:
+        """(V, 3) by which the colours of a material are multiplied."""
+        if "COLOR_0" not in primitive["attributes"]:
+            return None
+        colors = self.file.accessor(primitive["attributes"]["COLOR_0"])
+        if len(colors) != len(part.vertices) or colors.shape[1] < 3 or colors.dtype.kind != "f":
+            raise InputError(
+                f"{self.file.path}: COLOR_0 has the shape {colors.shape} beside {len(part.vertices)} positions"
+            )
+        return np.clip(colors[:, :3], 0, 1)
+
+    def bsdf(self, material: dict, colored: bool) -> dict:
+        """Both sides alike, as path tracers have them; the format would show one of them alone."""
+        pbr = material.get("pbrMetallicRoughness", {})
+        factor = np.array(pbr.get("baseColorFactor", [1.0, 1.0, 1.0, 1.0]))
+        base = self.texture(pbr.get("baseColorTexture"))
+        color = _rgb(factor[:3]) if base is None else base.times(slice(0, 3), factor[:3], raw=False)
+        if colored and (base is not None or (factor[:3] != 1).any()):
+            self.note("the colours of its vertices are left out where a material has a colour of its own")
+        elif colored:
+            color = {"type": "mesh_attribute", "name": "vertex_color"}
+        extensions = material.get("extensions", {})
+        if "KHR_materials_unlit" in extensions:
+            self.note("its unlit materials are lit, as diffuse ones of their colour")
+            bsdf = {"type": "diffuse", "reflectance": color}
+        else:
+            bsdf = {"type": "principled", "base_color": color}
+            if "KHR_materials_ior" in extensions:
+                bsdf["eta"] = float(extensions["KHR_materials_ior"].get("ior", 1.5))
+            both = self.texture(pbr.get("metallicRoughnessTexture"))
+            for key, channel, usual in (("roughness", 1, "roughnessFactor"), ("metallic", 2, "metallicFactor")):
+                share = float(pbr.get(usual, 1.0))
+                bsdf[key] = share if both is None else both.times(slice(channel, channel + 1), share, raw=True)
+            if (normals := self.texture(material.get("normalTexture"))) is not None:
+                normal = normals.normals(float(material["normalTexture"].get("scale", 1.0)))
+                bsdf = {"type": "normalmap", "normalmap": normal, "bsdf": bsdf}
+        if "occlusionTexture" in material:
+            self.note("the occlusion in its materials is left out, as light is traced")
+        bsdf = {"type": "twosided", "bsdf": bsdf}
+        if (mode := material.get("alphaMode", "OPAQUE")) == "OPAQUE":
+            return bsdf
+        cutoff = float(material.get("alphaCutoff", 0.5)) if mode == "MASK" else None
+        if base is not None:
+            opacity = base.alpha(float(factor[3]), cutoff)
+        else:
+            opacity = float(factor[3]) if cutoff is None else float(factor[3] >= cutoff)
+        return {"type": "mask", "opacity": opacity, "bsdf": bsdf}
+
+    def emission(self, material: dict) -> dict | None:
+        """Radiance; None where there is none."""
+        factor = np.array(material.get("emissiveFactor", [0.0, 0.0, 0.0]))
+        extension = material.get("extensions", {}).get("KHR_materials_emissive_strength", {})
+        factor = factor * extension.get("emissiveStrength", 1.0)
+        texture = self.texture(material.get("emissiveTexture")) if factor.any() else None
+        if texture is None:
+            return _rgb(factor) if factor.any() else None
+        return texture.times(slice(0, 3), factor, raw=False) if texture.pixels[..., :3].any() else None
+
+    # ---- textures
+
+    def coordinates(self, material: dict) -> int:
+        """Which texture coordinates of a mesh its textures use."""
+        pbr = material.get("pbrMetallicRoughness", {})
+        infos = [pbr.get("baseColorTexture"), pbr.get("metallicRoughnessTexture")]
+        infos += [material.get("normalTexture"), material.get("emissiveTexture")]
+        used = {_transform_of(info).get("texCoord", info.get("texCoord", 0)) for info in infos if info}
+        if len(used) > 1:
+            raise self.file.refuse("textures of one material that use different texture coordinates")
+        return used.pop() if used else 0
+
+    def texture(self, info: dict | None) -> _Picture | None:
+        if not info:
+            return None
+        texture = self.file.entry("textures", info["index"])
+        webp = texture.get("extensions", {}).get("EXT_texture_webp", {})
+        source = texture.get("source", webp.get("source"))
+        if source is None:
+            raise self.file.refuse("images of another format than PNG, JPEG and WebP")
+        if source not in self.pictures:
+            self.pictures[source] = self.picture(source)
+        sampler = self.file.entry("samplers", texture["sampler"]) if "sampler" in texture else {}
+        wraps = {WRAPS[sampler.get(axis, 10497)] for axis in ("wrapS", "wrapT")}
+        if len(wraps) > 1:
+            self.note("its textures wrap the same way along u and v, that of u")
+        how = {"wrap_mode": WRAPS[sampler.get("wrapS", 10497)]}
+        how |= {"filter_type": "nearest"} if sampler.get("magFilter") == NEAREST else {}
+        if placed := _transform_of(info):
+            turn = Transform().translate([*placed.get("offset", [0, 0]), 0])
+            turn = turn.rotate([0, 0, 1], -math.degrees(placed.get("rotation", 0)))
+            how["to_uv"] = turn.scale([*placed.get("scale", [1, 1]), 1])
+        return _Picture(self.pictures[source], how)
+
+    def picture(self, number: int) -> np.ndarray:
+        """(H, W, 4) uint8 of an image."""
+        from PIL import Image
+
+        data = self.file.image(number)
+        try:
+            with Image.open(io.BytesIO(data or b"")) as image:
+                if image.width * image.height > MOST_PIXELS:
+                    raise InputError(f"{self.file.path}: image {number} has more than {MOST_PIXELS:.0e} pixels")
+                return np.asarray(image.convert("RGBA"))
+        except InputError:
+            raise
+        except Exception as error:  # of the decoder, as the image's bytes have it
+            raise InputError(
+                f"{self.file.path}: image {number} cannot be read: {' '.join(str(error).split())}"
+            ) from None
+
+
+class _Picture:
+    """An image, and how it lies on a surface."""
+
+    def __init__(self, pixels: np.ndarray, how: dict):
+        self.pixels, self.how = pixels, how
+
+    def bitmap(self, data: np.ndarray, raw: bool, **more) -> dict:
+        return {"type": "bitmap", "data": data, "raw": raw, **self.how, **more}
+
+    def times(self, channels: slice, factor: float | np.ndarray, raw: bool) -> dict:
+        """Some of its channels times a factor; raw: they are plain numbers, not sRGB. Stored bytes where that is 1."""
+        stored = self.pixels[..., channels]
+        if np.all(factor == 1):
+            return self.bitmap(stored, raw)
+        return self.bitmap(decoded(stored, raw) * np.asarray(factor, np.float32), raw=True)
+
+    def normals(self, scale: float) -> dict:
+        """Of a normal map whose x and y are scaled."""
+        if scale == 1:
+            return self.bitmap(self.pixels[..., :3], raw=True)
+        normal = (2 * decoded(self.pixels[..., :3], raw=True) - 1) * np.array([scale, scale, 1], np.float32)
+        length = np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), np.finfo(np.float32).tiny)
+        return self.bitmap((normal / length + 1) / 2, raw=True)
+
+    def alpha(self, factor: float, cutoff: float | None) -> dict:
+        """Opacity; with a cutoff texels are there or not."""
+        alpha = decoded(self.pixels[..., 3:], raw=True) * np.float32(factor)
+        if cutoff is None:
+            return self.bitmap(alpha, raw=True)
+        return self.bitmap((alpha >= cutoff).astype(np.float32), raw=True, filter_type="nearest")
+
+
+def _rgb(color: np.ndarray) -> dict:
+    return {"type": "rgb", "value": color}
+
+
+def _transform_of(info: dict) -> dict:
+    return info.get("extensions", {}).get("KHR_texture_transform", {})
+
+
+def _looking(matrix: np.ndarray) -> Transform:
+    """The turned and moved frame whose z axis points where cameras and lights of the format look, along -z."""
+    origin = matrix[:3, 3]
+    return Transform().look_at(origin, origin - matrix[:3, 2] / np.linalg.norm(matrix[:3, 2]), matrix[:3, 1])
