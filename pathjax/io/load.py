@@ -7,6 +7,7 @@ import warnings
 from collections.abc import Mapping
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import DTypeLike
@@ -15,7 +16,7 @@ from pathjax import bsdfs, emitters
 from pathjax.compile import is_traced
 from pathjax.errors import InputError, InputWarning
 from pathjax.io.mitsuba import loader, writer
-from pathjax.scene.builder import build
+from pathjax.scene.builder import build, seen
 from pathjax.scene.parameters import about
 from pathjax.scene.parameters import parameters as parameters_of
 from pathjax.scene.scene import Scene
@@ -88,7 +89,18 @@ def save_scene(scene: Scene, file: str | os.PathLike) -> list[Path]:
     if any(is_traced(value) for value in values.values()):
         raise InputError(f"{file}: the scene's parameters are traced; save it outside of jit and derivatives")
     known = about(scene).description
+    for name, value in seen(known, scene.camera.origin.dtype).items():
+        if not _equal(value, getattr(scene, name)):
+            raise InputError(
+                f"{file}: the scene's {name} was replaced after it was loaded, which save_scene cannot write"
+            )
     return writer.save(known, {name: np.asarray(value) for name, value in values.items()}, Path(file))
+
+
+def _equal(one: object, other: object) -> bool:
+    """Of pytrees."""
+    alike = jax.tree.structure(one) == jax.tree.structure(other)
+    return alike and all(map(np.array_equal, jax.tree.leaves(one), jax.tree.leaves(other)))
 
 
 def _lit(scene: Scene, file: str | os.PathLike) -> Scene:

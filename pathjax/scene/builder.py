@@ -37,19 +37,21 @@ def build(description: desc.Description, dtype=jnp.float32, split_rule: str = "s
     geometry, lamps, trees = shapes.build(description.shapes, dtype, split_rule, **asked)
     given = [*(shape.emitter for shape in description.shapes), *description.emitters]
     lights, geometry = emitters.build(given, lamps, geometry, dtype, ("emitters",), parameters)
-    integrator = description.integrator
-    max_depth = UNBOUNDED if integrator.max_depth < 0 else integrator.max_depth
-    scene = Scene(
-        description.camera.build(description.film, dtype),
-        description.film.build(dtype),
-        geometry,
-        materials,
-        lights,
-        np.int32(max_depth),
-        np.int32(integrator.rr_depth),
-        integrator.hide_emitters,
-        About(description, parameters.known, parameters.refused, trees),
-        integrator.free_passes and bsdfs.occurs(materials, "passes"),
-    )
+    about = About(description, parameters.known, parameters.refused, trees)
+    view = seen(description, dtype)
     # NumPy up to here: `jnp.asarray` compiles a program for every shape that it meets.
-    return jax.device_put(scene)
+    free_passes = description.integrator.free_passes and bsdfs.occurs(materials, "passes")
+    parts = {"geometry": geometry, "materials": materials, "emitters": lights, "about": about}
+    return jax.device_put(Scene(**parts, **view, free_passes=free_passes))
+
+
+def seen(description: desc.Description, dtype) -> dict[str, object]:
+    """The fields of a scene that say how it is looked at."""
+    integrator = description.integrator
+    return {
+        "camera": description.camera.build(description.film, dtype),
+        "film": description.film.build(dtype),
+        "max_depth": np.int32(UNBOUNDED if integrator.max_depth < 0 else integrator.max_depth),
+        "rr_depth": np.int32(integrator.rr_depth),
+        "hide_emitters": integrator.hide_emitters,
+    }

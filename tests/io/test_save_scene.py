@@ -98,8 +98,8 @@ def test_files_come_back_as_they_were(path, again):
 def test_arrays_come_back_from_files_beside(again, tmp_path):
     scene = pj.load_dict(dictionary())
     same(scene, again(scene))
-    files = {"saved.xml", "saved_bytes.png", "saved_floor.exr", "saved_floor.ply", "saved_ball.ply"}
-    assert {file.name for file in tmp_path.iterdir()} == files
+    files = {"bytes_reflectance.png", "floor_reflectance.exr", "floor.ply", "ball.ply"}
+    assert {file.name for file in tmp_path.iterdir()} == {"saved.xml", *(f"saved_{name}" for name in files)}
     same(scene, again(again(scene), "second.xml"))
 
 
@@ -156,6 +156,11 @@ def test_references_aliases_includes_and_names_come_back(again, tmp_path):
       <shape type="cube"><bsdf type="diffuse"><float name="reflectance" value="$grey"/></bsdf></shape></scene>""")
     scene = pj.load_scene(tmp_path / "scene.xml", grey=0.75)
     same(scene, again(scene))
+    (tmp_path / "old.xml").write_text("""<scene version="0.6.0"><sensor type="perspective"/><emitter type="constant"/>
+      <shape type="sphere"><bsdf type="dielectric"><float name="intIOR" value="1.25"/></bsdf></shape></scene>""")
+    scene = pj.load_scene(tmp_path / "old.xml")
+    same(scene, again(scene))
+    assert '<scene version="3.0.0">' in (tmp_path / "saved.xml").read_text()
 
 
 def test_the_sensor_that_is_used_comes_first(again, tmp_path):
@@ -229,6 +234,8 @@ def test_what_no_file_can_say_is_refused(make_scene, tmp_path):
     with pytest.raises(pj.InputError, match=r"scene.a\$b: .*'a\$b' cannot be written"):
         pj.save_scene(scene, tmp_path / "saved.xml")
     scene = make_scene('<shape type="sphere" id="ball"/><emitter type="constant"/>')
+    with pytest.raises(pj.InputError, match="max_depth was replaced after it was loaded"):
+        pj.save_scene(replace(scene, max_depth=jnp.int32(3)), tmp_path / "saved.xml")
     with pytest.raises(pj.InputError, match="traced; save it outside"):
         jax.jit(lambda x: pj.save_scene(pj.with_parameters(scene, {"ball.reflectance": x}), tmp_path / "x.xml"))(0.5)
 

@@ -22,6 +22,7 @@ from pathjax.images import write_exr
 from pathjax.images.png import write_stored
 from pathjax.images.read import decoded
 from pathjax.io.mesh import ply_writer
+from pathjax.io.mitsuba import dict_reader
 from pathjax.io.mitsuba.loader import read_again
 from pathjax.io.mitsuba.plugins import PLUGINS
 from pathjax.kinds import Instance
@@ -62,9 +63,11 @@ class _Writer:
         if element.tag == "shape" and self.made.get(element) is None and _has_arrays(element):
             return ""  # a mesh of which no triangle is left
         element = self.changed(element)
-        if element.tag == "ref":
-            element = Element("ref", element.attributes | {"id": self.document.ids[element.id].id}, element.file, 0)
         attributes = self.attributes(element)
+        if element.tag == "ref" and (target := self.document.ids.get(element.id)) is not None:
+            attributes["id"] = target.id  # which may have been given another one by <alias>
+        if element.tag == "scene":
+            attributes["version"] = dict_reader.VERSION  # what older files say was brought up to date
         start = f"{'    ' * depth}<{element.tag}" + "".join(f" {key}={quoteattr(x)}" for key, x in attributes.items())
         if not element.children:
             return f"{start}/>\n"
@@ -101,7 +104,8 @@ class _Writer:
             values = {key: self.values[f"{made.name}.{key}"] for key in self.different(made)}
             element = self.with_values(element, made, values) if values else element
         if _has_arrays(element):
-            name = made.name if isinstance(made, Instance) else element.tag
+            names = [made.name if isinstance(made, Instance) else element.tag, element.attributes.get("name")]
+            name = "_".join(filter(None, names))
             children = [self.image(child, element, name) for child in element.children]
             return Element(element.tag, element.attributes, element.file, element.line, children)
         return element
