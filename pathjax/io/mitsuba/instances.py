@@ -11,7 +11,7 @@ import numpy as np
 from pathjax import description as d
 from pathjax.description.fields import Fields
 from pathjax.kinds import Unused
-from pathjax.shapes import Mesh, Shape
+from pathjax.shapes import Shape
 
 # Above, the tables of a scene would not fit into the memory of usual machines, or its numbers into 32 bits.
 MOST_TRIANGLES = 1 << 28
@@ -49,7 +49,7 @@ class Instance:
         if not groups or groups[0].attributes.get("type") != "shapegroup":
             raise fields.element.error(f'{fields.element} needs a <ref> to a <shape type="shapegroup">')
         shapes = [_placed(fields, shape, to_world, name) for shape in loader.group(groups[0])]
-        loader.copy(fields.element, sum(len(s.geometry.faces) for s in shapes if isinstance(s.geometry, Mesh)))
+        loader.copy(fields.element, sum(len(s.geometry.faces) for s in shapes if s.geometry.triangles))
         return shapes
 
 
