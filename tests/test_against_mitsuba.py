@@ -82,6 +82,15 @@ def test_image_agrees_with_mitsuba(path, with_border, mitsuba, estimate, agree):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("kind", ["gaussian", "mitchell", "catmullrom", "lanczos"])
+def test_images_through_other_filters_agree_with_mitsuba(kind, with_border, mitsuba, estimate, agree):
+    """The border of the lamp, that is, with the lobes that a filter draws beside it."""
+    path = with_border(ROOT / "scenes" / "cornell_box.xml")
+    path.write_text(path.read_text().replace('<rfilter type="box"/>', f'<rfilter type="{kind}"/>'))
+    agree(estimate(pj.load_scene(path, res=32), spp=SPP, count=SEEDS), mitsuba(path), whole=False, rounding=ROUNDING)
+
+
+@pytest.mark.slow
 def test_nine_spheres_agree_with_double_precision(shipped, mitsuba, estimate, agree, x64):
     """Mitsuba's single precision is 3 to 10 % too dark among walls of radius 1e5, so it cannot judge here. Where its
     build has no double precision (the wheels have none), pathjax itself in float64 does, with seeds of its own."""

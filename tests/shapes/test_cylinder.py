@@ -12,6 +12,7 @@ import pytest
 
 import pathjax as pj
 from pathjax import description as desc
+from pathjax import transport
 from pathjax.bsdfs import Diffuse
 from pathjax.core.types import Ray
 from pathjax.emitters import Area
@@ -223,6 +224,19 @@ def test_light_is_drawn_with_the_density_that_is_told():
         values = np.where(facing & (drawn.pdf > 0), 1 / np.where(drawn.pdf > 0, drawn.pdf, 1), 0).astype(float)
         # One in 20,000 that a right sampler fails.
         assert abs(values.mean() - expected) < 4 * values.std() / np.sqrt(len(values))
+
+
+@pytest.mark.slow
+def test_a_closed_cylinder_that_shines_inside_has_the_radiance_of_the_geometric_series(write_scene):
+    """L = Le / (1 - rho) everywhere, by patches, whose areas are those of the surface."""
+    inside = """<emitter type="area"><rgb name="radiance" value="1"/></emitter>
+    <bsdf type="diffuse"><rgb name="reflectance" value="0.5"/></bsdf></shape>"""
+    top = '<transform name="to_world"><rotate x="1" angle="180"/><translate z="1"/></transform>'
+    wall = '<shape type="cylinder"><boolean name="flip_normals" value="true"/>'
+    body = f'{wall}{inside}<shape type="disk">{inside}<shape type="disk">{top}{inside}'
+    op = transport.operator(pj.load_scene(write_scene(body)), patches=100)
+    assert op.area.sum() == pytest.approx(4 * math.pi, rel=1e-5)
+    np.testing.assert_allclose(op.solve().L, 2, rtol=1e-4)
 
 
 @pytest.mark.slow

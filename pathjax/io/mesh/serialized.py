@@ -17,7 +17,7 @@ from pathjax.io.mesh.raw import Raw
 
 _IDENTIFIER = 0x041C
 _NORMALS, _UV, _COLORS, _DOUBLE = 0x0001, 0x0002, 0x0008, 0x2000  # Mitsuba heeds no other flags
-_LONGEST_NAME = 1 << 16
+_LONGEST_NAME = 1 << 12
 # Packed bytes that are unpacked at a time, and the most that come of them at once.
 _BLOCK, _LARGEST_PIECE = 1 << 16, 1 << 24
 

@@ -49,7 +49,7 @@ class Instance:
         if not groups or groups[0].attributes.get("type") != "shapegroup":
             raise fields.element.error(f'{fields.element} needs a <ref> to a <shape type="shapegroup">')
         shapes = [_placed(fields, shape, to_world, name) for shape in loader.group(groups[0])]
-        loader.copy(fields.element, sum(len(s.geometry.faces) for s in shapes if s.geometry.triangles))
+        loader.copy(fields.element, sum(len(each.geometry.faces) for each in shapes if each.geometry.triangles))
         return shapes
 
 
