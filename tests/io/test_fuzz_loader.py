@@ -41,7 +41,15 @@ SCENE = """<?xml version="1.0"?>
   <shape type="rectangle"><ref id="wall"/><emitter type="area"><rgb name="radiance" value="$color"/></emitter></shape>
   <shape type="obj"><string name="filename" value="mesh.obj"/><boolean name="face_normals" value="false"/>
     <transform name="to_world"><matrix value="1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1"/></transform><ref id="tin"/></shape>
-  <emitter type="constant"><rgb name="radiance" value="1"/></emitter>
+  <shape type="shapegroup" id="group">
+    <shape type="cylinder"><point name="p0" value="1, 2, 3"/><float name="radius" value="0.5"/></shape>
+    <shape type="ply"><string name="filename" value="mesh.ply"/><bsdf type="diffuse">
+      <texture type="mesh_attribute" name="reflectance"><string name="name" value="vertex_color"/></texture></bsdf>
+    </shape>
+  </shape>
+  <shape type="instance"><ref id="group"/><transform name="to_world"><scale value="2"/></transform></shape>
+  <emitter type="constant"><spectrum name="radiance" value="400:1, 500:2 600:3"/></emitter>
+  <emitter type="constant"><spectrum name="radiance" type="d65"><float name="scale" value="2"/></spectrum></emitter>
   <emitter type="point"><point name="position" x="0" y="1" z="2"/><spectrum name="intensity" value="3"/></emitter>
   <emitter type="spot"><float name="cutoff_angle" value="30"/><float name="beam_width" value="20"/>
     <transform name="to_world"><lookat origin="0,0,4" target="0,0,0" up="0,1,0"/></transform></emitter>
@@ -50,6 +58,11 @@ SCENE = """<?xml version="1.0"?>
 </scene>
 """
 
+PLY_COLORS = (
+    "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\nproperty uchar r\n"
+    "property uchar g\nproperty uchar b\nelement face 1\nproperty list uchar int vertex_indices\nproperty float w_0\n"
+    "end_header\n0 0 0 9 8 7\n1 0 0 6 5 4\n0 1 0 3 2 1\n3 0 1 2 0.5\n"
+)
 OBJ = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvn 0 0 1\nf 1/1/1 2/1/1 3/1/1\n"
 PLY = (
     "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\nproperty float u\n"
@@ -90,6 +103,7 @@ MESHES = {
     "obj": ("obj", OBJ.encode(), 1),
     "obj with odd lines": ("obj", OBJ_ODD.encode(), 2),
     "ply": ("ply", PLY.encode(), 1),
+    "ply of colours": ("ply", PLY_COLORS.encode(), 1),
     "binary ply of a quad and a triangle": ("ply", PLY_BINARY, 3),
     "ply of strips": ("ply", PLY_STRIPS.encode(), 2),
     "stl": ("stl", STL, 1),
@@ -117,6 +131,7 @@ def quickly(examples: int):
 @pytest.fixture
 def folder(tmp_path):
     (tmp_path / "mesh.obj").write_text(OBJ)
+    (tmp_path / "mesh.ply").write_text(PLY_COLORS)
     (tmp_path / "part.xml").write_text('<scene version="3.0.0"/>')
     write_png(tmp_path / "picture.png", np.full((2, 2, 3), 0.5))
     return tmp_path
@@ -127,7 +142,7 @@ def load_or_refuse(folder, content: bytes) -> Description | None:
     try:
         return load(folder / "scene.xml")
     except InputError as error:
-        assert "\n" not in str(error) and re.search(r"\.(xml|png|obj)", str(error)), error
+        assert "\n" not in str(error) and re.search(r"\.(xml|png|obj|ply)", str(error)), error
         return None
 
 

@@ -187,8 +187,8 @@ def _table(path: Path, element: _Element, names: tuple[str, ...]) -> np.ndarray:
         return np.stack([element.columns[name].astype(element.types[name][0]) for name in names], 1).astype(np.float64)
 
 
-def _attributes(elements: dict[str, _Element]) -> tuple[dict[str, np.ndarray], tuple[str, ...]]:
-    """What vertices and faces carry, (N, 3) by Mitsuba's names, and notes.
+def _attributes(elements: dict[str, _Element]) -> tuple[tuple[str, ...], dict[str, np.ndarray]]:
+    """Notes, and what vertices and faces carry, (N, 3) by Mitsuba's names.
 
     Of properties r, g, b or red, green, blue the name is "color"; of N_r, N_g, N_b "N_color"; of N_x, N_y, N_z or N_0,
     N_1, N_2 "N". One alone of these stands for three.
@@ -209,7 +209,7 @@ def _attributes(elements: dict[str, _Element]) -> tuple[dict[str, np.ndarray], t
                     notes.append(f"{', '.join(keys)} of each {element.name} are integers, divided by the largest one")
                 words = [element.name, stem, "color" if first.strip("_") in COLORS else ""]
                 found["_".join(word for word in words if word)] = np.broadcast_to(values, (len(values), 3))
-    return found, tuple(notes)
+    return tuple(notes), found
 
 
 def _faces(path: Path, elements: dict[str, _Element]) -> tuple[np.ndarray, np.ndarray]:

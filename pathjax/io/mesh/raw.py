@@ -18,8 +18,8 @@ class Raw:
     sizes: np.ndarray | None = None  # (F,) int64, corners of each polygon; None: triangles
     normals: np.ndarray | None = None  # (V, 3); a row of zeros: this vertex has none
     uv: np.ndarray | None = None  # (V, 2), v as the file has it
-    attributes: Mapping[str, np.ndarray] = field(default_factory=dict)  # "vertex_*" (V, 3), "face_*" (F, 3)
     notes: tuple[str, ...] = ()
+    attributes: Mapping[str, np.ndarray] = field(default_factory=dict)  # "vertex_*" (V, 3), "face_*" (F, 3)
 
 
 def plain_text(data: bytes) -> bytes:
