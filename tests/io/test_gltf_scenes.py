@@ -4,7 +4,9 @@ import io
 import json
 import math
 import struct
+from dataclasses import replace
 
+import jax
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -12,6 +14,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 import pathjax as pj
+from pathjax.bench import peers
 from pathjax.io import bare, gltf
 
 CORNERS = np.array([(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)], "<f4")
@@ -294,6 +297,48 @@ def test_the_film_has_the_cameras_shape_and_what_is_lacking_is_added(write):
     made, notes = bare.scene(write(with_node(extensions={"KHR_lights_punctual": {"light": 0}})), {})
     assert (made["camera"]["film"]["width"], made["camera"]["film"]["height"]) == (768, 576)
     assert "sky" not in made and any("has no camera" in note for note in notes)
+
+
+# ---- scenes -------------------------------------------------------------------------------------------------------
+
+
+def everything(alpha="MASK"):
+    """A square of all textures, in front of one that glows, with a camera and lights."""
+    file = Gltf(cameras=[CAMERA], extensions={"KHR_lights_punctual": {"lights": LIGHTS}})
+    bumps = np.full((4, 4, 3), (128, 128, 255), np.uint8)
+    bumps[1:3, 1:3] = (90, 190, 220)
+    pbr = {"baseColorTexture": file.texture(), "metallicRoughnessTexture": file.texture(), "roughnessFactor": 0.8}
+    square = {"pbrMetallicRoughness": pbr, "normalTexture": file.texture(bumps), "alphaMode": alpha}
+    file.header["materials"] = [square, {"emissiveFactor": [0.5, 0.25, 0.125], "name": "glow"}]
+    file.header["meshes"].append({"primitives": [file.primitive | {"material": 1}]})
+    file.node(mesh=1, translation=[0, 0, -1], name="back")
+    file.node(camera=0, translation=[0.5, 0.25, 5])
+    for number in range(3):
+        file.node(translation=[0.5, 0.5 * number, 3], extensions={"KHR_lights_punctual": {"light": number}})
+    return file
+
+
+def test_a_file_is_a_scene_that_can_be_saved(write, tmp_path):
+    scene = pj.load_scene(write(everything()), res=32)
+    assert {"back.radiance", "glow.roughness", "light.intensity"} < set(pj.parameters(scene))
+    assert len(pj.save_scene(scene, tmp_path / "saved.xml")) == 8
+    again = pj.load_scene(tmp_path / "saved.xml")
+    jax.tree.map(np.testing.assert_array_equal, *(replace(each, about=None) for each in (scene, again)))
+
+
+@pytest.mark.slow
+def test_mitsuba_renders_what_is_saved(write, tmp_path, estimate, estimate_type, agree):
+    pytest.importorskip("mitsuba")
+    # Opaque: to Mitsuba's shadow rays what is masked is, and lights without size are found by no others.
+    scene = pj.load_scene(write(everything("OPAQUE")), res=32)
+    pj.save_scene(scene, tmp_path / "saved.xml")
+    run = {"sampler": "independent", "spp": 64, "seeds": list(range(12))}
+    request = {"scene": str(tmp_path / "saved.xml"), "parameters": {}, "variant": "llvm_ad_rgb", "runs": [run]}
+    _, arrays = peers.call("mitsuba3", request, timeout=300)
+    images = arrays["images_0"].astype(float)
+    theirs = estimate_type(images.mean(0), images.var(0, ddof=1) / 12, 12)
+    # The filter shares samples among pixels, so their mean tells less than its variance says.
+    agree(estimate(scene, spp=64, count=12), theirs, whole=False, rounding=1e-3)
 
 
 # ---- what is left out, and refused ----------------------------------------------------------------------------------

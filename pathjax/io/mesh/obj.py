@@ -59,7 +59,7 @@ def read(path: Path) -> Raw:
         vertices = tables[0]
     lacking = 0 if uv is None else np.count_nonzero(rows[:, 1] == 0)
     notes = (f"{lacking} vertices without texture coordinates got (0, 0)",) if lacking else ()
-    return Raw(vertices, corners, sizes, normals, uv, notes)
+    return Raw(vertices, corners, sizes, normals, uv, notes=notes)
 
 
 def _logical_lines(text: bytes) -> bytes:
