@@ -93,7 +93,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def _add_scene(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("scene", metavar="SCENE.xml")
+    parser.add_argument("scene", metavar="SCENE.xml", help="or glTF, or a mesh: .glb, .gltf, .obj, .ply, .stl")
     parser.add_argument(
         "-D", dest="defines", action="append", default=[], type=_pair, metavar="name=value", help="a $name of the file"
     )

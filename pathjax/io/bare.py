@@ -19,8 +19,8 @@ FOV = 35.0  # degrees, of the camera that frames the object
 TOWARDS = np.array([0.45, 0.35, 1.0])  # that camera, from the object: y is up, z its front, as in glTF
 
 
-def scene(path: Path, parameters: Mapping[str, object]) -> tuple[dict, list[str]]:
-    """A scene for `load_dict`, and notes.
+def scene(path: Path, parameters: Mapping[str, object]) -> tuple[dict, list[str], list[Path]]:
+    """A scene for `load_dict`, notes, and the files that were read.
 
     Args:
         parameters: `res`, the width of the image in pixels.
@@ -30,7 +30,7 @@ def scene(path: Path, parameters: Mapping[str, object]) -> tuple[dict, list[str]
     for name in parameters:
         if name != "res":
             raise InputError(f'{path}: the scene has no parameter "{name}"; it has: res')
-    objects, notes = gltf.scene(path) if path.suffix.lower() in (".glb", ".gltf") else _mesh(path)
+    objects, notes, files = gltf.scene(path) if path.suffix.lower() in (".glb", ".gltf") else _mesh(path)
     shapes = [each for each in objects.values() if each["type"] == "mesh"]
     if not shapes:
         raise InputError(f"{path}: holds no triangles")
@@ -44,10 +44,10 @@ def scene(path: Path, parameters: Mapping[str, object]) -> tuple[dict, list[str]
     if not lit:
         objects["sky"] = {"type": "constant"}
         notes.append(f"{path}: has no light; a sky of radiance 1 is used")
-    return {"type": "scene", "integrator": {"type": "path"}, **objects, **cameras}, notes
+    return {"type": "scene", "integrator": {"type": "path"}, **objects, **cameras}, notes, files
 
 
-def _mesh(path: Path) -> tuple[dict[str, dict], list[str]]:
+def _mesh(path: Path) -> tuple[dict[str, dict], list[str], list[Path]]:
     """A grey object, or one of the colours of its vertices."""
     made, notes = mesh.load(path, path.suffix.lower()[1:], np.eye(4))
     arrays = {"vertices": made.vertices, "faces": made.faces, "normals": made.normals, "uv": made.uv}
@@ -59,7 +59,7 @@ def _mesh(path: Path) -> tuple[dict[str, dict], list[str]]:
         arrays["vertex_color"] = color
         bsdf["reflectance"] = {"type": "mesh_attribute", "name": "vertex_color"}
     shape = {name: array for name, array in arrays.items() if array is not None}
-    return {"mesh": {"type": "mesh", **shape, "bsdf": {"type": "twosided", "bsdf": bsdf}}}, notes
+    return {"mesh": {"type": "mesh", **shape, "bsdf": {"type": "twosided", "bsdf": bsdf}}}, notes, [path]
 
 
 def _framing(vertices: np.ndarray, path: Path) -> dict:

@@ -28,14 +28,15 @@ KNOWN = re.compile(
 MOST_PIXELS = 10**9
 
 
-def scene(path: Path) -> tuple[dict[str, dict], list[str]]:
-    """Objects of a scene by name, and notes on what is left out.
+def scene(path: Path) -> tuple[dict[str, dict], list[str], list[Path]]:
+    """Objects of a scene by name, notes on what is left out, and the files that were read.
 
     Raises:
         InputError: the file is damaged, a part of it is missing, or it requires what is not modelled.
     """
     try:
-        return _Scene(gltf.opened(path, KNOWN)).objects()
+        file = gltf.opened(path, KNOWN)
+        return *_Scene(file).objects(), [path, *file.beside]
     except InputError:
         raise
     except Exception as error:  # brought about by a header that is not as the format says

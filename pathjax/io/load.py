@@ -50,10 +50,10 @@ def load_scene(
     parameters: Mapping[str, object] | None = None,
     **keywords: object,
 ) -> Scene:
-    """Load a Mitsuba 3 XML scene.
+    """Load a scene file of Mitsuba 3, or glTF or a bare mesh as a scene.
 
     Args:
-        file: path of the scene file.
+        file: path of the file; what it is, is told by its suffix.
         sensor: which of several to use: its number, from 0, or its id.
         dtype: of all real numbers; float64 needs `jax_enable_x64`.
         split_rule: how hierarchies are split, for experiments: "sah" (least expected cost), "equal" (equal counts) or

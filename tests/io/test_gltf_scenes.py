@@ -77,7 +77,7 @@ def objects(tmp_path):
 
     def objects(file):
         (tmp_path / "file.glb").write_bytes(file if isinstance(file, bytes) else file.glb())
-        return gltf.scene(tmp_path / "file.glb")
+        return gltf.scene(tmp_path / "file.glb")[:2]
 
     return objects
 
@@ -291,10 +291,10 @@ def test_lights_shine_along_minus_z(objects, number):
 
 
 def test_the_film_has_the_cameras_shape_and_what_is_lacking_is_added(write):
-    made, notes = bare.scene(write(with_node(camera=0)), {"res": 100})
+    made, notes, _ = bare.scene(write(with_node(camera=0)), {"res": 100})
     assert (made["it"]["film"]["width"], made["it"]["film"]["height"]) == (100, 50)
     assert made["sky"] == {"type": "constant"} and any("has no light" in note for note in notes)
-    made, notes = bare.scene(write(with_node(extensions={"KHR_lights_punctual": {"light": 0}})), {})
+    made, notes, _ = bare.scene(write(with_node(extensions={"KHR_lights_punctual": {"light": 0}})), {})
     assert (made["camera"]["film"]["width"], made["camera"]["film"]["height"]) == (768, 576)
     assert "sky" not in made and any("has no camera" in note for note in notes)
 
@@ -324,6 +324,18 @@ def test_a_file_is_a_scene_that_can_be_saved(write, tmp_path):
     assert len(pj.save_scene(scene, tmp_path / "saved.xml")) == 8
     again = pj.load_scene(tmp_path / "saved.xml")
     jax.tree.map(np.testing.assert_array_equal, *(replace(each, about=None) for each in (scene, again)))
+
+
+def test_what_was_read_is_not_overwritten(tmp_path):
+    file = everything()
+    (tmp_path / "b_square.ply").write_bytes(file.data)
+    buffers = [{"byteLength": len(file.data), "uri": "b_square.ply"}]
+    header = {key: value for key, value in file.header.items() if value != []}
+    (tmp_path / "a.gltf").write_text(json.dumps(header | {"buffers": buffers}))
+    scene = pj.load_scene(tmp_path / "a.gltf", res=32)
+    with pytest.raises(pj.InputError, match=r"b_square\.ply: is read by the same command"):
+        pj.save_scene(scene, tmp_path / "b.xml")
+    assert len(pj.save_scene(scene, tmp_path / "c.xml")) == 8
 
 
 @pytest.mark.slow

@@ -37,6 +37,7 @@ class File:
     header: dict
     chunk: bytes | None  # the binary part of a GLB
     buffers: dict[int, bytes] = field(default_factory=dict)
+    beside: list[Path] = field(default_factory=list)  # other files that were read
 
     def refuse(self, what: str) -> InputError:
         return InputError(f"{self.path}: glTF with {what} is not supported; export plain triangles")
@@ -69,6 +70,7 @@ class File:
         found = next((file for name in names if (file := self.path.parent / name).is_file()), None)
         if found is None:
             raise InputError(f"{self.path}: {unquote(uri)[:200]}, which it names, is not beside it")
+        self.beside.append(found)
         return found.read_bytes()
 
     def image(self, number: int) -> bytes | None:

@@ -134,8 +134,6 @@ class _Reader:
             attributes["id"] = _string(name, place)
         if tag == "shape" and "mesh" in value:
             value = {key: each for key, each in value.items() if key != "mesh"} | _of_trimesh(value["mesh"], place)
-        if "bitmap" in value and "data" not in value:  # Mitsuba's name, of its own class of images
-            value = {"data" if key == "bitmap" else key: each for key, each in value.items()}
         element = Element(tag, attributes, place, 0)
         element.children = self.children(value, place)
         if tag not in ("shape", "texture"):  # their arrays are what they consist of; elsewhere they are images

@@ -38,9 +38,10 @@ def load(path: str | Path, sensor: int | str = 0, /, **parameters: object) -> d.
     """
     if Path(path).suffix.lower() not in bare.SUFFIXES:
         return _Loader(read(path, parameters)).description(str(path), sensor)
-    scene, notes = bare.scene(Path(path), parameters)
+    scene, notes, files = bare.scene(Path(path), parameters)
     loader = _Loader(dict_reader.read(scene, str(path)))
     loader.notes += notes
+    loader.document.found.update({Element("file", {}, str(path), 0): file for file in files})
     return loader.description(str(path), sensor)
 
 
