@@ -49,6 +49,7 @@ class _Scene:
         self.notes: dict[str, None] = {}  # each once
         self.made: dict[str, dict] = {}
         self.materials: dict[tuple[int | None, bool], str] = {}  # by number, and whether vertices have colours
+        self.emissions: dict[int | None, dict | None] = {}
         self.pictures: dict[int, np.ndarray] = {}
 
     def objects(self) -> tuple[dict[str, dict], list[str]]:
@@ -132,7 +133,9 @@ class _Scene:
             name = self.free(material.get("name") or "material")
             self.made[name], self.materials[kind] = self.bsdf(material, colored=colors is not None), name
         made["bsdf"] = {"type": "ref", "id": self.materials[kind]}
-        if (radiance := self.emission(material)) is not None:
+        if number not in self.emissions:
+            self.emissions[number] = self.emission(material)
+        if (radiance := self.emissions[number]) is not None:
             made["emitter"] = {"type": "area", "radiance": radiance}
         return made
 
@@ -192,7 +195,11 @@ class _Scene:
         texture = self.texture(material.get("emissiveTexture")) if factor.any() else None
         if texture is None:
             return _rgb(factor) if factor.any() else None
-        return texture.times(slice(0, 3), factor, raw=False) if texture.pixels[..., :3].any() else None
+        if not texture.pixels[..., :3].any():
+            return None
+        name = self.free(f"{material.get('name') or 'material'}_emission")
+        self.made[name] = texture.times(slice(0, 3), factor, raw=False)
+        return {"type": "ref", "id": name}
 
     # ---- textures
 

@@ -186,8 +186,13 @@ def test_what_glows_is_a_light(objects):
     file = Gltf({"emissiveFactor": [1, 0.5, 0], "extensions": strength})
     assert list(objects(file)[0]["square"]["emitter"]["radiance"]["value"]) == [4, 2, 0]
     file.header["materials"][0]["emissiveTexture"] = file.texture()
-    radiance = objects(file)[0]["square"]["emitter"]["radiance"]
-    np.testing.assert_allclose(radiance["data"], pj.images.srgb_to_linear(PIXELS[..., :3] / 255) * [4, 2, 0], rtol=1e-6)
+    file.header["nodes"].append({"mesh": 0})
+    file.header["scenes"] = [{"nodes": [0, 1]}]
+    made, _ = objects(file)
+    shared = {"type": "ref", "id": "material_emission"}
+    assert made["square"]["emitter"]["radiance"] == made["mesh"]["emitter"]["radiance"] == shared
+    linear = pj.images.srgb_to_linear(PIXELS[..., :3] / 255) * [4, 2, 0]
+    np.testing.assert_allclose(made["material_emission"]["data"], linear, rtol=1e-6)
     file.header["materials"][0]["emissiveTexture"] = file.texture(np.zeros((1, 1, 3), np.uint8))
     assert "emitter" not in objects(file)[0]["square"]
 
