@@ -14,6 +14,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
+from pathjax import textures
 from pathjax.core.math import at, dot, larger
 from pathjax.core.types import EmitterSample, Hit, Ray, Surface
 from pathjax.emitters.area import Area
@@ -25,9 +26,10 @@ from pathjax.emitters.point import Point
 from pathjax.emitters.selection import Choice, Lights, choice, choose
 from pathjax.emitters.spot import Spot
 from pathjax.errors import InputError
-from pathjax.kinds import Instance, Parameters, ordered
+from pathjax.kinds import Instance, Parameters, Table, ordered
 from pathjax.kinds import register as register_kind
 from pathjax.shapes import Geometry, Lamp, geometry, lamp_table
+from pathjax.textures import Textures
 
 __all__ = [
     "KINDS",
@@ -65,10 +67,11 @@ def register(name: str):
 
 def _fault(kind: type[Emitter]) -> str:
     declared = kind.declared.values()
-    if declared and not any(parameter.textured for parameter in declared):
+    if not declared:
+        return "declares nothing; declare a Color(..., textured=False)"
+    if kind.on_surfaces or not any(parameter.textured for parameter in declared):
         return ""
-    why = "declares a textured parameter, which lights cannot have" if declared else "declares nothing"
-    return f"{why}; declare a Color(..., textured=False)"
+    return "declares a textured parameter, which lights on surfaces alone can have; declare Color(..., textured=False)"
 
 
 def build(
@@ -86,15 +89,44 @@ def build(
     outside = ordered([each for each in emitters if each is not None and each not in of_shapes], KINDS)
     made, light, number = [], np.full(len(shapes.shape), -1, np.int32), 0
     for kind, instances in (*inside.items(), *sorted(outside.items(), key=lambda item: item[0].distant)):
-        table = kind.build(instances, dtype, (*path, len(made), "table"), parameters, None)
+        place = (*path, len(made))
+        covers, codes = _textures(instances, dtype, (*place, "textures"), parameters)
+        table = kind.build(instances, dtype, (*place, "table"), parameters, codes.get)
+        for key in kind.declared if codes else ():
+            table = _with_means(table, key, [instance.values[key] for instance in instances])
         shining = [lamp for lamp in lamps if emitters[lamp.shape].kind is kind]  # of kinds outside of shapes: nothing
         for lamp in shining:
             light[lamp.primitive : lamp.primitive + lamp.count] = number
             number += 1
         rows = {instance: row for row, instance in enumerate(instances)}
         row_of = np.asarray([rows[emitters[lamp.shape]] for lamp in shining], np.int32)
-        made.append(Lights(table, lamp_table(shining, dtype), row_of) if shining else Lights(table, None, None))
+        lamps_of = (lamp_table(shining, dtype), row_of) if shining else (None, None)
+        made.append(Lights(table, *lamps_of, covers))
     return tuple(made), replace(shapes, light=light)
+
+
+def _textures(instances: list[Instance], dtype, path: tuple, parameters: Parameters) -> tuple[Textures | None, dict]:
+    """Those of lights, and their codes. A texture has one place in a scene, by which its parameters are known."""
+    used = dict.fromkeys(v for each in instances for v in each.values.values() if isinstance(v, Instance))
+    own = Parameters()
+    made, codes = textures.build(list(used), dtype, path, own)
+    for parameter in own.known.keys() & parameters.known.keys():
+        raise InputError(f"{parameter} is of a texture of a bsdf and of a light; give each a texture of its own")
+    parameters.known.update(own.known)
+    return made, codes
+
+
+def _with_means(table: Table, key: str, values: list) -> Table:
+    """What lights are chosen by."""
+    column = table.column(key)
+    if column is None or column.texture is None:
+        return table
+    rows = [row if mean is None else mean for row, mean in zip(column.values, map(_mean, values), strict=True)]
+    return table.with_column(key, np.asarray(rows, column.values.dtype))
+
+
+def _mean(value) -> np.ndarray | None:
+    return value.kind.mean(value) if isinstance(value, Instance) else None
 
 
 def name(lights: Lights) -> str:
@@ -145,6 +177,8 @@ def even_lights(emitters: tuple[Lights, ...]) -> Lights | None:
                 f"the scene has a {name(lights)} emitter; patches hold the light of surfaces alone, the same in all "
                 "directions. Enclose it, or use pathjax.render"
             )
+        if lights.textures is not None:
+            raise InputError("the scene has a light with a texture; a patch has one radiance. Give it a constant one")
     if len(emitters) > 1:
         raise InputError("the scene has several kinds of emitters on surfaces; patches hold the light of one kind")
     return emitters[0] if emitters else None
@@ -177,6 +211,9 @@ def sample(
             if lights.kind.on_surfaces:
                 d, distance, n, pdf, primitive = geometry.sample_lamp(shapes, lights.lamps, light, ref, u, u_part)
                 front = dot(n, d) < 0
+                if lights.textures is not None:
+                    there = Hit(distance, primitive, jnp.int32(0))
+                    p = lights.parameters(light, geometry.surface(shapes, Ray(ref, d, distance, jnp.int32(-1)), there))
                 Le = jnp.where(front, lights.kind.emitted(p, d), 0)
                 pdf = jnp.where(front, pdf, 0) * probability
             elif not lights.kind.dirac:
@@ -209,7 +246,7 @@ def hit(
         def lit():
             light = number - first if first else number
             front = dot(surface.n, ray.d) < 0
-            Le = jnp.where(front, lights.kind.emitted(lights.parameters(light), ray.d), 0)
+            Le = jnp.where(front, lights.kind.emitted(lights.parameters(light, surface), ray.d), 0)
             pdf = geometry.lamp_density(shapes, lights.lamps, light, ray, hit, surface)
             return Le, larger(pdf, jnp.zeros_like(pdf)) * at(chosen.pdf, number)
 

@@ -1,4 +1,4 @@
-"""Surfaces that emit the same radiance from their front in all directions."""
+"""Surfaces that emit the same radiance from their front in all directions, or in all of each point."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pathjax.kinds import Color, Row
 
 
 class Area(SurfaceEmitter):
-    radiance = Color(1.0, bounds=(0, math.inf), textured=False, radiance=True)
+    radiance = Color(1.0, bounds=(0, math.inf), radiance=True)
     even = True
 
     @staticmethod

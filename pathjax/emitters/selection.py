@@ -11,10 +11,11 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from pathjax.core.math import at
-from pathjax.core.types import Number
+from pathjax.core.types import Number, Surface
 from pathjax.emitters.emitter import Background, Emitter
 from pathjax.kinds import Color, Row, Table
 from pathjax.shapes import Lamps
+from pathjax.textures import Textures
 
 
 @jax.tree_util.register_dataclass
@@ -25,6 +26,7 @@ class Lights:
     table: Table  # a row for each emitter of the file
     lamps: Lamps | None  # what shines, of kinds that stand inside shapes; None: each row is one light
     row: Int[Array, " R"] | None  # row of the table, of each lamp
+    textures: Textures | None = None  # in the place of parameters; None: there are none
 
     @property
     def kind(self) -> type[Emitter]:
@@ -41,9 +43,9 @@ class Lights:
     def left_to_bsdfs(self) -> bool:
         return issubclass(self.kind, Background) and self.kind.left_to_bsdfs
 
-    def parameters(self, light: Number) -> Row:
-        """Of the light of this number among those of this kind."""
-        return Row(self.table, light if self.row is None else at(self.row, light))
+    def parameters(self, light: Number, surface: Surface | None = None) -> Row:
+        """Of the light of this number among those of this kind; surface: where it is met, if it has textures."""
+        return Row(self.table, light if self.row is None else at(self.row, light), surface, self.textures)
 
     def power(self) -> Float[Array, " R"]:
         """`Emitter.power`, of surfaces times their area."""
@@ -59,7 +61,7 @@ class Lights:
 
 
 class AllRows:
-    """Parameters of all rows, as attributes (R, *shape)."""
+    """Parameters of all rows, as attributes (R, *shape); of a texture its mean."""
 
     def __init__(self, table: Table):
         self._table = table

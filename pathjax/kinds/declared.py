@@ -202,7 +202,7 @@ def _given_or_placed(fields, name):
 
 def _in_range(fields, name, texture, bounds):
     low, high = texture.kind.span(texture)
-    if not bounds[0] <= low <= high <= bounds[1]:  # also where one is NaN
-        above = f", above {bounds[1]:g}" if bounds[1] < math.inf else ""
-        raise fields.error(name, f"is a texture with values below {bounds[0]:g}{above} or NaN")
+    if not (bounds[0] <= low <= high <= bounds[1] and high < math.inf):  # also where one is NaN
+        above = f"above {bounds[1]:g}" if bounds[1] < math.inf else "inf"
+        raise fields.error(name, f"is a texture with values below {bounds[0]:g}, {above} or NaN")
     return texture

@@ -82,6 +82,10 @@ class Bitmap(Texture):
         return float(texture.values["texels"].min()), float(texture.values["texels"].max())
 
     @classmethod
+    def mean(cls, texture):
+        return texture.values["texels"].mean((0, 1), dtype=np.float64)
+
+    @classmethod
     def refused(cls, name):
         why = "whose texels are too many for one derivative each; name a constant or the colours of a checkerboard"
         return {name: f"{name} is a bitmap, {why}"}

@@ -32,6 +32,12 @@ class Texture(Kind):
         return float(np.min(colors)), float(np.max(colors))
 
     @classmethod
+    def mean(cls, texture: Instance) -> np.ndarray | None:
+        """(3,) colour by which a light that it covers is chosen among others; None: the texture cannot cover lights."""
+        colors = [texture.values[key] for key, declared in cls.declared.items() if isinstance(declared, Color)]
+        return np.mean([np.broadcast_to(color, 3) for color in colors], axis=0) if colors else None
+
+    @classmethod
     def refused(cls, name: str) -> dict[str, str]:
         """What is no parameter because this texture stands in its place, and why."""
         return {name: f"{name} is a texture; its parameters have names of their own (`pathjax info` lists them)"}

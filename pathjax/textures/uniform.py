@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from pathjax.core.types import Surface
@@ -28,3 +29,7 @@ class Uniform(Texture):
     @classmethod
     def span(cls, texture: Instance) -> tuple[float, float]:
         return (texture.values["value"],) * 2
+
+    @classmethod
+    def mean(cls, texture: Instance) -> np.ndarray:
+        return np.full(3, texture.values["value"])

@@ -545,7 +545,7 @@ def test_constant_emitters_stand_in_the_scene_in_any_number(read):
         ('<emitter type="constant"><float name="sampling_weight" value="-1"/></emitter>', "at least 0"),
         (shape('<emitter type="area"/>' * 2), "at most 1 <emitter>"),
         (shape('<emitter type="area"><rgb name="radiance" value="-1"/></emitter>'), "not be negative"),
-        (shape('<emitter type="area"><texture name="radiance" type="bitmap"/></emitter>'), "cannot be a <texture>"),
+        (shape('<emitter type="area"><texture name="radiance" type="bitmap"/></emitter>'), "needs <string name="),
         (shape('<emitter type="area"><rgb name="intensity" value="1"/></emitter>'), "it has: radiance"),
     ],
 )

@@ -1,0 +1,116 @@
+"""Lights that textures cover: against the same light cut into pieces, and against Mitsuba."""
+
+import numpy as np
+import pytest
+
+import pathjax as pj
+from pathjax import transport
+from pathjax.images import write_exr
+
+FLOOR = """<shape type="rectangle"><transform name="to_world"><rotate x="1" angle="-90"/><scale value="2"/></transform>
+  <bsdf type="diffuse" id="floor"><rgb name="reflectance" value="0.2, 0.5, 0.8"/></bsdf></shape>"""
+VIEW = {"origin": "0, 1, 4", "target": "0, 0.5, 0", "res": 8, "depth": 3}
+COLORS = np.array([[[5, 1, 0], [0, 2, 4]], [[0, 0, 0], [3, 3, 30]]], np.float32)
+
+
+def lamp(inside, x=0.0, z=0.0, half=1.0, name="lamp"):
+    """A square one above the floor that faces down; u grows with x, v with z."""
+    return f"""<shape type="rectangle" id="{name}"><transform name="to_world"><rotate x="1" angle="90"/>
+      <scale value="{half}"/><translate x="{x}" y="1.5" z="{z}"/></transform>{inside}</shape>"""
+
+
+def area(inside):
+    return f'<emitter type="area">{inside}</emitter>'
+
+
+CHECKS = """<texture type="checkerboard" name="radiance" id="checks"><rgb name="color0" value="1, 0.5, 0"/>
+  <rgb name="color1" value="0, 0.1, 0.9"/></texture>"""
+
+
+@pytest.fixture(scope="module")
+def picture(tmp_path_factory):
+    """A texture of four texels, without interpolation."""
+    file = tmp_path_factory.mktemp("pictures") / "four.exr"
+    write_exr(file, {channel: COLORS[..., k] for k, channel in enumerate("RGB")}, {})
+    return f"""<texture type="bitmap" name="radiance"><string name="filename" value="{file}"/>
+      <string name="filter_type" value="nearest"/></texture>"""
+
+
+def pieces():
+    """The same as four lamps of one colour each."""
+    colors = ((COLORS[j, i], i, j) for j in (0, 1) for i in (0, 1))
+    parts = []
+    for color, i, j in colors:
+        inside = area(f'<rgb name="radiance" value="{", ".join(map(str, color))}"/>')
+        parts.append(lamp(inside, i - 0.5, j - 0.5, 0.5, f"lamp{i}{j}"))
+    return "".join(parts)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("strategy", ["mis", "light"])
+def test_a_picture_shines_as_its_texels_do(make_scene, picture, estimate, agree, strategy):
+    whole, parts = make_scene(FLOOR + lamp(area(picture)), **VIEW), make_scene(FLOOR + pieces(), **VIEW)
+    agree(estimate(whole, 64, strategy=strategy), estimate(parts, 64, first_seed=90))
+
+
+def test_a_picture_is_seen_as_it_is(make_scene, picture):
+    """By the camera, from below."""
+    scene = make_scene(lamp(area(picture)), origin="0, 0, 0", target="0, 1, 0", up="0, 0, 1", fov=10, res=2, depth=1)
+    image = np.asarray(pj.render(scene, 16))
+    expected = {tuple(color) for color in COLORS.reshape(-1, 3).tolist()}
+    assert {tuple(color) for color in image.reshape(-1, 3).round(4).tolist()} == expected
+
+
+def test_lights_are_chosen_by_the_mean_of_what_covers_them(make_scene, picture):
+    both = lamp(area(picture)) + lamp(area('<rgb name="radiance" value="1, 1, 1"/>'), 5, name="other")
+    (lights,) = make_scene(FLOOR + both).emitters
+    power = COLORS.mean((0, 1)) @ [0.2126, 0.7152, 0.0722]
+    np.testing.assert_allclose(lights.power(), [4 * power, 4], rtol=1e-5)
+
+
+@pytest.mark.slow
+def test_images_are_linear_in_the_colours_of_a_light(make_scene):
+    scene = make_scene(FLOOR + lamp(area(CHECKS)), **VIEW)
+    names = ["checks.color0", "checks.color1"]
+    assert set(names) <= pj.parameters(scene).keys()
+    image, J = pj.jacobian(scene, names, 16)
+    values = pj.parameters(scene)
+    total = sum(np.asarray(J[name]) @ np.asarray(values[name]) for name in names)
+    np.testing.assert_allclose(total, image, rtol=1e-4, atol=1e-6)
+
+
+def test_what_cannot_cover_a_light_is_refused(make_scene, tmp_path):
+    shared = CHECKS.replace('name="radiance"', "")
+    floor = FLOOR.replace('<rgb name="reflectance" value="0.2, 0.5, 0.8"/>', '<ref name="reflectance" id="checks"/>')
+    with pytest.raises(pj.InputError, match="of a texture of a bsdf and of a light; give each a texture of its own"):
+        make_scene(shared + floor + lamp(area('<ref name="radiance" id="checks"/>')))
+    write_exr(tmp_path / "inf.exr", {channel: np.full((2, 2), np.inf, np.float32) for channel in "RGB"}, {})
+    inf = f"""<texture type="bitmap" name="radiance"><string name="filename" value="{tmp_path}/inf.exr"/></texture>"""
+    with pytest.raises(pj.InputError, match="values below 0, inf or NaN"):
+        make_scene(FLOOR + lamp(area(inf)))
+    attribute = '<texture type="mesh_attribute" name="radiance"><string name="name" value="vertex_color"/></texture>'
+    with pytest.raises(pj.InputError, match="without a mean over uv"):
+        make_scene(FLOOR + lamp(area(attribute)))
+    with pytest.raises(pj.InputError, match="a light with a texture; a patch has one radiance"):
+        transport.operator(make_scene(FLOOR + lamp(area(CHECKS))))
+
+
+@pytest.mark.slow
+def test_light_samples_find_what_bsdf_samples_do(make_scene, picture, estimate, agree):
+    """Of a cube, whose faces share one picture; Mitsuba samples one of its faces alone."""
+    scene = make_scene(FLOOR + lamp(area(picture), half=0.4).replace('"rectangle"', '"cube"'), **VIEW)
+    agree(estimate(scene, 256, strategy="bsdf"), estimate(scene, 256, strategy="light", first_seed=90))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["rectangle", "sphere"])
+def test_images_are_mitsubas(make_scene, write_scene, picture, estimate, estimate_type, agree, kind):
+    mi = pytest.importorskip("mitsuba")
+    mi.set_variant("scalar_rgb")
+    turned = '<transform name="to_uv"><rotate z="1" angle="30"/><scale x="2" y="3"/></transform></texture>'
+    light = lamp(area(picture.replace("</texture>", turned)), half=0.4).replace('"rectangle"', f'"{kind}"')
+    body = FLOOR + light
+    theirs = mi.load_file(str(write_scene(body, **VIEW)))
+    images = np.stack([np.array(mi.render(theirs, spp=128, seed=seed), float) for seed in range(16)])
+    theirs = estimate_type(images.mean(0), images.var(0, ddof=1) / len(images), len(images))
+    agree(estimate(make_scene(body, **VIEW), 128), theirs)
