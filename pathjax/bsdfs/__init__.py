@@ -31,7 +31,9 @@ from pathjax.bsdfs.null import Null
 from pathjax.bsdfs.plastic import Plastic
 from pathjax.bsdfs.principled import Principled
 from pathjax.bsdfs.roughconductor import RoughConductor
+from pathjax.bsdfs.roughdielectric import RoughDielectric
 from pathjax.bsdfs.roughplastic import RoughPlastic
+from pathjax.bsdfs.thindielectric import ThinDielectric
 from pathjax.bsdfs.twosided import TwoSided
 from pathjax.bsdfs.wrapper import Wrapper
 from pathjax.core.math import at
@@ -55,7 +57,9 @@ __all__ = [
     "Plastic",
     "Principled",
     "RoughConductor",
+    "RoughDielectric",
     "RoughPlastic",
+    "ThinDielectric",
     "TwoSided",
     "register",
 ]
@@ -66,6 +70,8 @@ KINDS: dict[str, type[BSDF]] = {
     "conductor": Conductor,
     "roughconductor": RoughConductor,
     "dielectric": Dielectric,
+    "thindielectric": ThinDielectric,
+    "roughdielectric": RoughDielectric,
     "plastic": Plastic,
     "null": Null,
     "roughplastic": RoughPlastic,

@@ -10,7 +10,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from pathjax.bsdfs import fresnel
-from pathjax.bsdfs.bsdf import BSDF
+from pathjax.bsdfs.interface import Interface
 from pathjax.bsdfs.ior import IOR
 from pathjax.core.math import larger, smaller
 from pathjax.core.types import BSDFSample
@@ -39,7 +39,7 @@ class IndexOfRefraction(Number):
         return value
 
 
-class Dielectric(BSDF):
+class Dielectric(Interface):
     """Smooth interface; `int_ior` lies on the side that the normal points away from."""
 
     int_ior = IndexOfRefraction(IOR["bk7"], moves_paths=True)
@@ -48,14 +48,7 @@ class Dielectric(BSDF):
     # derivatives; 0: this row chooses by its own. None, outside derivatives: all do.
     choose_by = Internal()
     fresnel = Setting("exact", options=tuple(REFLECTANCES))
-    delta = transmissive = sided = branches = True
-
-    @classmethod
-    def read(cls, loader, fields, name):
-        for lobe in ("specular_reflectance", "specular_transmittance"):
-            if (fields.color(lobe, np.ones(3)) != 1).any():
-                raise fields.error(lobe, "must be 1")
-        return super().read(loader, fields, name)
+    delta = branches = True
 
     @staticmethod
     def sample(p: Row, wi: Float[Array, "3"], u: Float[Array, " numbers"], other: bool = False) -> BSDFSample:
@@ -86,7 +79,7 @@ class Dielectric(BSDF):
         if choose_by is not None:
             share = jnp.where(reflect, r, 1 - r) / jnp.where(pdf > 0, pdf, 1)
             weight = weight * jnp.where(choose_by > 0, share, 1)
-        return BSDFSample(wo, jnp.broadcast_to(weight, (3,)), pdf, jnp.bool_(True), weight)
+        return BSDFSample(wo, Interface.tinted(p, weight, reflect), pdf, jnp.bool_(True), weight)
 
 
 def _frozen_choice(reflectance, cos_i, ratio, outside, r):

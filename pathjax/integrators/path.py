@@ -70,7 +70,8 @@ def vertices(path: Path) -> Int[Array, ""]:
 def start(scene: Scene, ray: Ray, options: Options) -> Path:
     """A path that has its camera ray."""
     one, zero3 = jnp.ones_like(ray.t_max), jnp.zeros_like(ray.o)
-    branches, passes = (bsdfs.occurs(scene.materials, each) for each in ("transmissive", "passes"))
+    transmits, passes = (bsdfs.occurs(scene.materials, each) for each in ("transmissive", "passes"))
+    splits = options.split_depth and bsdfs.occurs(scene.materials, "branches")
     path = Path(
         ray,
         Gain(zero3, zero3, jnp.int32(0) if passes else None) if options.by_vertex else zero3,
@@ -80,11 +81,11 @@ def start(scene: Scene, ray: Ray, options: Options) -> Path:
         scene.max_depth > 0,
         ray.o if passes else None,
         jnp.int32(0) if scene.free_passes else None,
-        one if branches else None,
+        one if transmits else None,
         jnp.int32(0) if options.watch_moving else None,
         jnp.zeros_like(one) if options.controlled else None,
     )
-    return splitting.start(path, options.split_depth) if options.split_depth and branches else path
+    return splitting.start(path, options.split_depth) if splits else path
 
 
 def extend(scene: Scene, choice: Choice | None, path: Path, u: Bounce, options: Options, control=None) -> Path:

@@ -176,7 +176,8 @@ class _TermSums:
                 )
         colors, options = tangents.places(wanted.values()), replace(self.options, derivative=bool(wanted))
         sums, by_color = _kernel(scene, *work, depth=self.depth, options=options, colors=colors)
-        return sums, {name: tangents.by_channel(by_color[:, :, place]) for place, name in enumerate(wanted)}
+        slopes = {name: by_color[:, :, place] for place, name in enumerate(wanted)}
+        return sums, {name: tangents.by_channel(s) if wanted[name].shape else s for name, s in slopes.items()}
 
 
 @partial(jax.jit, static_argnames=("depth", "options", "colors"))

@@ -7,8 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import pathjax as pj
 from pathjax import bsdfs, testing
-from pathjax.bsdfs import RoughConductor
+from pathjax.bsdfs import Dielectric, RoughConductor, RoughDielectric, ThinDielectric
 from pathjax.bsdfs.metals import METALS
 from pathjax.kinds import Parameters
 
@@ -88,6 +89,163 @@ def test_weights_of_small_roughnesses_are_right_in_float32(distribution, x64):
             # Of Beckmann's normals G1 is within 0.35 % of what the density holds.
             most = 1.0035 if distribution == "beckmann" else 1 + 1e-5
             assert (np.asarray(single.weight) >= 0).all() and (np.asarray(single.weight) <= most).all()
+
+
+GLASS = {"int_ior": 1.5, "ext_ior": 1.0}
+TINTS = {"specular_reflectance": np.array([0.5, 0.9, 1.0]), "specular_transmittance": np.array([1.0, 0.4, 0.7])}
+
+
+@pytest.mark.parametrize("distribution", ["ggx", "beckmann"])
+@pytest.mark.parametrize("values", [{"alpha": 0.3, **GLASS}, {**BRUSHED, "int_ior": 1.0, "ext_ior": 2.4}], ids=str)
+def test_values_and_densities_of_rough_glass_are_mitsubas(distribution, values, mitsuba_values):
+    """Reflected and refracted, from outside and from inside."""
+    values = {**values, **TINTS, "distribution": distribution}
+    wi, wo = pairs(400)
+    wi[::2, 2] *= -1
+    wo[::3, 2] *= -1
+    f, pdf = ours(RoughDielectric, values, wi, wo)
+    expected, density = mitsuba_values("roughdielectric", values, wi, wo)
+    np.testing.assert_allclose(f, expected, rtol=5e-4, atol=1e-7)
+    np.testing.assert_allclose(pdf, density, rtol=4e-3 if distribution == "beckmann" else 5e-4, atol=1e-7)
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        pytest.param({"alpha": 0.3, **GLASS}, marks=slow),
+        pytest.param({"alpha": 0.3, **TINTS, "int_ior": 1.33, "ext_ior": 2.4}, marks=slow),
+        pytest.param({**BRUSHED, "int_ior": 1.0, "ext_ior": 1.7}, marks=slow),
+    ],
+)
+def test_rough_glass_passes_the_checks_of_all_kinds(values):
+    testing.check_bsdf(RoughDielectric, samples=20_000, **values)
+
+
+@slow
+@pytest.mark.parametrize("values", [{"alpha": 0.3, **GLASS}, {**BRUSHED, "int_ior": 1.33, "ext_ior": 2.4}], ids=str)
+def test_rough_glass_of_ggx_passes_the_checks_but_for_derivatives_in_its_ior(values, monkeypatch):
+    """Its facets stand upright too: at grazing angles f ends at an edge, which differences see and samples do not, and
+    which the midpoint rule finds with more points."""
+    monkeypatch.setattr(testing, "POINTS", 60)
+    materials = testing.material(RoughDielectric, distribution="ggx", **values)
+    for wi in testing.directions(RoughDielectric):
+        testing.check_range(materials, wi)
+        testing.check_weights(materials, wi)
+        testing.check_furnace(materials, wi, 100_000, 1e-4)
+        testing.check_detached(materials, wi)
+        testing.check_chi_square(materials, wi, 100_000, 1e-4)
+
+
+def test_rough_glass_is_reciprocal_through_and_through():
+    """Radiance / n^2 is what is kept: f of one way, times n^2 of where it comes from, is that of the other way."""
+    values = {"alpha": 0.3, "distribution": "ggx", **GLASS}
+    wi, wo = pairs(300)
+    wo[:, 2] *= -1
+    there, back = ours(RoughDielectric, values, wi, wo)[0], ours(RoughDielectric, values, wo, wi)[0]
+    # wi is outside: n = 1; f carries the cosine of its second direction.
+    np.testing.assert_allclose(there / abs(wo[:, 2:]) * 1.5**2, back / abs(wi[:, 2:]), rtol=1e-3, atol=1e-6)
+
+
+@pytest.mark.parametrize("distribution", ["ggx", "beckmann"])
+def test_rough_glass_of_small_roughness_acts_as_smooth_glass(distribution):
+    """Of roughness 1e-3, from both sides, at the critical angle too: mean weights of either lobe."""
+    rough = testing.material(RoughDielectric, alpha=1e-3, distribution=distribution, **GLASS)
+    smooth = testing.material(Dielectric, **GLASS)
+    for wi in testing.directions(RoughDielectric):
+        means = []
+        for materials in (rough, smooth):
+            drawn = testing.sample(materials, wi, testing.random_numbers(materials, 20_000, 1))
+            reflected = np.asarray(drawn.wo)[:, 2] * wi[2] > 0
+            weight = np.asarray(drawn.weight, np.float64)[:, 0]
+            means.append([np.mean(weight * reflected), np.mean(weight * ~reflected)])
+        # Of 20,000 choices 4 standard deviations; the roughness changes angles by 1e-3, the reflectance by less.
+        np.testing.assert_allclose(*means, atol=4 * 0.5 / np.sqrt(20_000) * 2.25)
+
+
+def test_nothing_is_nan_between_nearly_equal_media():
+    for ior in (1.0, 1 + 1e-7, 1.001):
+        materials = testing.material(RoughDielectric, alpha=0.1, int_ior=ior, ext_ior=1.0)
+        for wi in testing.directions(RoughDielectric):
+            testing.check_range(materials, wi)
+
+
+def test_a_pane_reflects_between_its_faces_any_number_of_times():
+    """At normal incidence a slab lets 2 n / (n^2 + 1) through; from both sides, tinted, and going straight on."""
+    pane = testing.material(ThinDielectric, **TINTS, **GLASS)
+    u = testing.random_numbers(pane, 20_000, 1)
+    for z in (1.0, -1.0):
+        drawn = testing.sample(pane, np.array([0, 0, z], np.float32), u)
+        passed = np.asarray(drawn.wo)[:, 2] * z < 0
+        through = 2 * 1.5 / (1.5**2 + 1)
+        assert np.asarray(drawn.pdf)[passed][0] == pytest.approx(through, rel=1e-6)
+        assert passed.mean() == pytest.approx(through, abs=4 * np.sqrt(through * (1 - through) / len(u)))
+        np.testing.assert_allclose(np.asarray(drawn.weight)[passed][0], TINTS["specular_transmittance"], rtol=1e-6)
+        np.testing.assert_allclose(np.asarray(drawn.weight)[~passed][0], TINTS["specular_reflectance"], rtol=1e-6)
+    oblique = testing.directions(ThinDielectric)[1]
+    drawn = testing.sample(pane, oblique, u)
+    np.testing.assert_array_equal(np.unique(drawn.wo, axis=0), np.sort([-oblique, oblique * [-1, -1, 1]], axis=0))
+
+
+def test_thin_panes_pass_the_checks_of_all_kinds():
+    testing.check_bsdf(ThinDielectric, samples=20_000, **TINTS)
+
+
+def test_lobes_of_glass_have_their_colours_where_some_are_given():
+    plain, tinted = testing.material(Dielectric, **GLASS), testing.material(Dielectric, **GLASS, **TINTS)
+    assert plain.tables[0].column("specular_reflectance") is None
+    u = testing.random_numbers(plain, 1000, 1)
+    for wi in testing.directions(Dielectric):
+        a, b = (testing.sample(materials, wi, u) for materials in (plain, tinted))
+        reflected = (np.asarray(a.wo)[:, 2] * wi[2] > 0)[:, None]
+        tint = np.where(reflected, TINTS["specular_reflectance"], TINTS["specular_transmittance"])
+        np.testing.assert_allclose(b.weight, a.weight * tint, rtol=1e-6)
+        np.testing.assert_array_equal(b.passive, a.passive)
+
+
+def test_glass_without_colours_among_tinted_glass_has_ones():
+    glass = tables(Dielectric.instance("a", **GLASS), Dielectric.instance("b", **GLASS, **TINTS)).tables[0]
+    np.testing.assert_allclose(glass.column("specular_transmittance").values, [[1, 1, 1], [1, 0.4, 0.7]])
+
+
+SPLIT = """<scene version="3.0.0">
+  <sensor type="perspective">
+    <transform name="to_world"><lookat origin="0, 0, 4" target="0, 0, 0" up="0, 1, 0"/></transform>
+    <film type="hdrfilm"><integer name="width" value="8"/><integer name="height" value="8"/></film>
+  </sensor>
+  <shape type="sphere"><bsdf type="roughdielectric" id="it"/></shape>
+  <emitter type="constant" id="sky"/>
+</scene>"""
+
+
+def test_rough_glass_is_no_smooth_interface_to_splitting_and_derivatives(tmp_path):
+    """Nothing splits there, and its IOR is an ordinary parameter, which moves no paths."""
+    file = tmp_path / "scene.xml"
+    file.write_text(SPLIT)
+    scene = pj.load_scene(file)
+    programs = (jax.make_jaxpr(lambda s, n=n: pj.render(s, spp=4, split_depth=n))(scene) for n in (0, 2))
+    assert len(set(map(str, programs))) == 1
+    assert not any(parameter.moves_paths for parameter in scene.about.parameters.values())
+    assert "it.int_ior" in pj.parameters(scene) and "it.specular_reflectance" not in pj.parameters(scene)
+
+
+@slow
+@pytest.mark.parametrize(
+    ("scene", "name"),
+    [
+        ("rough_metals", "gold.alpha"),
+        ("rough_metals", "copper.alpha"),
+        ("rough_metals", "brushed.alpha_u"),
+        ("rough_glass", "frosted.alpha"),
+        ("rough_glass", "frosted.int_ior"),
+        ("rough_glass", "bubble.alpha"),
+        ("rough_glass", "bubble.int_ior"),
+        ("rough_glass", "pane.int_ior"),
+        ("rough_glass", "stained.specular_transmittance"),
+        ("rough_glass", "stained.int_ior"),
+    ],
+)
+def test_derivatives_are_those_of_images(shipped, scene, name):
+    assert pj.check_gradient(shipped(scene, res=16), name, spp=64).passed
 
 
 def tables(*instances):

@@ -395,7 +395,12 @@ def test_conductor_is_an_ideal_mirror_unless_told_otherwise(read):
         ("dielectric", '<float name="ext_ior" value="-1"/>', "must be above 0, is -1"),
         ("dielectric", '<string name="int_ior" value="1.5"/>', "use a number or one of vacuum"),
         ("dielectric", '<string name="int_ior" value="diamonds"/>', 'did you mean "diamond"?'),
-        ("dielectric", '<rgb name="specular_transmittance" value="0.9"/>', "must be 1"),
+        ("dielectric", '<rgb name="specular_transmittance" value="1.1"/>', "between 0 and 1"),
+        (
+            "roughdielectric",
+            '<float name="int_ior" value="1.5"/><float name="ext_ior" value="1.5"/>',
+            "must differ from",
+        ),
         ("conductor", '<string name="material" value="V_palic"/>', 'did you mean "V_palik"'),
         (
             "conductor",
@@ -673,7 +678,7 @@ def test_a_scene_needs_a_sensor(refused):
 
 def test_objects_that_nothing_uses_are_checked_and_noted(read, refused):
     assert any("is used by nothing" in note for note in read('<bsdf type="diffuse" id="spare"/>').notes)
-    assert "plastic" in refused('<bsdf type="plastic" id="spare"/>')
+    assert "hair" in refused('<bsdf type="hair" id="spare"/>')
 
 
 # --- what Mitsuba's plugins take, and no image depends on
@@ -819,7 +824,7 @@ def test_another_sensor_is_chosen_by_its_number_or_id(tmp_path, which):
     )
     (tmp_path / "scene.xml").write_text(f'<scene version="3.0.0">{views}</scene>')
     assert load(tmp_path / "scene.xml", which).camera.fov == 50
-    with pytest.raises(InputError, match=r'scene.xml: there is no sensor \'rihgt\'; use 0 to 1 or left, right; did'):
+    with pytest.raises(InputError, match=r"scene.xml: there is no sensor \'rihgt\'; use 0 to 1 or left, right; did"):
         load(tmp_path / "scene.xml", "rihgt")
     with pytest.raises(InputError, match="there is no sensor 2; use 0 to 1"):
         load(tmp_path / "scene.xml", 2)
