@@ -61,17 +61,10 @@ class Bitmap(Texture):
 
     @staticmethod
     def look_up(p: Row, uv: Float[Array, "2"], surface: Surface) -> Float[Array, "3"]:
-        size = p.size
-        vu = jnp.stack([uv[1], uv[0]])
-        # Texel centres lie at (i + 1/2) / size.
-        place = vu * size - jnp.where(p.nearest, 0, jnp.asarray(0.5, uv.dtype))
-        low = jnp.floor(place)
-        fraction = jnp.where(p.nearest, 0, place - low)
-        low = low.astype(jnp.int32)
+        index, fraction = _corners(p, uv)
 
         def texel(i, j):
-            y, x = _wrapped(low + jnp.array([i, j], jnp.int32), size, p.wrap)
-            return at(p.texels, p.first + y * size[1] + x)
+            return at(p.texels, index(i, j))
 
         top = texel(0, 0) * (1 - fraction[1]) + texel(0, 1) * fraction[1]
         bottom = texel(1, 0) * (1 - fraction[1]) + texel(1, 1) * fraction[1]
@@ -108,10 +101,33 @@ def texels_of(fields, data: np.ndarray, raw: bool) -> np.ndarray:
     return np.asarray(colors, np.float32)
 
 
-def _wrapped(index, size, wrap):
+def _corners(p, uv):
+    """Of the texels around a point: (0 or 1 down, 0 or 1 right) -> which of all; and where between them it lies (2,)."""
+    size = p.size
+    vu = jnp.stack([uv[1], uv[0]])
+    # Texel centres lie at (i + 1/2) / size.
+    place = vu * size - jnp.where(p.nearest, 0, jnp.asarray(0.5, uv.dtype))
+    low = jnp.floor(place)
+    fraction = jnp.where(p.nearest, 0, place - low)
+    corners = _wrapped(low, size, p.wrap), _wrapped(low + 1, size, p.wrap)
+
+    def index(i, j):
+        return p.first + corners[i][0] * size[1] + corners[j][1]
+
+    return index, fraction
+
+
+def _wrapped(low, size, wrap):
+    """Row and column (2,) int32 in the image; low: whole numbers, as floats, any."""
     size = jnp.maximum(size, 1)
-    repeat = jnp.mod(index, size)
-    twice = jnp.mod(index, 2 * size)
-    mirror = jnp.where(twice < size, twice, 2 * size - 1 - twice)
-    clamp = jnp.clip(index, 0, size - 1)
-    return jnp.where(wrap == 0, repeat, jnp.where(wrap == 1, mirror, clamp))
+    folded = _modulo(low, jnp.where(wrap == 1, 2 * size, size))
+    folded = jnp.where(folded < size, folded, 2 * size - 1 - folded)
+    return jnp.where(wrap == 2, jnp.clip(low.astype(jnp.int32), 0, size - 1), folded)
+
+
+def _modulo(a, b):
+    """a mod b, int32, of a whole a and b > 0, without division of integers, for which there is no SIMD."""
+    quotient = jnp.floor(a / b.astype(a.dtype)).astype(jnp.int32)
+    rest = a.astype(jnp.int32) - quotient * b  # the rounding of the quotient moves it by b, at most
+    rest = jnp.where(rest < 0, rest + b, rest)
+    return jnp.where(rest >= b, rest - b, rest)
