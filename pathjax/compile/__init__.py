@@ -1,8 +1,10 @@
 """How a function of one ray becomes a native kernel over millions, and what its code may say of that.
 
-- `native_map` runs a function of one item over all items, on all devices; `lanes/` is how, on CPUs.
+- `native_map` runs a function of one item over all items, on all devices; `lanes/` is how, on CPUs. `native_fold` is
+  the same for items that leave something in memory that they share.
 - `compute_once`, `one_by_one` and `persistent_loop` stand in code of one item. They change nothing of its results, only
-  what is computed when.
+  what is computed when. `together` changes the memory of a `native_fold`.
+- `linear` is a linear function with a transpose of its own.
 - `concurrently` calls one kernel several times at once.
 - `setup` prepares XLA. It runs here, so that importing pathjax is enough; `keep_kernels` is for programs.
 
@@ -13,8 +15,9 @@ from __future__ import annotations
 
 from pathjax.compile.cache import keep_kernels
 from pathjax.compile.jax_compat import is_symbolic_zero, is_traced
-from pathjax.compile.mapping import MANY_ITEMS, native_map
-from pathjax.compile.primitives import compute_once, one_by_one, persistent_loop
+from pathjax.compile.linear import linear
+from pathjax.compile.mapping import MANY_ITEMS, native_fold, native_map
+from pathjax.compile.primitives import compute_once, one_by_one, persistent_loop, together
 from pathjax.compile.promotion import usual_promotion
 from pathjax.compile.threads import calls_at_once, concurrently, devices_of_a_call
 from pathjax.compile.xla import native, setup
@@ -28,11 +31,14 @@ __all__ = [
     "is_symbolic_zero",
     "is_traced",
     "keep_kernels",
+    "linear",
     "native",
+    "native_fold",
     "native_map",
     "one_by_one",
     "persistent_loop",
     "setup",
+    "together",
     "usual_promotion",
 ]
 

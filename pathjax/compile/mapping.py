@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
+from functools import partial, reduce
 
 import jax
 import jax.numpy as jnp
@@ -21,6 +21,8 @@ from pathjax.compile.xla import native
 # that what they keep stays in the nearest caches. Few items would leave most of the lanes idle.
 _LANES, _FEW_LANES = 256, 64
 MANY_ITEMS = 2 * _LANES
+# Of a sum over items: so many for a part, so that few lanes wait for its last one; and bytes of the sums of all parts.
+ITEMS_OF_A_PART, MOST_PARTS, MOST_BYTES = 4096, 16, 1 << 26
 # Bytes of live values that one lane of a vmapped path keeps; sizes the chunks on an accelerator.
 _BYTES_PER_LANE = 4096
 _CHUNK_BYTES = 1 << 30
@@ -70,6 +72,57 @@ def native_map(f: Callable, xs, *shared, form: str | None = None, devices: int |
         return ys, jax.tree.map(lambda _: True, ys)
 
     return run(xs, *shared)
+
+
+@usual_promotion
+def native_fold(f: Callable, xs, *shared, start: Callable, finish: Callable, devices: int | None = None):
+    """What all items together leave in memory that they share (`together`), on all local devices.
+
+    Items are dealt to parts, whose number depends on theirs alone. Each part has a memory of its own and is done by one
+    device, and parts are added up in their order: so the sums are bitwise the same for every number of devices.
+
+    Args:
+        f: (x, *shared, memory) -> memory, of one item. An item of zeros leaves the memory as it is.
+        xs: pytree of arrays (N, ...), N > 0.
+        shared: pytrees that every item sees whole.
+        start: number of lanes -> memory before the first item.
+        finish: memory after the last item of a part -> pytree of arrays, which are added up.
+        devices: how many local devices to use; None: all.
+    """
+    count = jax.tree.leaves(xs)[0].shape[0]
+    devices = jax.local_devices()[:devices]
+    nbytes = sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(jax.eval_shape(lambda: finish(start(_LANES)))))
+    parts = min(MOST_PARTS, -(-count // ITEMS_OF_A_PART), max(1, MOST_BYTES // nbytes))
+    rounds = -(-parts // len(devices))
+    each = -(-count // parts)
+    width = _LANES if each >= MANY_ITEMS else _FEW_LANES
+
+    def deal(x):
+        """(N, ...) -> (devices, rounds, items, ...): item i belongs to part i % parts."""
+        x = jnp.pad(x, [(0, each * parts - count), *[(0, 0)] * (x.ndim - 1)])
+        x = x.reshape(each, parts, *x.shape[1:]).swapaxes(0, 1)
+        x = jnp.pad(x, [(0, rounds * len(devices) - parts), *[(0, 0)] * (x.ndim - 1)])
+        return x.reshape(len(devices), rounds, *x.shape[1:])
+
+    def part(xs, shared):
+        (memory,) = lanes(lambda *args: (f(*args),), width, memory=start(width))(xs, *shared)
+        return finish(memory)
+
+    def on_one_device(xs, *shared):
+        return lax.map(lambda xs: part(xs, shared), jax.tree.map(lambda x: x[0], xs))
+
+    if len(devices) == 1:
+        sums = on_one_device(jax.tree.map(deal, xs), *shared)
+    else:
+        spec = PartitionSpec("device")
+        sums = jax.shard_map(
+            on_one_device,
+            mesh=Mesh(np.array(devices), ("device",)),
+            in_specs=(spec, *(PartitionSpec() for _ in shared)),
+            out_specs=spec,
+            check_vma=False,
+        )(jax.tree.map(deal, xs), *shared)
+    return jax.tree.map(lambda x: reduce(jnp.add, [x[k] for k in range(parts)]), sums)
 
 
 def _map(f, xs, shared, form, devices):

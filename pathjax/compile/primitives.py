@@ -1,6 +1,6 @@
-"""What code of one item may say to `lanes`: three primitives, with all rules that JAX's transformations need.
+"""What code of one item may say to `lanes`: four primitives, with all rules that JAX's transformations need.
 
-They change no result, and outside of lanes they do next to nothing.
+Three change no result, and outside of lanes they do next to nothing. `together` changes what all items share.
 """
 
 from __future__ import annotations
@@ -19,6 +19,8 @@ compute_once_p.multiple_results = True
 one_by_one_p = Primitive("one_by_one")
 one_by_one_p.multiple_results = True
 persistent_test_p = Primitive("persistent_test")
+together_p = Primitive("together")
+together_p.multiple_results = True
 
 
 def compute_once(values):
@@ -61,6 +63,29 @@ def persistent_loop(test: Callable, body: Callable, state):
     begins an item, what stands after it when the lane is done with it, both for one lane alone: so both are short.
     """
     return lax.while_loop(lambda state: persistent_test_p.bind(jnp.asarray(test(state))), body, state)
+
+
+def together(f: Callable) -> Callable:
+    """f(memory, here, values) -> memory, called by one item as (memory, values), and by lanes once for all of them.
+
+    Memory is a pytree of arrays that items share, like a table to which each of them adds: the only thing by which one
+    item may leave anything to another. f gets the flags (W,) of the lanes that hold an item, and the values, numbers of
+    an item, as (W,) arrays. It stands in the body of a `persistent_loop` that carries the memory, and in no branch; see
+    `lanes`. Outside of lanes an item is the only lane.
+    """
+
+    def called(memory, values):
+        memory_leaves, memory_tree = jax.tree.flatten(memory)
+        leaves, tree = jax.tree.flatten(values)
+
+        def flat(memory, here, leaves):
+            new = f(jax.tree.unflatten(memory_tree, memory), here, jax.tree.unflatten(tree, leaves))
+            return jax.tree.leaves(new)
+
+        out = together_p.bind(*memory_leaves, *leaves, f=flat, shared=len(memory_leaves))
+        return jax.tree.unflatten(memory_tree, out)
+
+    return called
 
 
 # ---- compute_once ---------------------------------------------------------------------------------------------------
@@ -149,3 +174,16 @@ persistent_test_p.def_impl(jnp.asarray)
 persistent_test_p.def_abstract_eval(lambda goes_on: goes_on)
 mlir.register_lowering(persistent_test_p, lambda context, goes_on: [goes_on])
 batching.primitive_batchers[persistent_test_p] = lambda values, axes: (persistent_test_p.bind(*values), *axes)
+
+
+# ---- together -------------------------------------------------------------------------------------------------------
+
+
+def _alone(*inputs, f, shared):
+    return f(inputs[:shared], jnp.ones((1,), bool), [x[None] for x in inputs[shared:]])
+
+
+# Derivatives are made of it, and it has none.
+together_p.def_impl(_alone)
+together_p.def_abstract_eval(lambda *avals, f, shared: avals[:shared])
+mlir.register_lowering(together_p, mlir.lower_fun(_alone, multiple_results=True))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from jax import lax
 
-from pathjax.compile import mapping, native_map
+from pathjax.compile import mapping, native_fold, native_map, persistent_loop, together
 
 
 def collatz(n):
@@ -108,3 +108,49 @@ def test_branches_of_the_vectorised_form(differing):
     xs = jnp.arange(3.0)
     for a, b in zip(*(native_map(f, xs, 0, form=form, devices=1) for form in ("vmap", "loop")), strict=True):
         np.testing.assert_array_equal(a, b)
+
+
+# ---- what items add to memory that they share -----------------------------------------------------------------------
+
+
+def histogram(steps, numbers, table):
+    """Each item adds 1 / (k + 1) to the entry `number` after each of its steps k."""
+
+    def add(table, here, values):
+        k, number = values
+
+        def one(lane, table):
+            return table.at[number[lane]].add(jnp.where(here[lane], 1 / (k[lane] + 1), 0))
+
+        return lax.fori_loop(0, len(k), one, table)
+
+    def step(state):
+        k, table = state
+        return k + 1, together(add)(table, (k, numbers[k % 5]))
+
+    return persistent_loop(lambda state: state[0] != steps, step, (jnp.int32(0), table))[1]
+
+
+@pytest.mark.parametrize("count", [3, 1500])
+def test_items_share_memory(monkeypatch, count):
+    """Of every number of devices bitwise the same; lanes without an item add nothing."""
+    monkeypatch.setattr(mapping, "ITEMS_OF_A_PART", 400)
+    numbers = np.array([0, 3, 3, 1, 2], np.int32)
+    steps = np.random.default_rng(0).integers(0, 9, count).astype(np.int32)
+    expected = np.zeros(4)
+    for n in steps:
+        np.add.at(expected, numbers[np.arange(n) % 5], 1 / (np.arange(n) + 1))
+
+    def fold(devices):
+        start = lambda lanes: jnp.zeros(4)  # noqa: E731
+        return native_fold(histogram, steps, numbers, start=start, finish=lambda x: x, devices=devices)
+
+    results = [np.asarray(jax.jit(lambda devices=devices: fold(devices))()) for devices in range(1, MANY + 1)]
+    np.testing.assert_allclose(results[0], expected, rtol=1e-5)
+    for other in results[1:]:
+        np.testing.assert_array_equal(other, results[0])
+
+
+def test_one_item_alone_is_the_only_lane():
+    table = histogram(jnp.int32(3), jnp.array([0, 3, 3, 1, 2], jnp.int32), jnp.zeros(4))
+    np.testing.assert_allclose(table, [1, 0, 0, 1 / 2 + 1 / 3])

@@ -24,16 +24,22 @@ from pathjax.compile.lanes.scheduling import from_queue, in_groups
 __all__ = ["lanes"]
 
 
-def lanes(f: Callable, width: int) -> Callable:
+def lanes(f: Callable, width: int, memory=None) -> Callable:
     """f(x, *shared) of any number of items x, `width` at a time.
 
+    Args:
+        memory: of `together`, a pytree of arrays. f is then (x, *shared, memory) -> (y, memory), where its persistent
+            loop, which has no end that all items know, carries the memory.
     Returns:
-        function of xs, a pytree of arrays (N, ...), and of what all items share, to pytrees of arrays (N, ...).
+        function of xs, a pytree of arrays (N, ...), and of what all items share, to pytrees of arrays (N, ...), and to
+        the memory after all items, where there is one.
     Raises:
         ValueError: f holds two persistent loops.
     """
+    memories = len(jax.tree.leaves(memory))
 
     def run(xs, *shared):
+        shared = shared if memory is None else (*shared, memory)
         one = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), xs)
         program, out = jax.make_jaxpr(f, return_shape=True)(one, *shared)
         xs, shared = jax.tree.leaves(xs), jax.tree.leaves(shared)
@@ -44,10 +50,12 @@ def lanes(f: Callable, width: int) -> Callable:
         interpreter = Interpreter(width, never)
         differing = differing_in(program, [True] * len(xs) + [False] * len(shared))
         loop = find_persistent_loop(program, differing)
+        if memory is not None and loop is None:
+            raise ValueError("memory is carried by the persistent_loop of an item, and there is none")
         if loop is None:
             outputs = in_groups(interpreter, program, xs, shared)
         else:
-            outputs = from_queue(interpreter, program, xs, shared, loop, differing)
+            outputs = from_queue(interpreter, program, xs, shared, loop, differing, memories)
         return jax.tree.unflatten(jax.tree.structure(out), outputs)
 
     return run

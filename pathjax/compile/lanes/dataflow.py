@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from pathjax.compile.jax_compat import ClosedJaxpr, Literal, called_program, scan_parts, while_parts
-from pathjax.compile.primitives import persistent_test_p
+from pathjax.compile.primitives import persistent_test_p, together_p
 
 
 def variables(atoms) -> set:
@@ -35,7 +35,7 @@ def program_outputs_differ(program: ClosedJaxpr, inputs_differ: list[bool]) -> l
 
 
 def equation_outputs_differ(eqn, inputs_differ: list[bool]) -> list[bool]:
-    if not any(inputs_differ):
+    if not any(inputs_differ) or eqn.primitive is together_p:
         return [False] * len(eqn.outvars)
     match eqn.primitive.name:
         case "while":
@@ -52,12 +52,21 @@ def equation_outputs_differ(eqn, inputs_differ: list[bool]) -> list[bool]:
 
 def _while_outputs_differ(eqn, inputs_differ):
     test_consts, body_consts, carry = while_parts(eqn, inputs_differ)
+    memory = carried_memory(eqn)
 
     def step(carry):
         (goes_on,) = program_outputs_differ(eqn.params["cond_jaxpr"], test_consts + carry)
-        return [goes_on or d for d in program_outputs_differ(eqn.params["body_jaxpr"], body_consts + carry)]
+        results = program_outputs_differ(eqn.params["body_jaxpr"], body_consts + carry)
+        return [(goes_on and not is_memory) or d for d, is_memory in zip(results, memory, strict=True)]
 
     return _fixpoint(step, carry)
+
+
+def carried_memory(eqn) -> list[bool]:
+    """Of what a while loop carries, whether it is the memory of `together`, which lanes share."""
+    body = eqn.params["body_jaxpr"].jaxpr
+    changed = variables(v for e in body.eqns if e.primitive is together_p for v in e.outvars)
+    return [not isinstance(v, Literal) and v in changed for v in body.outvars]
 
 
 def _scan_outputs_differ(eqn, inputs_differ):

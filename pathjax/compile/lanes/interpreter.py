@@ -24,7 +24,7 @@ from pathjax.compile.lanes.columns import (
 )
 from pathjax.compile.lanes.dataflow import equation_outputs_differ, variables, variables_read_by
 from pathjax.compile.lanes.primitive_rules import COMPONENTWISE, RULES
-from pathjax.compile.primitives import compute_once_p, one_by_one_p
+from pathjax.compile.primitives import compute_once_p, one_by_one_p, together_p
 
 # Rows of a table from which lanes select what they want; gathering is faster from more.
 _FEW_ROWS = 8
@@ -37,6 +37,7 @@ class Interpreter:
         self.width, self.never = width, never
         # By id: what has been made to be computed once. JAX wants no tracer to outlive its function.
         self.computed: WeakValueDictionary = WeakValueDictionary()
+        self.occupied = None  # (W,) bool lanes that hold an item; None: all
         self.active = None  # (W,) bool lanes whose results are read; None: all. In the others they may be anything.
 
     def run(self, program: ClosedJaxpr, inputs) -> list:
@@ -83,6 +84,8 @@ class Interpreter:
             return self.materialize(inputs)
         if primitive is one_by_one_p:
             return self.one_by_one(eqn.params["program"], inputs)
+        if primitive is together_p:
+            return self.together(inputs, **eqn.params)
         called = called_program(eqn)
         if called is not None:
             return self.run(called, inputs)
@@ -171,6 +174,10 @@ class Interpreter:
 
         results = [jnp.zeros((self.width, *aval.shape), aval.dtype) for aval in program.out_avals]
         return list(map(split, flags.for_each_lane(flags.packed(active), act, results)))
+
+    def together(self, inputs, f, shared):
+        here = jnp.ones((self.width,), bool) if self.occupied is None else self.occupied
+        return f(inputs[:shared], here, [join(x, self.width) for x in inputs[shared:]])
 
     # ---- control flow -----------------------------------------------------------------------------------------------
 

@@ -29,13 +29,16 @@ def in_groups(interpreter: Interpreter, program, xs, shared):
     return [y.reshape(groups * width, *y.shape[2:])[:count] for y in lax.map(one_group, list(map(grouped, xs)))]
 
 
-def from_queue(interpreter: Interpreter, program, xs, shared, place, differ):
+def from_queue(interpreter: Interpreter, program, xs, shared, place, differ, memory=0):
     """The same where equation `place` of the program is a `persistent_loop`: a lane that leaves it begins another item.
 
     Args:
         differ: of `dataflow.differing_in`.
+        memory: how many of the last outputs are memory of `together`, carried by the loop, and returned as it is.
     """
     width, count, jaxpr = interpreter.width, len(xs[0]), program.jaxpr
+    first_memory = len(jaxpr.outvars) - memory
+    own_outputs, memory_outputs = jaxpr.outvars[:first_memory], jaxpr.outvars[first_memory:]
     before, loop, after = jaxpr.eqns[:place], jaxpr.eqns[place], jaxpr.eqns[place + 1 :]
     test_consts, body_consts, init = while_parts(loop, loop.invars)
 
@@ -88,7 +91,7 @@ def from_queue(interpreter: Interpreter, program, xs, shared, place, differ):
             interpreter.run_equations(after, ended)
             # A lane without an item writes what its next one, or the last, overwrites.
             row = jnp.minimum(entry(item, lane), following)
-            outputs = zip(results, read_all(ended, jaxpr.outvars), strict=True)
+            outputs = zip(results, read_all(ended, own_outputs), strict=True)
             return following + 1, [with_entry(result, value, row) for result, value in outputs]
 
         def begin_item(lane, state):
@@ -112,6 +115,7 @@ def from_queue(interpreter: Interpreter, program, xs, shared, place, differ):
         _, state = lax.while_loop(lambda state: flags.any_set(state[0]), refill, (idle(state), state))
         following, item, packed, results = state
         values = unpack(packed)
+        interpreter.occupied = item < count if memory else None
         carry = interpreter.run(loop.params["body_jaxpr"], read_all(values, [*body_consts, *loop.outvars]))
         values |= zip(loop.outvars, carry, strict=True)
         return following, item, interpreter.pack(read_all(values, kept), differing), results
@@ -120,8 +124,8 @@ def from_queue(interpreter: Interpreter, program, xs, shared, place, differ):
         split(jnp.broadcast_to(first[v], (width, *v.aval.shape))) if differs else first[v]
         for v, differs in zip(kept, differing, strict=True)
     ]
-    results = [jnp.zeros((count, *v.aval.shape), v.aval.dtype) for v in jaxpr.outvars]
+    results = [jnp.zeros((count, *v.aval.shape), v.aval.dtype) for v in own_outputs]
     state = jnp.int32(0), jnp.full((width,), count, jnp.int32), interpreter.pack(copies, differing), results
     # A number is taken by each lane at first, then for each item whose results are stored.
-    *_, results = lax.while_loop(lambda state: state[0] < count + width, trip, state)
-    return results
+    _, _, packed, results = lax.while_loop(lambda state: state[0] < count + width, trip, state)
+    return [*results, *read_all(unpack(packed), memory_outputs)]
