@@ -842,7 +842,7 @@ def test_wrong_arguments_are_refused(plane, names, how, message):
 
 
 def test_bitmaps_are_refused_by_name(stage):
-    with pytest.raises(pj.InputError, match="screen.reflectance is a bitmap"):
+    with pytest.raises(pj.InputError, match="screen.reflectance is a texture"):
         pj.jacobian(stage(), ["screen.reflectance"])
 
 

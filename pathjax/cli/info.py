@@ -7,6 +7,7 @@ import numpy as np
 from pathjax import bsdfs, emitters
 from pathjax.cli import DONE
 from pathjax.cli.inputs import load
+from pathjax.kinds.parameter import Parameter
 from pathjax.rendering import bounces
 from pathjax.scene.parameters import parameters
 from pathjax.scene.scene import UNBOUNDED, Scene
@@ -65,11 +66,17 @@ def scene_facts(scene: Scene) -> dict:
             for kind, tree in about.trees.items()
         },
         "parameters": {
-            name: {"value": np.asarray(value), "shape": value.shape, "bounds": about.parameters[name].bounds}
+            name: _parameter_facts(about.parameters[name], np.asarray(value))
             for name, value in parameters(scene).items()
         },
         "notes": [*description.notes, *([f"{dark}, so images are black"] if dark else [])],
     }
+
+
+def _parameter_facts(parameter: Parameter, value: np.ndarray) -> dict:
+    """Of a texture the mean stands for all numbers."""
+    known = {"mean": value.mean((0, 1))} if parameter.is_texture else {"value": value}
+    return known | {"shape": value.shape, "bounds": parameter.bounds}
 
 
 def tail_facts(scene: Scene, error: float) -> dict:
@@ -137,7 +144,9 @@ def text(facts: dict) -> str:
     lines.append("parameters" if facts["parameters"] else "parameters  none")
     for name, parameter in facts["parameters"].items():
         low, high = parameter["bounds"]
-        shown = ", ".join(f"{x:g}" for x in parameter["value"].ravel())
+        shown = ", ".join(f"{x:g}" for x in (parameter["mean"] if "mean" in parameter else parameter["value"]).ravel())
+        if "mean" in parameter:
+            shown = f"{parameter['shape'][0]} x {parameter['shape'][1]} texels, mean {shown}"
         lines.append(f"  {name:32} {shown:28} in [{low:g}, {high:g}]")
     lines += [f"note        {note}" for note in facts["notes"]]
     return "\n".join(lines)

@@ -90,7 +90,7 @@ def jacobian(
     Returns:
         image and Jacobian.
     Raises:
-        InputError: unknown name, method or strategy; spp, seed or step out of range.
+        InputError: unknown name, method or strategy; spp, seed or step out of range; a name of a texture.
     """
     if isinstance(names, str):
         raise InputError(f"names is a list of names; write [{names!r}]")
@@ -135,12 +135,13 @@ def pixel_jacobians(
         first_sample, spp, seed: each one number, or one of each pixel.
         how: `form` and `devices` of `native_map`.
     """
+    tangents.refuse_textures(wanted)
     attached = method == "attached"
     colors = [name for name, p in wanted.items() if attached or not p.moves_paths]
     rows = tuple(sorted({p.index[0] for p in wanted.values() if p.moves_paths}))
     glass = () if attached else rows
     if rows:
-        scene = rules.differentiated_once(scene)
+        scene = rules.differentiated_once(scene, "the IOR of smooth glass")
     if attached and rows:
         scene = choosing_by_present_iors(scene, rows)
     steps = ior_step.steps(scene, glass, step)

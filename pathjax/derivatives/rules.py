@@ -2,7 +2,8 @@
 
 An estimate E(theta) is differentiated by the Jacobian J that its own kernel makes beside it: the tangent of E is
 J d(theta). That is linear in d(theta), so JAX transposes it: `jax.jvp`, `jax.linearize`, `jax.jacfwd`, `jax.grad` and
-optimistix's solvers all work, and what they ask of the kernel is always the same.
+optimistix's solvers all work, and what they ask of the kernel is always the same. Of many numbers, as those of
+textures, J is never made: J v and J^T v come by kernels of their own, the transpose of each other.
 
 What d(theta) is, the scene says: `with_parameters` keeps traced values by name in `Scene.varied`, and puts them into
 the tables detached. A derivative that arrives by a table all the same was asked for by other means; it is that of all
@@ -18,7 +19,7 @@ from typing import Protocol, runtime_checkable
 import jax
 import jax.numpy as jnp
 
-from pathjax.compile import is_symbolic_zero, usual_promotion
+from pathjax.compile import is_symbolic_zero, linear, usual_promotion
 from pathjax.errors import InputError
 from pathjax.kinds.parameter import Parameter
 from pathjax.scene import parameters as named
@@ -37,6 +38,20 @@ class Estimator(Protocol):
         Raises:
             InputError: what it is not differentiated in.
         """
+
+    def matrix_free(self, scene: Scene, wanted: dict[str, Parameter]) -> set[str]:
+        """Names in which it is better differentiated by `push` and `pull` than by the Jacobian."""
+
+
+@runtime_checkable
+class MatrixFree(Estimator, Protocol):
+    """What is estimated, and differentiated without its Jacobian too."""
+
+    def push(self, scene: Scene, wanted: dict[str, Parameter], changes: dict[str, jax.Array], *work) -> jax.Array:
+        """J v of such names."""
+
+    def pull(self, scene: Scene, wanted: dict[str, Parameter], adjoint: jax.Array, *work) -> dict[str, jax.Array]:
+        """J^T v of such names."""
 
 
 def estimate(estimator: Estimator, scene: Scene, *work) -> jax.Array:
@@ -60,11 +75,30 @@ def _estimate_jvp(static, primals, tangents):
     changes = _changes(parameters, scene_tangent, varied_tangent)
     # Attached, for derivatives of the derivative.
     scene = named.with_values(scene, varied, parameters)
-    value, J = estimator.jacobian(scene, {name: parameters[name] for name in changes}, *work)
+    wanted = {name: parameters[name] for name in changes}
+    free = {name: wanted.pop(name) for name in sorted(estimator.matrix_free(scene, wanted))}
+    if free:
+        scene = differentiated_once(scene, "an image in a texture, or in more colours than a Jacobian has,")
+    value, J = estimator.jacobian(scene, wanted, *work) if wanted else (estimator.value(scene, *work), {})
     tangent = jnp.zeros_like(value)
-    for name, change in changes.items():
-        tangent = tangent + jnp.tensordot(J[name], change, change.ndim)
+    for name in wanted:
+        tangent = tangent + jnp.tensordot(J[name], changes[name], changes[name].ndim)
+    if free:
+        tangent = tangent + _moved(estimator, free, {name: changes[name] for name in free}, scene, work)
     return value, tangent
+
+
+def _moved(estimator: MatrixFree, free: dict[str, Parameter], changes: dict[str, jax.Array], scene: Scene, work):
+    """J v as a function whose transpose is J^T v."""
+    def there(known, changes):
+        scene, work = known
+        return estimator.push(scene, free, changes, *work)
+
+    def back(known, adjoint):
+        scene, work = known
+        return estimator.pull(scene, free, adjoint, *work)
+
+    return linear(there, back, (scene, work), changes)
 
 
 def _changes(parameters: Mapping[str, Parameter], scene_tangent, varied_tangent) -> dict[str, jax.Array]:
@@ -83,16 +117,16 @@ def _changes(parameters: Mapping[str, Parameter], scene_tangent, varied_tangent)
                 "lists them)"
             )
         for name, parameter in held.items():
-            changes[name] = changes.get(name, 0) + leaf[parameter.index]
+            changes[name] = changes.get(name, 0) + parameter.get(leaf)
     return {name: changes[name] for name in parameters if name in changes}
 
 
-@jax.custom_jvp
-def differentiated_once(scene):
-    """The scene; a derivative in it is refused."""
+@partial(jax.custom_jvp, nondiff_argnums=(1,))
+def differentiated_once(scene, where: str):
+    """The scene; a derivative in it is refused. where: what is differentiated, in words."""
     return scene
 
 
 @partial(differentiated_once.defjvp, symbolic_zeros=True)
-def _refuse(primals, tangents):
-    raise InputError("second derivatives are not supported where the IOR of smooth glass is differentiated")
+def _refuse(where, primals, tangents):
+    raise InputError(f"second derivatives are not supported where {where} is differentiated")

@@ -5,18 +5,29 @@ Light does not change its channel on the way, so one tangent stands for the thre
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from pathjax.errors import InputError
 from pathjax.kinds.parameter import Parameter
 from pathjax.scene import parameters as named
 from pathjax.scene.scene import Scene
 
 # Of each colour the path to its table and its index there.
 Places = tuple[tuple[tuple, tuple], ...]
+
+
+def refuse_textures(wanted: Mapping[str, Parameter]) -> None:
+    """Raises InputError: one of the parameters is a texture, whose entries are too many for a derivative each."""
+    for name, parameter in wanted.items():
+        if parameter.is_texture:
+            raise InputError(
+                f"{name} is a texture, whose numbers are too many for a derivative of each by itself; differentiate "
+                "`render` in it by jax.grad, jax.vjp or jax.jvp, which take them all at once"
+            )
 
 
 def places(parameters: Iterable[Parameter]) -> Places:
@@ -63,6 +74,18 @@ def by_tangent(
         return jax.jvp(varied, ([named.get(scene, path) for path in paths],), (tangents,), has_aux=True)
 
     return jax.vmap(push, out_axes=(None, 0, None))(tangents)
+
+
+def along(of: Callable, scene: Scene, paths: tuple, moved: list[Float[Array, "..."]]) -> Float[Array, "*shape"]:
+    """The derivative of `of(scene)` along a change of the arrays at these paths."""
+
+    def varied(arrays):
+        changed = scene
+        for path, array in zip(paths, arrays, strict=True):
+            changed = named.put(changed, path, array)
+        return of(changed)
+
+    return jax.jvp(varied, ([named.get(scene, path) for path in paths],), (moved,))[1]
 
 
 def _tables(colors: Places):

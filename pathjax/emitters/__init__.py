@@ -46,6 +46,7 @@ __all__ = [
     "Spot",
     "SurfaceEmitter",
     "choice",
+    "choose",
     "register",
 ]
 
@@ -163,6 +164,11 @@ def darkness(emitters: tuple[Lights, ...], smooth: bool) -> str | None:
         return None
     names = " and ".join(map(name, bright))
     return f"the {names} emitters shine on smooth glass and mirrors alone, which show no light without size"
+
+
+def backgrounds(emitters: tuple[Lights, ...]) -> list[int]:
+    """Places of those that are met where nothing is hit."""
+    return [place for place, lights in enumerate(emitters) if issubclass(lights.kind, Background)]
 
 
 def even_lights(emitters: tuple[Lights, ...]) -> Lights | None:

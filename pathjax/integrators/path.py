@@ -100,11 +100,31 @@ def extend(scene: Scene, choice: Choice | None, path: Path, u: Bounce, options: 
     Gradient: what is drawn is detached from albedos and radiances, so weights carry the derivative, unbiased. Where the
     IOR of glass moves the path, the derivative is that of the moving points (attached), and edges are missing from it.
     """
-    ray, first = path.ray, path.depth == 0
+    hit, here, u = meet(scene, path.ray, u, options)
+    return onward(scene, choice, path, hit, here, u, options, control)
+
+
+def meet(scene: Scene, ray: Ray, u: Bounce, options: Options) -> tuple[Hit, Vertex | None, Bounce]:
+    """What a ray meets, None in a scene without shapes; and u as it was."""
     hit = geometry.closest_hit(scene.geometry, ray)
     here = vertex(scene, ray, hit, u.leaf, options.derivative) if scene.geometry.tables else None
     # What many results share is computed once.
     u, here = compute_once((u, here))
+    return hit, here, u
+
+
+def onward(
+    scene: Scene,
+    choice: Choice | None,
+    path: Path,
+    hit: Hit,
+    here: Vertex | None,
+    u: Bounce,
+    options: Options,
+    control=None,
+) -> Path:
+    """`extend` of a path whose ray is known to meet `here`."""
+    ray, first = path.ray, path.depth == 0
     path = path._replace(L=_with_emission(path.L, emission(scene, choice, path, hit, here, options)))
     if scene.free_passes:
         free = bsdfs.has(scene.materials, here.kind, "passes")

@@ -99,6 +99,11 @@ def build(scene, target, names, start) -> Problem:
         holder = next((s for s in scenes if name in named.about(s).parameters), scenes[0])
         found[name] = named.find(holder, name)
         values[name] = named.parameters(holder)[name]
+        if found[name].is_texture:
+            raise InputError(
+                f"{name} is a texture, and fit takes no more unknowns than a Jacobian has columns; descend along the "
+                "gradient that jax.grad gives of a loss of `render` (`pathjax help derivatives` has ten lines that do)"
+            )
     for name, value in start.items():
         if name not in found:
             raise InputError(f"start names {name}, which is not fitted; fitted are {', '.join(names)}")

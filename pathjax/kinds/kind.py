@@ -81,7 +81,7 @@ class Kind:
             for place, (key, declared) in enumerate(cls.declared.items()):
                 name, value = f"{instance.name}.{key}", instance.values[key]
                 if isinstance(value, Instance):
-                    parameters.refused.update(value.kind.refused(name))
+                    parameters.enter_texture(name, value, declared)
                 elif value is not None and declared.listed:
                     where = (*path, "columns", place, "values"), (row,)
                     moves = declared.moves_paths

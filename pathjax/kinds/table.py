@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 
 import jax
 import numpy as np
@@ -18,6 +19,7 @@ from pathjax.core.types import Number, Surface
 class Column:
     values: Shaped[Array, "R ..."]  # of a row with a texture: not read
     texture: Int[Array, "R 2"] | None = None  # kind, -1 for none, and row of the texture; None: no row has one
+    nudge: Shaped[Array, "..."] | None = None  # added to what is looked up, for derivatives in it; None: nothing
 
 
 @jax.tree_util.register_dataclass
@@ -40,6 +42,13 @@ class Table:
         columns[self.kind.place(name)] = None if values is None else Column(values, texture)
         return Table(tuple(columns), self.kind, self.settings)
 
+    def nudged(self, nudges: Mapping[int, Array]) -> Table:
+        """The table to whose columns, by place, something is added as they are looked up."""
+        columns = list(self.columns)
+        for place, nudge in nudges.items():
+            columns[place] = replace(columns[place], nudge=nudge)
+        return replace(self, columns=tuple(columns))
+
     def with_setting(self, name: str, value: str) -> Table:
         return Table(self.columns, self.kind, tuple((dict(self.settings) | {name: value}).items()))
 
@@ -60,15 +69,15 @@ class Row:
         column = self._table.column(name)
         if column is None or kind.declared[name].shared:
             return column and column.values
-        constant = at(column.values, self._row)
-        if column.texture is None:
-            return constant
+        value = constant = at(column.values, self._row)
+        if column.texture is not None:
 
-        def look_up():
-            color = self._textures.look_up(at(column.texture, self._row), self._surface)
-            return color if constant.shape else luminance(color)
+            def look_up():
+                color = self._textures.look_up(at(column.texture, self._row), self._surface)
+                return color if constant.shape else luminance(color)
 
-        return lax.cond(at(column.texture, self._row, 0) >= 0, look_up, lambda: constant)
+            value = lax.cond(at(column.texture, self._row, 0) >= 0, look_up, lambda: constant)
+        return value if column.nudge is None else value + column.nudge
 
     def gradient(self, name: str) -> Float[Array, "2"]:
         """How a number changes with u and v of the surface."""

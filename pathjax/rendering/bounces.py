@@ -167,7 +167,11 @@ class _TermSums:
         sums, _ = _kernel(scene, pixels, first_sample, spp, seeds, depth=self.depth, options=self.options)
         return sums
 
+    def matrix_free(self, scene, wanted):
+        return set()
+
     def jacobian(self, scene, wanted, *work):
+        tangents.refuse_textures(wanted)
         for name, parameter in wanted.items():
             if parameter.moves_paths:
                 raise InputError(

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 from pathjax import emitters
 from pathjax.compile import native_map, usual_promotion
 from pathjax.core.types import Number
+from pathjax.derivatives import matrix_free
 from pathjax.derivatives.jacobian import pixel_jacobians
 from pathjax.derivatives.rules import estimate
 from pathjax.errors import InputError
@@ -19,6 +20,9 @@ from pathjax.integrators import pixel
 from pathjax.integrators.options import DEFAULTS, Options
 from pathjax.scene.scene import Scene
 from pathjax.sensors import film
+
+# Up to so many colours derivatives go through the Jacobian, which is made in one pass with the image.
+MOST_TANGENTS = 8
 
 
 @usual_promotion
@@ -104,6 +108,20 @@ class _PixelMeans:
         self.options.check_differentiable()
         image, derivatives, *_ = pixel_jacobians(scene, wanted, pixels, *numbers, self.options, **dict(self.how))
         return image, derivatives
+
+    def matrix_free(self, scene, wanted):
+        # More colours than a pass of the kernel bears tangents, and textures always.
+        swept = {name for name, parameter in wanted.items() if matrix_free.is_swept(scene, parameter)}
+        textures = {name for name, parameter in wanted.items() if parameter.is_texture}
+        return swept if len(swept) > MOST_TANGENTS else textures
+
+    def push(self, scene, wanted, changes, control, pixels, *numbers):
+        self.options.check_differentiable()
+        return matrix_free.push(scene, wanted, changes, pixels, *numbers, self.options, **dict(self.how))
+
+    def pull(self, scene, wanted, adjoint, control, pixels, *numbers):
+        self.options.check_differentiable()
+        return matrix_free.pull(scene, wanted, adjoint, pixels, *numbers, self.options, **dict(self.how))
 
 
 @partial(jax.jit, static_argnames=("options", "form", "devices"))

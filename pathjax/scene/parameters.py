@@ -23,7 +23,7 @@ from pathjax.scene.scene import Scene
 def parameters(scene: Scene) -> dict[str, jax.Array]:
     """Return all parameters of the scene by name, `ID.field`."""
     scene = attached(scene)
-    return {name: get(scene, p.path)[p.index] for name, p in about(scene).parameters.items()}
+    return {name: p.get(get(scene, p.path)) for name, p in about(scene).parameters.items()}
 
 
 @usual_promotion
@@ -54,8 +54,8 @@ def attached(scene: Scene) -> Scene:
 def with_values(scene: Scene, values: Mapping[str, jax.Array], parameters: Mapping[str, Parameter]) -> Scene:
     """The scene with values of parameters in its tables, unchecked."""
     for name, value in values.items():
-        path, index = parameters[name].path, parameters[name].index
-        scene = put(scene, path, get(scene, path).at[index].set(value))
+        parameter = parameters[name]
+        scene = put(scene, parameter.path, parameter.put(get(scene, parameter.path), value))
     for path in dict.fromkeys(parameters[name].table for name in values):
         table = get(scene, path)
         scene = put(scene, path, table.kind.derived(table))
@@ -95,12 +95,16 @@ def checked(name, value, parameter: Parameter, dtype):
         value = jnp.asarray(value, dtype)
         value = jnp.broadcast_to(value, parameter.shape)
     except (TypeError, ValueError):
+        if parameter.is_texture:
+            given = " x ".join(map(str, np.shape(value)))
+            raise InputError(f"{name} has the shape {parameter.shape}, and cannot be set to {given} numbers") from None
         wanted = f"{parameter.shape[0]} numbers" if parameter.shape else "one number"
         raise InputError(f"{name} takes {wanted}, not {value!r}") from None
     if not is_traced(value):
         low, high = parameter.bounds
         if not bool(jnp.all((value >= low) & (value <= high) & jnp.isfinite(value))):
-            raise InputError(f"{name} = {np.asarray(value).tolist()} lies outside its bounds [{low:g}, {high:g}]")
+            given = "a value" if parameter.is_texture else np.asarray(value).tolist()
+            raise InputError(f"{name} = {given} lies outside its bounds [{low:g}, {high:g}]")
     return value
 
 

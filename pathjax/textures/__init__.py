@@ -6,6 +6,7 @@ scene file may put a texture; of kinds that the scene does not hold nothing is c
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import jax
@@ -59,16 +60,46 @@ class Textures:
         def of(table):
             def look_up():
                 p = Row(table, jnp.maximum(code[1], 0))
-                m, uv = p.to_uv, surface.uv
-                if m is not None:
-                    uv = m[:, 0] * uv[0] + m[:, 1] * uv[1] + m[:, 2]
-                return table.kind.look_up(p, uv, surface)
+                return table.kind.look_up(p, _uv(p, surface), surface)
 
             return look_up
 
-        if len(self.tables) == 1:
-            return of(self.tables[0])()
-        return lax.switch(jnp.maximum(code[0], 0), [of(table) for table in self.tables])
+        return self._switch(code, [of(table) for table in self.tables])
+
+    def entries(
+        self, code: Int[Array, "2"], surface: Surface, first: Mapping[tuple[int, int], int]
+    ) -> tuple[tuple[Int[Array, ""], ...], tuple[Float[Array, ""], ...]]:
+        """Where the numbers that a colour is the sum of stand in a list of derivatives, and their shares.
+
+        first: by table and column, where its entries begin. Of columns that are not named there the share is 0.
+        """
+
+        def of(number, table):
+            def entries():
+                row = jnp.maximum(code[1], 0)
+                p, columns = Row(table, row), [column for each, column in first if each == number]
+                parts = table.kind.entries(p, _uv(p, surface), surface) if columns else []
+                found = [
+                    (first[number, table.kind.place(name)] + (row if entry is None else entry), share)
+                    for name, entry, share in parts
+                    if table.kind.place(name) in columns
+                ]
+                found += [(jnp.int32(0), jnp.zeros_like(surface.uv[0]))] * (most - len(found))
+                return tuple(zip(*found, strict=True))
+
+            return entries
+
+        most = max(table.kind.parts for table in self.tables)
+        return self._switch(code, [of(*each) for each in enumerate(self.tables)])
+
+    def _switch(self, code, calls):
+        """What the call of the texture's kind gives."""
+        return calls[0]() if len(calls) == 1 else lax.switch(jnp.maximum(code[0], 0), calls)
+
+
+def _uv(p: Row, surface: Surface) -> Float[Array, "2"]:
+    m, uv = p.to_uv, surface.uv
+    return uv if m is None else m[:, 0] * uv[0] + m[:, 1] * uv[1] + m[:, 2]
 
 
 def build(instances: list[Instance], dtype, path: tuple, parameters: Parameters) -> tuple[Textures | None, dict]:

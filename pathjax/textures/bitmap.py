@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import ClassVar
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from pathjax.core.math import at
 from pathjax.core.types import Surface
 from pathjax.images import read_rgb
 from pathjax.images.read import decoded
-from pathjax.kinds import Column, Instance, PerRow, Row, Shared, Table, Unused
+from pathjax.kinds import Column, Instance, Parameter, PerRow, Row, Shared, Table, Unused
 from pathjax.textures.texture import Texture
 
 WRAPS = ("repeat", "mirror", "clamp")
@@ -28,6 +29,7 @@ class Bitmap(Texture):
     size = PerRow()  # (2,) int32 height, width
     nearest = PerRow()  # () bool, no interpolation
     wrap = PerRow()  # () int32 into WRAPS
+    parts = 4
     unused: ClassVar[Mapping[str, Unused]] = {
         "accel": Unused("boolean"),
         "format": Unused("string", "texels have the precision of the scene", choices=("variant", "fp16", "auto")),
@@ -57,6 +59,10 @@ class Bitmap(Texture):
             "nearest": np.asarray([bool(nearest) for nearest in all_of("nearest")]),
             "wrap": np.asarray([WRAPS.index(wrap or "repeat") for wrap in all_of("wrap")], np.int32),
         }
+        where = (*path, "columns", cls.place("texels"), "values")
+        for instance, image, first in zip(instances, images, columns["first"].tolist(), strict=True):
+            rows = image.shape[0] * image.shape[1]
+            parameters.textures[instance] = Parameter(where, (first,), image.shape, (0, math.inf), rows=rows)
         return Table(tuple(Column(columns[key]) for key in cls.declared), cls)
 
     @staticmethod
@@ -70,6 +76,12 @@ class Bitmap(Texture):
         bottom = texel(1, 0) * (1 - fraction[1]) + texel(1, 1) * fraction[1]
         return top * (1 - fraction[0]) + bottom * fraction[0]
 
+    @staticmethod
+    def entries(p: Row, uv: Float[Array, "2"], surface: Surface) -> list[tuple[str, Int[Array, ""] | None, Array]]:
+        index, fraction = _corners(p, uv)
+        shares = [[1 - part, part] for part in fraction]
+        return [("texels", index(i, j), shares[0][i] * shares[1][j]) for i in (0, 1) for j in (0, 1)]
+
     @classmethod
     def span(cls, texture: Instance) -> tuple[float, float]:
         return float(texture.values["texels"].min()), float(texture.values["texels"].max())
@@ -77,11 +89,6 @@ class Bitmap(Texture):
     @classmethod
     def mean(cls, texture):
         return texture.values["texels"].mean((0, 1), dtype=np.float64)
-
-    @classmethod
-    def refused(cls, name):
-        why = "whose texels are too many for one derivative each; name a constant or the colours of a checkerboard"
-        return {name: f"{name} is a bitmap, {why}"}
 
 
 def _joined(arrays: list[np.ndarray]) -> np.ndarray:
@@ -102,7 +109,7 @@ def texels_of(fields, data: np.ndarray, raw: bool) -> np.ndarray:
 
 
 def _corners(p, uv):
-    """Of the texels around a point: (0 or 1 down, 0 or 1 right) -> which of all; and where between them it lies (2,)."""
+    """Of the texels around a point: (0 or 1 down, 0 or 1 right) -> which of all; and (2,) where it is between them."""
     size = p.size
     vu = jnp.stack([uv[1], uv[0]])
     # Texel centres lie at (i + 1/2) / size.

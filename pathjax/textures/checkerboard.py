@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from pathjax.core.types import Surface
 from pathjax.kinds import Color, Row
@@ -15,8 +15,19 @@ class Checkerboard(Texture):
 
     color0 = Color(0.4, textured=False)
     color1 = Color(0.2, textured=False)
+    parts = 2
 
     @staticmethod
     def look_up(p: Row, uv: Float[Array, "2"], surface: Surface) -> Float[Array, "3"]:
-        odd = uv - jnp.floor(uv) > 0.5
-        return jnp.where(odd[0] == odd[1], p.color0, p.color1)
+        return jnp.where(_first(uv), p.color0, p.color1)
+
+    @staticmethod
+    def entries(p: Row, uv: Float[Array, "2"], surface: Surface) -> list[tuple[str, Int[Array, ""] | None, Array]]:
+        first = _first(uv).astype(uv.dtype)
+        return [("color0", None, first), ("color1", None, 1 - first)]
+
+
+def _first(uv):
+    """Whether the square has the first colour."""
+    odd = uv - jnp.floor(uv) > 0.5
+    return odd[0] == odd[1]

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from typing import ClassVar
 
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from pathjax.core.types import Surface
 from pathjax.kinds import Color, Instance, Kind, Row, Transform2
@@ -19,11 +20,20 @@ class Texture(Kind):
     """
 
     to_uv = Transform2()
+    parts: ClassVar[int] = 0  # number of its `entries`; 0: it says none, and is differentiated forwards alone
 
     @staticmethod
     @abstractmethod
     def look_up(p: Row, uv: Float[Array, "2"], surface: Surface) -> Float[Array, "3"]:
         """Colour at a point, whose uv is that of the surface with `to_uv` applied."""
+
+    @staticmethod
+    def entries(p: Row, uv: Float[Array, "2"], surface: Surface) -> list[tuple[str, Int[Array, ""] | None, Array]]:
+        """Of which numbers `look_up` is the sum, for derivatives in them: a parameter, the entry, and its share ().
+
+        The entry is that in a `Shared` array; None: the row of the texture. There are as many as the kind has `parts`.
+        """
+        return []
 
     @classmethod
     def span(cls, texture: Instance) -> tuple[float, float]:

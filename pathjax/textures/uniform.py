@@ -6,7 +6,7 @@ import math
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from pathjax.core.types import Surface
 from pathjax.kinds import Instance, Number, Row
@@ -17,6 +17,7 @@ class Uniform(Texture):
     """One number, of all channels."""
 
     value = Number(bounds=(0, math.inf))
+    parts = 1
 
     @classmethod
     def read(cls, loader, fields, name):
@@ -25,6 +26,10 @@ class Uniform(Texture):
     @staticmethod
     def look_up(p: Row, uv: Float[Array, "2"], surface: Surface) -> Float[Array, "3"]:
         return jnp.stack([p.value] * 3)
+
+    @staticmethod
+    def entries(p: Row, uv: Float[Array, "2"], surface: Surface) -> list[tuple[str, Int[Array, ""] | None, Array]]:
+        return [("value", None, jnp.ones_like(uv[0]))]
 
     @classmethod
     def span(cls, texture: Instance) -> tuple[float, float]:

@@ -30,6 +30,8 @@ def moved(scene):
     """The scene with another value of each parameter."""
     about = scene.about.parameters
     inside = {name: np.clip(value * 0.75 + 0.1, *about[name].bounds) for name, value in pj.parameters(scene).items()}
+    # Texels are written as float32.
+    inside = {name: np.float32(value) if about[name].is_texture else value for name, value in inside.items()}
     return pj.with_parameters(scene, inside)
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 import os
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from xml.sax.saxutils import quoteattr
 
@@ -57,6 +57,7 @@ class _Writer:
         self.document, self.made, self.values = description.document, description.made, values
         self.path, self.sources = path, sources
         self.files: dict[Path, Callable[[], None]] = {}  # and what writes each
+        self.images = _changed_images(description.made.values(), values)
 
     def text(self, element: Element, depth: int = 0) -> str:
         """The element and what it holds as lines of XML."""
@@ -103,6 +104,8 @@ class _Writer:
         if isinstance(made, Instance):
             values = {key: self.values[f"{made.name}.{key}"] for key in self.different(made)}
             element = self.with_values(element, made, values) if values else element
+        if isinstance(made, Instance) and made in self.images:
+            return self.with_image(element, *self.images[made])
         if _has_arrays(element):
             names = [made.name if isinstance(made, Instance) else element.tag, element.attributes.get("name")]
             name = "_".join(filter(None, names))
@@ -125,14 +128,15 @@ class _Writer:
 
         Where the file sets them by other names, as a metal's by that of its material, it states all parameters instead.
         """
-        listed = {key: x for key, x in made.values.items() if f"{made.name}.{key}" in self.values}
+        constant = {key: x for key, x in made.values.items() if not isinstance(x, Instance)}
+        listed = {key: x for key, x in constant.items() if f"{made.name}.{key}" in self.values}
         every = listed | values
         known = made.kind.declared.keys() | made.kind.unused.keys() | {"to_world"}
         own = [child for child in element.children if child.attributes.get("name") in known or _is_object(child)]
         for children, stated in ((element.children, values), (own, every)):
             new = Element(element.tag, element.attributes, element.file, element.line)
             new.children = [child for child in children if child.attributes.get("name") not in stated]
-            new.children += [_value(key, x, element) for key, x in stated.items() if not isinstance(x, Instance)]
+            new.children += [_value(key, x, element) for key, x in stated.items()]
             if self.reads(new, made, every):
                 return new
         names = ", ".join(f"{made.name}.{key}" for key in values)
@@ -170,6 +174,14 @@ class _Writer:
         self.files[file] = lambda: write(file, data)
         return Element("string", {"name": "filename", "value": file.name}, child.file, child.line)
 
+    def with_image(self, element: Element, name: str, texels: np.ndarray) -> Element:
+        """The bitmap with other texels, in a file of its own."""
+        file = self.file(name, ".exr")
+        self.files[file] = lambda: _write_linear(file, texels)
+        children = [x for x in element.children if x.attributes.get("name") not in ("filename", "data")]
+        children.append(Element("string", {"name": "filename", "value": file.name}, element.file, element.line))
+        return Element(element.tag, element.attributes, element.file, element.line, children)
+
     def mesh(self, element: Element, shape: d.Shape) -> Element:
         """Of a mesh that Mitsuba reads from no file, or not in its format, the PLY that holds it in world space."""
         file, geometry = self.file(shape.name, ".ply"), shape.geometry
@@ -189,6 +201,18 @@ class _Writer:
             if made not in self.files:
                 check_writable(made, self.sources)
                 return made
+
+
+def _changed_images(made: Iterable[object], values: Mapping[str, np.ndarray]) -> dict[Instance, tuple[str, np.ndarray]]:
+    """Of textures that are parameters and have changed, by instance, the parameter's name and the texels."""
+    found = {}
+    for owner in made:
+        for key, texture in owner.values.items() if isinstance(owner, Instance) else ():
+            name = f"{owner.name}.{key}"
+            if isinstance(texture, Instance) and name in values:
+                if not np.array_equal(np.asarray(texture.values["texels"], values[name].dtype), values[name]):
+                    found[texture] = name, values[name]
+    return found
 
 
 def _has_arrays(element: Element) -> bool:

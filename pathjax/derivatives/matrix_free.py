@@ -1,0 +1,104 @@
+"""J v and J^T v of the means of pixels, without J: each at the price of about one image, whatever the size of v.
+
+J v is the tangent of a pixel's mean (`tangents`), J^T v comes by a recorded sweep (`record`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from pathjax import emitters
+from pathjax.compile import native_map, usual_promotion
+from pathjax.derivatives import places, record, tangents
+from pathjax.integrators import pixel
+from pathjax.integrators.options import Counts, Options
+from pathjax.kinds.parameter import Parameter
+from pathjax.scene import parameters as named
+from pathjax.scene.scene import Scene
+
+Changes = dict[str, Float[Array, "..."]]
+
+
+def is_swept(scene: Scene, parameter: Parameter) -> bool:
+    """Whether the recorded sweep finds the parameter at the vertices of paths."""
+    path = parameter.path
+    if parameter.moves_paths:
+        return False
+    for number, columns in enumerate(places.columns_of_textures(scene)):
+        if path in columns:
+            # A number that is textured is the luminance of the colours, which the sweep does not know of.
+            summed = scene.materials.textures.tables[number].kind.parts > 0
+            return parameter.is_texture or (summed and not _textured_numbers(scene))
+    for number, columns in enumerate(places.columns_of_lights(scene)):
+        if path in columns:
+            # A direction in which nothing is hit has the light of all backgrounds.
+            behind = emitters.backgrounds(scene.emitters)
+            return number not in behind or sum(scene.emitters[each].count for each in behind) == 1
+    return any(path in columns for columns in places.columns_of_bsdfs(scene))
+
+
+def _textured_numbers(scene: Scene) -> bool:
+    tables = *scene.materials.tables, *scene.materials.wrappers
+    columns = [column for table in tables for column in table.columns if column is not None]
+    return any(column.texture is not None and column.values.ndim == 1 for column in columns)
+
+
+@usual_promotion
+def push(
+    scene: Scene, wanted: Mapping[str, Parameter], changes: Changes, pixels, first_sample, spp, seed, options, **how
+) -> Float[Array, "N 3"]:
+    """J v. changes: of parameters, by name; the rest as for `jacobian.pixel_jacobians`."""
+    paths = _paths(wanted)
+    moved = [jnp.zeros_like(named.get(scene, path)) for path in paths]
+    for name, change in changes.items():
+        place = paths.index(wanted[name].path)
+        moved[place] = moved[place] + wanted[name].put(jnp.zeros_like(moved[place]), change)
+    numbers = pixel.numbers(pixels, first_sample, spp, seed)
+    return _pushed(scene, moved, pixels, *numbers, paths=paths, options=options, **how)
+
+
+@usual_promotion
+def pull(
+    scene: Scene,
+    wanted: Mapping[str, Parameter],
+    adjoint: Float[Array, "N 3"],
+    pixels: Int[Array, " N"],
+    first_sample: Counts,
+    spp: Counts,
+    seed: Counts,
+    options: Options,
+    devices: int | None = None,
+    **how,
+) -> Changes:
+    """J^T v: by name, of the parameter's shape. adjoint: v; the rest as for `push`."""
+    paths = _paths(wanted)
+    numbers = pixel.numbers(pixels, first_sample, spp, seed)
+    options = replace(options, derivative=True, by_vertex=True)
+    arrays = record.pullback(scene, adjoint, pixels, *numbers, paths=paths, options=options, devices=devices)
+    return {name: parameter.get(arrays[paths.index(parameter.path)]) for name, parameter in wanted.items()}
+
+
+def _paths(wanted):
+    return tuple(dict.fromkeys(parameter.path for parameter in wanted.values()))
+
+
+@partial(jax.jit, static_argnames=("paths", "options", "form", "devices"))
+def _pushed(scene, moved, pixels, first_sample, spp, seed, *, paths, options, form=None, devices=None):
+    scene = options.applied(scene)
+    choice = emitters.choice(scene.emitters, options.strategy)
+    options = replace(options, derivative=True)
+
+    def one_pixel(work, scene, choice, moved):
+        def mean(scene):
+            return pixel.mean(work, scene, choice, options=options)
+
+        return tangents.along(mean, scene, paths, moved)
+
+    work = pixels, first_sample, spp, seed
+    return native_map(one_pixel, work, scene, choice, moved, form=form, devices=devices)

@@ -1,0 +1,301 @@
+"""Reverse mode at the price of about one image, whatever the number of parameters: J^T v by a recorded sweep.
+
+A path's derivative has entries at the parameters of the vertices that it meets, and nowhere else. So each vertex is
+recorded as it is met, and when the path has ended its vertices are gone through again, the last one first:
+
+    R_{k-1} = Le_k + n_k + w_k R_k                     radiance that arrives at vertex k-1; behind the last vertex 0
+    dI/d theta = beta_k (dLe_k/d theta + dn_k/d theta + (dw_k/d theta) R_k)
+
+with Le what the path ends on and n the light sample, each with its share, w the weight of the bsdf sample over the
+survival of roulette, and beta the throughput before the vertex. Nothing is divided by a reflectance, so what is black
+keeps its derivative. Times the adjoint of the pixel these are added to a list of derivatives, at the entries that the
+vertex looked up (`places`). What directions and probabilities depend on is detached, as in all of pathjax.
+
+All lanes record at once, in one row of a ring of buffers, and are swept at once, every WINDOW trips: back from the last
+end of a path that they have recorded to the first vertex of a path that was swept before.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from pathjax import emitters
+from pathjax.compile import native_fold, persistent_loop, together
+from pathjax.core import sampler
+from pathjax.core.math import at
+from pathjax.derivatives import places
+from pathjax.emitters import Choice
+from pathjax.integrators import path, pixel
+from pathjax.integrators.options import Options
+from pathjax.integrators.random_numbers import Bounce, bounce_numbers
+from pathjax.scene.scene import Scene
+
+# Trips of the ring, a power of 2, and those between two sweeps. A path of more than the difference is not recorded
+# whole, and makes the derivatives NaN: one in 1e20, if roulette ends paths.
+RING, WINDOW = 1024, 32
+# Entries of a list that every lane sums up by itself.
+FEW = 8
+
+BEGINS, ENDS, HOLDS = 1, 2, 4
+
+
+class Slot(NamedTuple):
+    """What a vertex adds to the derivatives in one number that it looked up, times the adjoint and the throughput."""
+
+    places: tuple[Int[Array, ""], ...]  # of the number, in the list of derivatives
+    shares: tuple[Float[Array, ""], ...] | None  # of each place in the number; None: there is one place
+    now: Float[Array, "3"]  # d(Le + n)
+    later: Float[Array, "3"] | None  # dw, to be multiplied by R
+
+
+class Record(NamedTuple):
+    """What the sweep needs of a vertex."""
+
+    begins: Bool[Array, ""]  # the first of its path
+    ends: Bool[Array, ""]  # the last one
+    gathered: Float[Array, "3"]  # Le + n
+    weight: Float[Array, "3"]  # w
+    slots: list[Slot]
+
+
+# ---- recording ------------------------------------------------------------------------------------------------------
+
+
+def extend(
+    scene: Scene,
+    choice: Choice | None,
+    now: path.Path,
+    u: Bounce,
+    options: Options,
+    slots: places.Slots,
+    paths: places.Paths,
+    lights: places.LightPlaces,
+    scale: Float[Array, "3"],
+) -> tuple[path.Path, Record]:
+    """`path.extend` and the Record of the vertex, whose `begins` is not known here.
+
+    options: by vertex. scale: what derivatives are multiplied by.
+    """
+    hit, here, u = path.meet(scene, now.ray, u, options)
+
+    def varied(changes):
+        changed = places.nudged(scene, slots, changes[1:])
+        of = now._replace(throughput=now.throughput + changes[0])
+        on = path.onward(changed, choice, of, hit, here, u, options)
+        return (on.L.emission, on.L.light, on.throughput), on
+
+    count = slots.of_bsdfs + slots.of_lights
+    zeros = jnp.zeros((1 + count,), scale.dtype)
+    push = partial(jax.jvp, varied, (zeros,), has_aux=True)
+    _, (Le, n, w), on = jax.vmap(lambda change: push((change,)), out_axes=(None, 0, None))(jnp.eye(1 + count))
+    w = jnp.where(on.alive, w, 0)
+    found = []
+    for s in range(slots.of_bsdfs):
+        if here is not None:
+            entries = places.of_bsdf(scene, paths, slots, s, here)
+            found.append(Slot(*entries, scale * n[1 + s], scale * w[1 + s]))
+    for s in range(slots.of_lights):
+        k = 1 + slots.of_bsdfs + s
+        found.append(Slot((places.of_hit(scene, lights, s, hit),), None, scale * Le[k], None))
+        if choice is not None:
+            found.append(Slot((places.of_light_sample(choice, lights, s, u),), None, scale * n[k], None))
+    return on, Record(jnp.bool_(False), ~on.alive, Le[0] + n[0], w[0], found)
+
+
+def columns_of(record: Record) -> list:
+    """Its numbers, one after another, the two flags in one."""
+    flags = jnp.where(record.begins, BEGINS, 0) | jnp.where(record.ends, ENDS, 0)
+    numbers = [x for leaf in jax.tree.leaves(record._replace(begins=None, ends=None)) for x in jnp.ravel(leaf)]
+    return [flags, *numbers]
+
+
+# ---- the memory that lanes share ------------------------------------------------------------------------------------
+
+
+class Memory(NamedTuple):
+    total: list[Float[Array, " W"]] | Float[Array, "M 3"]  # of few entries, a column for each; or the list
+    clock: Int[Array, ""]  # trips
+    swept: Int[Array, ""]  # trips before the last sweep
+    lost: Int[Array, ""]  # 1: a path was longer than the ring
+    ring: list  # of each number of a Record, (RING, W)
+
+
+class Sweep(NamedTuple):
+    """What goes back through the ring, of each lane."""
+
+    back: Int[Array, ""]  # trips so far
+    goes_on: Bool[Array, ""]
+    complete: Int[Array, " W"]  # 1: has met the end of a path, so that it knows what arrives
+    stopped: Int[Array, " W"]  # 1: all that is older has been swept before
+    R: list[Float[Array, " W"]]
+    total: list[Float[Array, " W"]] | Float[Array, "M 3"]
+
+
+def start(scene: Scene, record: Record, entries: int, lanes: int) -> Memory:
+    """record: of shapes and dtypes."""
+    dtype = scene.camera.origin.dtype
+    few = entries <= FEW
+    total = [jnp.zeros((lanes,), dtype)] * (3 * entries) if few else jnp.zeros((entries, 3), dtype)
+    numbers = jax.eval_shape(columns_of, record)
+    zero = jnp.int32(0)
+    return Memory(total, zero, zero, zero, [jnp.zeros((RING, lanes), x.dtype) for x in numbers])
+
+
+def remember(structure: Record, memory: Memory, here: Bool[Array, " W"], columns: list) -> Memory:
+    """Record a vertex of every lane; now and then, sweep."""
+    flags, *numbers = columns
+    # A lane without an item records nothing that is whole.
+    columns = [jnp.where(here, flags | HOLDS, BEGINS | ENDS), *numbers]
+    row = memory.clock & (RING - 1)
+
+    def with_row(buffer, x):
+        return lax.dynamic_update_slice(buffer, x[None], (row, jnp.int32(0)), allow_negative_indices=False)
+
+    memory = memory._replace(clock=memory.clock + 1, ring=list(map(with_row, memory.ring, columns)))
+    due = memory.clock - memory.swept >= WINDOW
+    return sweep(structure, memory, due)
+
+
+def sweep(structure: Record, memory: Memory, due: Bool[Array, ""]) -> Memory:
+    """Add what all paths give that have ended since the last sweep, if it is due."""
+    window = jnp.where(due, memory.clock - memory.swept, 0)
+
+    def step(state: Sweep) -> Sweep:
+        row = (memory.clock - 1 - state.back) & (RING - 1)
+        flags, *numbers = [
+            lax.dynamic_index_in_dim(x, row, keepdims=False, allow_negative_indices=False) for x in memory.ring
+        ]
+        record = unflattened(structure, numbers)
+        begins, ends, holds = (flags & bit != 0 for bit in (BEGINS, ENDS, HOLDS))
+        complete = (state.complete != 0) | ends
+        here = complete & (state.stopped == 0) & holds
+        # What is not finite in one path stays out of the one before.
+        R = [jnp.where(ends, 0, x) for x in state.R]
+        total = state.total
+        for slot in record.slots:
+            change = slot.now if slot.later is None else [a + b * x for a, b, x in zip(*slot[2:], R, strict=True)]
+            total = add(total, slot, [jnp.where(here, x, 0) for x in change])
+        R = [n + w * x for n, w, x in zip(record.gathered, record.weight, R, strict=True)]
+        back = state.back + 1
+        stopped = (state.stopped != 0) | ((back >= window) & (begins | ~complete))
+        goes_on = (back < window) | ((back < RING) & ~all_set(stopped))
+        return Sweep(back, goes_on, complete.astype(jnp.int32), stopped.astype(jnp.int32), R, total)
+
+    nothing = jnp.zeros((memory.ring[0].shape[1],), jnp.int32)
+    zeros = [jnp.zeros(nothing.shape, structure.weight.dtype)] * 3
+    first = Sweep(jnp.int32(0), window > 0, nothing, nothing, zeros, memory.total)
+    last = lax.while_loop(lambda state: state.goes_on, step, first)
+    lost = memory.lost | jnp.where(due & ~all_set(last.stopped != 0), 1, 0)
+    return memory._replace(total=last.total, swept=jnp.where(due, memory.clock, memory.swept), lost=lost)
+
+
+def unflattened(structure: Record, numbers: list) -> Record:
+    """The Record whose numbers these are, each vector as a list."""
+    following = iter(numbers)
+
+    def taken(leaf):
+        return [next(following) for _ in range(leaf.size)] if leaf.shape else next(following)
+
+    return jax.tree.map(taken, structure._replace(begins=None, ends=None))
+
+
+def add(total, slot: Slot, change: list[Float[Array, " W"]]):
+    """The total to which each lane's change (3) is added."""
+    shares = slot.shares or (None,)
+    if isinstance(total, list):
+        for place, share in zip(slot.places, shares, strict=True):
+            part = change if share is None else [share * x for x in change]
+            total = [t + jnp.where(place == k // 3, part[k % 3], 0) for k, t in enumerate(total)]
+        return total
+
+    # XLA's own scatter would break the native kernel; a lane that adds nothing adds 0.
+    def one(lane, total):
+        x = jnp.stack([at(column, lane) for column in change])
+        for place, share in zip(slot.places, shares, strict=True):
+            k = at(place, lane)
+            new = at(total, k) + (x if share is None else at(share, lane) * x)
+            total = lax.dynamic_update_slice(total, new[None], (k, jnp.int32(0)), allow_negative_indices=False)
+        return total
+
+    return lax.fori_loop(0, len(change[0]), one, total)
+
+
+def all_set(flags: Bool[Array, " W"]) -> Bool[Array, ""]:
+    from pathjax.compile.lanes import flags as of_lanes
+
+    return ~of_lanes.any_set(of_lanes.packed(~flags))
+
+
+# ---- pixels ---------------------------------------------------------------------------------------------------------
+
+
+def pixel_sweep(work, scene: Scene, choice, lights, memory: Memory, *, options, slots, paths, structure) -> Memory:
+    """Add what the samples of a pixel give. work: the adjoint (3,) of its mean, and `pixel.Work`."""
+    adjoint, (pixel_number, first_sample, spp, seed) = work
+    stream = sampler.pixel_stream(seed, pixel_number)
+    adjoint = adjoint / jnp.maximum(spp, 1).astype(adjoint.dtype)
+
+    def step(state):
+        number, now, weight, memory = state
+        begins = ~now.alive
+        now, weight = pixel.begun(scene, pixel_number, stream, number, now, weight, options)
+        u = bounce_numbers(scene, stream, number, path.vertices(now), options.sampler)
+        now, record = extend(scene, choice, now, u, options, slots, paths, lights, weight * adjoint)
+        record = record._replace(begins=begins)
+        memory = together(partial(remember, structure))(memory, columns_of(record))
+        return number + jnp.where(now.alive, 0, 1).astype(number.dtype), now, weight, memory
+
+    state = first_sample, *pixel.no_path(scene, options), memory
+    return persistent_loop(lambda state: state[0] != first_sample + spp, step, state)[-1]
+
+
+def finish(structure: Record, memory: Memory) -> Float[Array, "M 3"]:
+    memory = sweep(structure, memory, jnp.bool_(True))
+    total = memory.total
+    if isinstance(total, list):
+        total = jnp.stack([jnp.sum(x) for x in total]).reshape(-1, 3)
+    return jnp.where(memory.lost != 0, jnp.nan, total)
+
+
+@partial(jax.jit, static_argnames=("paths", "options", "devices"))
+def pullback(scene: Scene, adjoint, pixels, first_sample, spp, seed, *, paths, options: Options, devices=None):
+    """J^T adjoint: of each of the arrays, its shape.
+
+    Args:
+        scene: without names.
+        adjoint: (N, 3) of the means of the pixels.
+        pixels, first_sample, spp, seed: (N,) each.
+        paths: of the arrays, which `places` knows.
+    """
+    scene = options.applied(scene)
+    choice = emitters.choice(scene.emitters, options.strategy)
+    slots = places.slots(scene, paths)
+    lights = places.of_lights(scene, choice, paths, slots)
+    first, entries = places.firsts(scene, paths)
+
+    def record(scene, choice, lights, x):
+        now, _ = pixel.camera_path(scene, jnp.int32(0), x, x, options)
+        u = bounce_numbers(scene, x, x, path.vertices(now), options.sampler)
+        return extend(scene, choice, now, u, options, slots, paths, lights, now.throughput)[1]
+
+    structure = jax.eval_shape(record, scene, choice, lights, jnp.uint32(0))
+    f = partial(pixel_sweep, options=options, slots=slots, paths=paths, structure=structure)
+    begin, end = partial(start, scene, structure, entries), partial(finish, structure)
+    work = adjoint, (pixels, first_sample, spp, seed)
+    total = native_fold(f, work, scene, choice, lights, start=begin, finish=end, devices=devices)
+    return [_shaped(total, place, array) for place, array in ((first[p], _array(scene, p)) for p in paths)]
+
+
+def _array(scene, path):
+    return places.named.get(scene, path)
+
+
+def _shaped(total, begins, array):
+    rows = total[begins : begins + len(array)]
+    return rows if array.ndim == 2 else rows.sum(1)

@@ -1,0 +1,214 @@
+"""J v and J^T v without J: against each other, entry by entry, and against the Jacobian."""
+
+import contextlib
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import pathjax as pj
+from pathjax.derivatives import matrix_free, record
+from pathjax.images import write_exr
+from pathjax.integrators.options import Options
+from pathjax.scene import parameters as named
+from pathjax.sensors.film import pixel_count
+
+NO_LIMIT = 1 << 30
+RES, SPP = 8, 4
+# Of float32 sums of some thousand numbers, over the sum of their sizes.
+ROUNDING = 3e-6
+
+
+def diffuse(name, inside):
+    return f'<bsdf type="diffuse" id="{name}">{inside}</bsdf>'
+
+
+def rgb(name, value):
+    return f'<rgb name="{name}" value="{value}"/>'
+
+
+def texture(file, filter_type="bilinear"):
+    return (
+        f'<texture type="bitmap" name="reflectance"><string name="filename" value="{file}"/>'
+        f'<boolean name="raw" value="true"/><string name="filter_type" value="{filter_type}"/></texture>'
+    )
+
+
+@pytest.fixture(scope="module")
+def picture(tmp_path_factory):
+    """(h, w) -> file of an image of random colours."""
+    folder = tmp_path_factory.mktemp("pictures")
+
+    def make(h, w):
+        numbers = np.random.default_rng(h * w).uniform(0.1, 0.9, (3, h, w)).astype(np.float32)
+        write_exr(folder / f"{h}x{w}.exr", dict(zip("RGB", numbers, strict=True)), {})
+        return folder / f"{h}x{w}.exr"
+
+    return make
+
+
+@pytest.fixture(scope="module")
+def room(make_scene, picture):
+    """All that a path may meet: bitmaps of both filters, squares, a constant, metal, glass, a lamp and the sky."""
+
+    def make(**how):
+        squares = (
+            '<texture type="checkerboard" id="squares" name="reflectance"><transform name="to_uv"><scale value="2"/>'
+            f"</transform>{rgb('color0', '0.2, 0.5, 0.7')}{rgb('color1', '0.9, 0.3, 0.1')}</texture>"
+        )
+        metal = f'<bsdf type="conductor" id="metal">{rgb("eta", "0.2, 0.9, 1.1")}{rgb("k", "3.9, 2.4, 2.1")}</bsdf>'
+        lamp = f'<emitter type="area" id="lamp">{rgb("radiance", "3, 2, 1")}</emitter>'
+
+        def shape(kind, transform, inside):
+            return f'<shape type="{kind}"><transform name="to_world">{transform}</transform>{inside}</shape>'
+
+        def ball(x, y, z, inside):
+            return shape("sphere", f'<scale value="0.6"/><translate x="{x}" y="{y}" z="{z}"/>', inside)
+
+        floor, side = diffuse("floor", texture(picture(2, 3))), diffuse("side", texture(picture(2, 1), "nearest"))
+        black = diffuse("black", rgb("reflectance", 0))
+        return make_scene(
+            shape("rectangle", '<rotate x="1" angle="-90"/><scale value="3"/>', floor)
+            + shape("rectangle", '<scale value="3"/><translate z="-2"/>', diffuse("wall", squares))
+            + shape("rectangle", '<rotate y="1" angle="90"/><scale value="3"/><translate x="-2"/>', side)
+            + shape("rectangle", '<rotate x="1" angle="90"/><translate y="3"/>', black + lamp)
+            + ball(-1, 0.6, 0, metal)
+            + ball(1, 0.6, -1, diffuse("ball", rgb("reflectance", "0, 0.5, 1")))
+            + ball(0.3, 0.6, 1, '<bsdf type="dielectric"/>')
+            + f'<emitter type="constant" id="sky">{rgb("radiance", "0.3, 0.4, 0.5")}</emitter>',
+            res=RES,
+            origin="0, 1.5, 5",
+            target="-0.4, 1, 0",
+            fov=60,
+            **how,
+        )
+
+    return make
+
+
+def parts(scene, spp=SPP, seed=3, strategy="mis", **how):
+    """Parameters that the sweep finds, and functions for J v and J^T v of them."""
+    pixels = jnp.arange(pixel_count(scene.film), dtype=jnp.int32)
+    wanted = {n: p for n, p in scene.about.parameters.items() if matrix_free.is_swept(scene, p)}
+    work = pixels, 0, spp, seed, Options(strategy)
+    bare = named.nameless(scene)
+    return (
+        wanted,
+        lambda changes: np.asarray(matrix_free.push(bare, wanted, changes, *work, **how), float),
+        lambda adjoint: matrix_free.pull(bare, wanted, adjoint, *work, **how),
+    )
+
+
+def assert_transposed(scene, **how):
+    """Every entry of J^T v, from tangents that move one entry of a parameter in all channels at a time."""
+    wanted, push, pull = parts(scene, **how)
+    v = np.random.default_rng(0).normal(size=(pixel_count(scene.film), 3)).astype(scene.camera.origin.dtype)
+    pulled = pull(jnp.asarray(v))
+    assert set(pulled) == set(wanted)
+    for name, p in wanted.items():
+        for entry in np.ndindex(p.shape[:-1]):
+            terms = push({name: jnp.zeros(p.shape, v.dtype).at[entry].set(1)}) * v
+            gap = np.abs(pulled[name][entry] - terms.sum(0))
+            assert (gap <= ROUNDING * np.abs(terms).sum(0)).all(), (name, entry, gap)
+    return pulled
+
+
+def limited(scene, depth, rr_depth):
+    return replace(scene, max_depth=jnp.int32(depth), rr_depth=jnp.int32(rr_depth))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("depth, rr_depth", [(3, NO_LIMIT), (20, NO_LIMIT), (NO_LIMIT, 5)])
+def test_a_sweep_is_the_transpose_of_tangents(room, depth, rr_depth):
+    scene = limited(room(), depth, rr_depth)
+    for reflectance in ([0, 0.5, 1], [1, 1, 0]):
+        pulled = assert_transposed(pj.with_parameters(scene, {"ball.reflectance": reflectance}))
+        assert all(np.abs(pulled[name]).max() > 0 for name in pulled if name != "black.reflectance")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("how", [{"strategy": "light"}, {"strategy": "bsdf"}, {"hide": "true"}, {"dtype": jnp.float64}])
+def test_strategies_hidden_lights_and_float64(room, x64, how):
+    strategy = how.pop("strategy", "mis")
+    with x64() if "dtype" in how else contextlib.nullcontext():
+        assert_transposed(limited(room(**how), 6, 3), strategy=strategy)
+
+
+@pytest.mark.slow
+def test_the_jacobian_is_the_same(room):
+    """Through the public ways in: one number of each pixel's derivative, by the mean over pixels."""
+    scene, names = limited(room(), 4, 2), ["ball.reflectance", "metal.k", "lamp.radiance"]
+    wanted, push, pull = parts(scene)
+    v = jnp.asarray(np.random.default_rng(1).normal(size=(RES * RES, 3)), jnp.float32)
+    _, J = pj.jacobian(scene, names, SPP, 3)
+    pulled = pull(v)
+    for name in names:
+        terms = np.asarray(J[name]).reshape(-1, 3, 3) * np.asarray(v)[..., None]
+        gap = np.abs(pulled[name] - terms.sum((0, 1)))
+        assert (gap <= ROUNDING * np.abs(terms).sum((0, 1))).all(), name
+
+
+@pytest.fixture(scope="module")
+def screen(make_scene, picture):
+    """A bitmap that fills the view, under radiance 1: a pixel is a share of its texels, sample by sample."""
+    inside = diffuse("screen", texture(picture(4, 4)))
+    return make_scene(
+        f'<shape type="rectangle">{inside}</shape><emitter type="constant"/>', res=RES, fov=28.0724869, depth=2
+    )
+
+
+NAME = "screen.reflectance"
+
+
+def image_of(scene):
+    return lambda texels: pj.render(pj.with_parameters(scene, {NAME: texels}), SPP, 3)
+
+
+def test_a_bitmap_is_a_parameter(screen):
+    texels = pj.parameters(screen)[NAME]
+    assert texels.shape == (4, 4, 3)
+    black = pj.with_parameters(screen, {NAME: 0})
+    assert not pj.parameters(black)[NAME].any() and not np.asarray(pj.render(black, 1)).any()
+    changed = texels.at[1, 2, 0].set(0.25)
+    np.testing.assert_array_equal(pj.parameters(pj.with_parameters(screen, {NAME: changed}))[NAME], changed)
+    for value, message in ((np.zeros((4, 3, 3)), r"\(4, 4, 3\), and cannot be set to 4 x 3 x 3"), (2, "outside its")):
+        with pytest.raises(pj.InputError, match=message):
+            pj.with_parameters(screen, {NAME: value})
+
+
+def test_transformations_of_a_linear_image(screen):
+    """I = J texels, for J v, J^T v and all that JAX makes of them, within jit."""
+    texels, image = pj.parameters(screen)[NAME], image_of(screen)
+    v = jnp.asarray(np.random.default_rng(2).normal(size=(RES, RES, 3)), jnp.float32)
+    value, linear = jax.linearize(image, texels)
+    np.testing.assert_allclose(linear(texels), value, rtol=1e-5)
+    np.testing.assert_array_equal(jax.jvp(image, (texels,), (texels,))[1], linear(texels))
+    pulled = jax.jit(jax.grad(lambda x: (image(x) * v).sum()))(texels)
+    sizes = np.abs(value * v).sum((0, 1))
+    assert (np.abs((pulled * texels).sum((0, 1)) - (value * v).sum((0, 1))) <= ROUNDING * sizes).all()
+    batch = jax.vmap(linear)(jnp.stack([texels, 2 * texels]))
+    np.testing.assert_allclose(batch, [value, 2 * value], rtol=1e-5)
+
+
+def test_what_takes_a_derivative_of_each_number_refuses_textures(screen):
+    with pytest.raises(pj.InputError, match=f"{NAME} is a texture"):
+        pj.jacobian(screen, [NAME], 1)
+    with pytest.raises(pj.InputError, match=f"{NAME} is a texture"):
+        pj.fit(screen, np.ones((RES, RES, 3)), [NAME])
+    with pytest.raises(pj.InputError, match="second derivatives are not"):
+        jax.hessian(lambda x: pj.render(pj.with_parameters(screen, {NAME: x}), 1).sum())(pj.parameters(screen)[NAME])
+
+
+@pytest.mark.slow
+def test_a_path_longer_than_the_ring_is_told(screen, monkeypatch):
+    """Rather nan than a derivative that lacks something."""
+    texels, image = pj.parameters(screen)[NAME], image_of(limited(screen, 5, NO_LIMIT))
+    monkeypatch.setattr(record, "RING", 2)
+    monkeypatch.setattr(record, "WINDOW", 1)
+    record.pullback.clear_cache()
+    try:
+        assert np.isnan(jax.grad(lambda x: image(x).sum())(texels)).all()
+    finally:
+        record.pullback.clear_cache()
