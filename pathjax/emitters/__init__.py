@@ -23,6 +23,7 @@ from pathjax.emitters.directional import Directional
 from pathjax.emitters.emitter import Background, DiracEmitter, Emitter, SurfaceEmitter
 from pathjax.emitters.envmap import Envmap
 from pathjax.emitters.point import Point
+from pathjax.emitters.projector import Projector
 from pathjax.emitters.selection import Choice, Lights, choice, choose
 from pathjax.emitters.spot import Spot
 from pathjax.errors import InputError
@@ -43,6 +44,7 @@ __all__ = [
     "Envmap",
     "Lights",
     "Point",
+    "Projector",
     "Spot",
     "SurfaceEmitter",
     "choice",
@@ -57,6 +59,7 @@ KINDS: dict[str, type[Emitter]] = {
     "envmap": Envmap,
     "point": Point,
     "spot": Spot,
+    "projector": Projector,
     "directional": Directional,
 }
 

@@ -10,7 +10,7 @@ from typing import ClassVar
 import numpy as np
 from jaxtyping import Array, Float
 
-from pathjax.kinds import Instance, Kind, Row, Unused
+from pathjax.kinds import Kind, Row, Unused
 
 
 class Emitter(Kind):
@@ -45,14 +45,6 @@ class SurfaceEmitter(Emitter):
 
     on_surfaces = True
     even: ClassVar[bool] = False  # its parameter `radiance` is all that it emits, in all directions
-
-    @classmethod
-    def read(cls, loader, fields, name):
-        instance = super().read(loader, fields, name)
-        for key, value in instance.values.items():
-            if isinstance(value, Instance) and value.kind.mean(value) is None:
-                raise fields.error(key, "is a texture without a mean over uv, by which lights are chosen; use a bitmap")
-        return instance
 
     @staticmethod
     @abstractmethod

@@ -67,7 +67,8 @@ class AllRows:
         self._table = table
 
     def __getattr__(self, name: str):
-        return self._table.column(name).values
+        column = self._table.column(name)
+        return None if column is None else column.values
 
 
 @jax.tree_util.register_dataclass

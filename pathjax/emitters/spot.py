@@ -3,14 +3,23 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from pathjax.core.math import cross, dot, larger, safe_atan2, safe_divide, safe_sqrt
+from pathjax.core.math import cross, dot, larger, luminance, safe_atan2, safe_divide, safe_sqrt
 from pathjax.emitters.point import Point
-from pathjax.kinds import Angle, Direction, Row
+from pathjax.kinds import Angle, Color, Direction, Rotation, Row
+
+
+@dataclass(frozen=True)
+class Cover(Color):
+    """A colour that light is multiplied by; white of rows that lack it."""
+
+    def standing_in(self):
+        return np.ones(self.shape)
 
 
 class Spot(Point):
@@ -18,14 +27,15 @@ class Spot(Point):
     `cutoff_angle`.
     """
 
+    texture = Cover(None, bounds=(0, math.inf), radiance=True)  # over the square around the cone, seen from the light
     cutoff_angle = Angle(20.0, bounds=(0, 180))
     beam_width = Angle(None)  # by default 3/4 of the cutoff angle
     direction = Direction()
+    to_world = Rotation(None)  # of the texture
 
     @classmethod
     def read(cls, loader, fields, name):
-        if fields.has("texture"):
-            raise fields.error("texture", "is not supported; without it the light is even within beam_width")
+        texture = cls.texture.read(loader, fields, "texture", name)
         intensity = cls.intensity.read(loader, fields, "intensity", name)
         cutoff = cls.cutoff_angle.read(loader, fields, "cutoff_angle", name)
         beam = fields.float("beam_width", None, at_least=0)
@@ -36,7 +46,11 @@ class Spot(Point):
         if not np.allclose(axes.T @ axes, np.eye(3), atol=2e-3):
             raise fields.error("to_world", "shears or scales unevenly, and its cone would not be round")
         placed = {"position": to_world[:3, 3], "direction": Direction.of(to_world[:3, 2])}
-        return cls.instance(name, intensity=intensity, cutoff_angle=cutoff, beam_width=beam, **placed)
+        if texture is not None:
+            if cutoff >= 90:
+                raise fields.error("cutoff_angle", f"must be below 90 where a texture covers the cone, is {cutoff:g}")
+            placed["to_world"] = axes
+        return cls.instance(name, intensity=intensity, texture=texture, cutoff_angle=cutoff, beam_width=beam, **placed)
 
     @classmethod
     def instance(cls, name="", **values):
@@ -54,7 +68,8 @@ class Spot(Point):
         # (1 - (sin c - sin b) / (c - b)) / 2. Written so, it would be 0 for narrow cones by rounding, and they would
         # never be chosen.
         share = jnp.sin(middle / 2) ** 2 + jnp.cos(middle) * (1 - jnp.sinc(half / math.pi)) / 2
-        return Point.power(p) * jnp.sqrt(share)
+        bright = Point.power(p) if p.texture is None else 4 * luminance(p.intensity * p.texture)
+        return bright * jnp.sqrt(share)
 
     @staticmethod
     def sample(p: Row, ref: Float[Array, "3"]) -> tuple[Float[Array, "3"], Float[Array, ""], Float[Array, "3"]]:
@@ -63,4 +78,9 @@ class Spot(Point):
         across = cross(axis, d)
         angle = safe_atan2(safe_sqrt(dot(across, across)), -dot(axis, d)) * (180 / math.pi)
         falloff = jnp.where(angle < beam, 1, larger(safe_divide(cutoff - angle, cutoff - beam), 0))
+        if p.to_world is not None:
+            x, y, z = -(d @ p.to_world)
+            # Beside the cone any texel will do.
+            scale = 0.5 * safe_divide(1, jnp.where(falloff > 0, z * jnp.tan(cutoff * (math.pi / 180)), 0))
+            irradiance = irradiance * p.on(jnp.stack([x, y]) * scale + jnp.asarray(0.5, d.dtype)).texture
         return d, distance, irradiance * falloff

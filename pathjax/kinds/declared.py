@@ -57,6 +57,8 @@ class Color(Declared):
 
     def read(self, loader, fields, name, owner):
         if self.textured and (made := loader.texture(fields, name, owner)) is not None:
+            if self.radiance and made.kind.mean(made) is None:
+                raise fields.error(name, "is a texture without a mean over uv, to choose among lights by; use a bitmap")
             return _in_range(fields, name, made, self.bounds)
         default = None if self.default is None else np.broadcast_to(np.asarray(self.default, float), 3)
         low, high = self.bounds

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from types import SimpleNamespace
 
 import jax
 import numpy as np
@@ -59,6 +60,10 @@ class Row:
     def __init__(self, table: Table, row: Number, surface: Surface | None = None, textures=None):
         """surface, textures: what `look_up` of a texture takes; not used where no row has one."""
         self._table, self._row, self._surface, self._textures = table, row, surface, textures
+
+    def on(self, uv: Float[Array, "2"]) -> Row:
+        """The same, with textures looked up at uv."""
+        return Row(self._table, self._row, SimpleNamespace(uv=uv), self._textures)
 
     def __getattr__(self, name: str):
         kind = self._table.kind

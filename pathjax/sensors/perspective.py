@@ -77,7 +77,7 @@ class Perspective(Sensor):
             raise fields.error("to_world", "scales or shears; a camera can be turned and moved only")
         lens = cls.read_lens(fields, far)
         offset = tuple(fields.float(f"principal_point_offset_{axis}", 0.0) for axis in "xy")
-        return cls(to_world, *_field_of_view(fields), near, far, offset, **lens)
+        return cls(to_world, *field_of_view(fields), near, far, offset, **lens)
 
     @staticmethod
     def read_lens(fields: Fields, far: float) -> dict[str, float]:
@@ -89,16 +89,7 @@ class Perspective(Sensor):
 
     def arrays(self, film: HDRFilm, dtype):
         """Of `PerspectiveCamera`."""
-        aspect = film.width / film.height
-        tan = math.tan(math.radians(self.fov) / 2)
-        tan_x = {
-            "x": tan,
-            "y": tan * aspect,
-            "diagonal": tan * aspect / math.hypot(aspect, 1),
-            "smaller": tan * max(aspect, 1),
-            "larger": tan * min(aspect, 1),
-        }[self.fov_axis]
-        half = np.array([tan_x, tan_x / aspect])
+        half = half_extent(self.fov, self.fov_axis, film.width / film.height)
         # The local x axis points to the left of the image.
         axes = self.to_world[:3, :3] / np.linalg.norm(self.to_world[:3, :3], axis=0)
         shift = 2 * half * np.array([-self.principal_point_offset[0], -self.principal_point_offset[1]])
@@ -106,7 +97,20 @@ class Perspective(Sensor):
         return [np.asarray(x, dtype) for x in numbers]
 
 
-def _field_of_view(fields: Fields) -> tuple[float, str]:
+def half_extent(fov: float, fov_axis: str, aspect: float) -> np.ndarray:
+    """(2,) half of width and height of what is seen at distance 1. aspect: width over height."""
+    tan = math.tan(math.radians(fov) / 2)
+    tan_x = {
+        "x": tan,
+        "y": tan * aspect,
+        "diagonal": tan * aspect / math.hypot(aspect, 1),
+        "smaller": tan * max(aspect, 1),
+        "larger": tan * min(aspect, 1),
+    }[fov_axis]
+    return np.array([tan_x, tan_x / aspect])
+
+
+def field_of_view(fields: Fields) -> tuple[float, str]:
     """Degrees, and the axis along which they are measured; a focal length is one of 35 mm film, 36 x 24 mm."""
     if fields.has("focal_length") and (fields.has("fov") or fields.has("fov_axis")):
         raise fields.error("focal_length", "excludes fov and fov_axis; give one or the other")

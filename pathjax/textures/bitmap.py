@@ -90,6 +90,10 @@ class Bitmap(Texture):
     def mean(cls, texture):
         return texture.values["texels"].mean((0, 1), dtype=np.float64)
 
+    @classmethod
+    def resolution(cls, texture):
+        return texture.values["texels"].shape[:2]
+
 
 def _joined(arrays: list[np.ndarray]) -> np.ndarray:
     """One after another; of one alone no copy is made, as it may be large."""

@@ -48,6 +48,11 @@ class Texture(Kind):
         return np.mean([np.broadcast_to(color, 3) for color in colors], axis=0) if colors else None
 
     @classmethod
+    def resolution(cls, texture: Instance) -> tuple[int, int]:
+        """Height and width in texels; 1, 1 of what has none."""
+        return 1, 1
+
+    @classmethod
     def refused(cls, name: str) -> dict[str, str]:
         """What is no parameter because this texture stands in its place, and why."""
         return {name: f"{name} is a texture; its parameters have names of their own (`pathjax info` lists them)"}

@@ -10,8 +10,9 @@ import pytest
 import pathjax as pj
 from pathjax import emitters, transport
 from pathjax.description.spectra import UNIFORM_RADIANCE
-from pathjax.emitters import Directional, Point, Spot
+from pathjax.emitters import Directional, Point, Projector, Spot
 from pathjax.emitters.selection import AllRows
+from pathjax.images import write_exr
 from pathjax.kinds import Parameters, Row
 
 # ---- one light, one point of a floor --------------------------------------------------------------------------------
@@ -144,6 +145,16 @@ def test_defaults_are_mitsubas(make_scene):
     np.testing.assert_allclose(found, 2 * UNIFORM_RADIANCE, rtol=1e-6)
 
 
+@pytest.mark.parametrize("at, lit", [((0, 0), 1), ((0.9, 0), 1), ((0, 0.9), 1), ((1.1, 0), 0), ((0, -1.1), 0)])
+def test_a_projector_lights_a_screen_evenly(make_scene, at, lit):
+    """It receives pi times `irradiance` over the square of the distance, wherever the picture falls."""
+    x, z = -2 * at[0], -2 * at[1]
+    above = lookat((x, 2, z), (x, 0, z), (0, 0, 1))
+    light = emitter("projector", color("irradiance", 1, 2, 3) + lens(90) + above)
+    found = rendered(make_scene(plate('<scale value="4"/>') + light, **VIEW))
+    np.testing.assert_allclose(found, lit * reflected(np.pi * np.array([1, 2, 3]) / 4), rtol=NEAR)
+
+
 # ---- shadows --------------------------------------------------------------------------------------------------------
 
 BULB = emitter("point", color("intensity", *INTENSITY) + vector("position", (0, 2, 0)))
@@ -182,7 +193,7 @@ def test_a_light_shines_off_the_wall_that_it_lies_in(make_scene):
 
 
 def test_at_the_light_itself_nothing_is_nan():
-    for kind in (Point, Spot):
+    for kind in (Point, Spot, Projector):
         p = Row(table(kind), 0)
         for ref in (np.zeros(3), np.array([0, 0, 1e-25]), np.array([0, 0, 3e18])):
             value, slopes = jax.jvp(lambda ref, p=p, kind=kind: kind.sample(p, ref), [jnp.float32(ref)], [jnp.ones(3)])
@@ -302,6 +313,23 @@ def mitsuba():
     return mi
 
 
+@pytest.fixture(scope="module")
+def pictures(tmp_path_factory):
+    """File of 4 x 6 texels."""
+    texels = np.random.default_rng(1).random((4, 6, 3), np.float32)
+    file = tmp_path_factory.mktemp("pictures") / "small.exr"
+    write_exr(file, {channel: texels[..., k] for k, channel in enumerate("RGB")}, {})
+    return file
+
+
+def picture(name):
+    return f'<texture type="bitmap" name="{name}"><string name="filename" value="PICTURE"/></texture>'
+
+
+def lens(fov, axis="x"):
+    return f'<float name="fov" value="{fov}"/><string name="fov_axis" value="{axis}"/>'
+
+
 TURNED = lookat((0.3, 1, -0.4), (-1, 0.2, 0.5))
 
 
@@ -317,19 +345,27 @@ TURNED = lookat((0.3, 1, -0.4), (-1, 0.2, 0.5))
         (Spot, placed('<scale x="3" y="3" z="-3"/>', '<translate z="1"/>') + cone(80)),
         (Directional, vector("direction", (1, -2, 3)) + color("irradiance", 3, 2, 1)),
         (Directional, TURNED),
+        (Spot, TURNED + cone(60, 10) + color("intensity", 3, 2, 1) + picture("texture")),
+        (Spot, placed('<scale x="-1"/>', '<rotate y="1" angle="40"/>') + cone(80) + picture("texture")),
+        (Projector, TURNED + lens(fov=100)),
+        (Projector, TURNED + lens(fov=80) + picture("irradiance") + '<float name="scale" value="3"/>'),
+        (Projector, placed('<rotate y="1" angle="200"/>') + lens(fov=100, axis="y") + picture("irradiance")),
+        (Projector, picture("irradiance") + '<string name="focal_length" value="12mm"/>'),
     ],
 )
-def test_what_arrives_is_what_mitsuba_says(make_scene, mitsuba, kind, inside):
+def test_what_arrives_is_what_mitsuba_says(make_scene, mitsuba, pictures, kind, inside):
     name = next(name for name, each in emitters.KINDS.items() if each is kind)
-    text = emitter(name, inside)
+    text = emitter(name, inside.replace("PICTURE", str(pictures)))
     scene = make_scene(FLOOR + text)
     theirs = mitsuba.load_string(f'<scene version="3.0.0">{FLOOR}{text}</scene>').emitters()[0]
-    p = Row(scene.emitters[0].table, 0)
-    for ref in np.random.default_rng(3).normal(size=(50, 3)):
+    (lights,) = scene.emitters
+    refs = np.random.default_rng(3).normal(size=(50, 3))
+    ours = jax.jit(lambda lights, refs: jax.vmap(lambda ref: kind.sample(lights.parameters(0), ref))(refs))
+    ours = map(np.asarray, ours(lights, jnp.asarray(refs, jnp.float32)))
+    for ref, d, distance, arriving in zip(refs, *ours, strict=True):
         at = mitsuba.SurfaceInteraction3f()
         at.p = list(ref)
         drawn, irradiance = theirs.sample_direction(at, [0.5, 0.5])
-        d, distance, arriving = kind.sample(p, jnp.asarray(ref, jnp.float32))
         np.testing.assert_allclose(d, np.array(drawn.d), atol=1e-6)
         np.testing.assert_allclose(arriving, np.array(irradiance), rtol=1e-4, atol=1e-5)
         assert np.isinf(distance) if kind.distant else np.isclose(distance, drawn.dist, rtol=1e-3)
@@ -352,9 +388,13 @@ def test_what_arrives_is_what_mitsuba_says(make_scene, mitsuba, kind, inside):
         (emitter("spot", cone(0)), "must be above 0 and below 180, is 0"),
         (emitter("spot", cone(None, 25)), "must not exceed cutoff_angle, 20; is 25"),
         (emitter("spot", cone(None, -1)), "must be at least 0, is -1"),
-        (emitter("spot", vector("position", (0, 1, 0))), "it has: intensity, cutoff_angle, beam_width, to_world"),
+        (emitter("spot", vector("position", (0, 1, 0))), "it has: texture, intensity, cutoff_angle, beam"),
         (emitter("spot", placed('<scale x="2"/>')), "scales unevenly"),
-        (emitter("spot", '<texture name="texture" type="bitmap"/>'), '"texture" of .* is not supported'),
+        (emitter("spot", cone(90) + '<rgb name="texture" value="1"/>'), "must be below 90 where a texture covers"),
+        (emitter("projector", placed('<scale value="2"/>')), "scales or shears"),
+        (emitter("projector", lens(180)), "above 0 and below 180"),
+        (emitter("projector", color("irradiance", 1, -1, 1)), "must not be negative"),
+        (emitter("projector", '<float name="scale" value="-1"/>'), "at least 0"),
         (emitter("spot", '<texture name="intensity" type="bitmap"/>'), "cannot be a <texture>"),
         (plate(inside=emitter("point")), "shines from no surface; it stands directly in <scene>"),
     ],

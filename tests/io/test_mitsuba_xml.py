@@ -540,12 +540,12 @@ def test_constant_emitters_stand_in_the_scene_in_any_number(read):
 @pytest.mark.parametrize(
     ("body", "words"),
     [
-        ('<emitter type="projector"/>', '<emitter type="projector"> is not supported yet; use one of constant'),
+        ('<emitter type="sunsky"/>', '<emitter type="sunsky"> is not supported yet; use one of constant'),
         ('<emitter type="pint"/>', '<emitter type="pint"> is not supported; use one of constant'),
         ('<emitter type="area"><rgb name="intensity" value="1"/></emitter>', "it has: radiance"),
         (shape('<emitter type="constant"/>'), "shines from no surface; it stands directly in <scene>"),
         (shape('<emitter type="point"/>'), "shines from no surface; it stands directly in <scene>"),
-        (shape('<emitter type="projector"/>'), '<emitter type="projector"> is not supported yet; use one of area'),
+        (shape('<emitter type="projector"/>'), "shines from no surface; it stands directly in <scene>"),
         (shape('<emitter type="area" id="a"/>') + shape('<ref id="a"/>'), "shines from <shape"),
         ('<emitter type="constant"><float name="sampling_weight" value="-1"/></emitter>', "at least 0"),
         (shape('<emitter type="area"/>' * 2), "at most 1 <emitter>"),

@@ -86,7 +86,7 @@ PLACES = {
 MESHES = ("obj", "ply", "stl", "glb", "gltf", "serialized")
 # What an element must have to be read at all; the second of a pair, where one excludes the other.
 NEEDS = {
-    "perspective": ["", '<float name="fov" value="40"/>'],
+    **dict.fromkeys(("perspective", "projector"), ["", '<float name="fov" value="40"/>']),
     "thinlens": [f'<float name="aperture_radius" value="1"/>{fov}' for fov in ("", '<float name="fov" value="40"/>')],
     "instance": ['<shape type="shapegroup"/>'],
     "uniform": ['<float name="value" value="1"/>'],
