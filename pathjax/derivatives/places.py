@@ -70,7 +70,7 @@ def _columns(table, path):
 def slots(scene: Scene, paths: Paths) -> Slots:
     textured = any(path in columns for columns in columns_of_textures(scene) for path in paths)
 
-    def looked_up(table, columns):
+    def looked_up(table, columns, textured):
         held = ((i, table.columns[i]) for i in columns.values())
         colors = [i for i, column in held if column.texture is not None and column.values.ndim == 2]
         return tuple(i for path, i in columns.items() if path in paths or (textured and i in colors))
@@ -78,8 +78,8 @@ def slots(scene: Scene, paths: Paths) -> Slots:
     bsdfs = zip(scene.materials.tables, columns_of_bsdfs(scene), strict=True)
     lights = zip(scene.emitters, columns_of_lights(scene), strict=True)
     return Slots(
-        tuple(looked_up(table, columns) for table, columns in bsdfs),
-        tuple(looked_up(each.table, columns) for each, columns in lights),
+        tuple(looked_up(table, columns, textured) for table, columns in bsdfs),
+        tuple(looked_up(each.table, columns, False) for each, columns in lights),  # their textures are their own
     )
 
 

@@ -94,10 +94,12 @@ def build(
     made, light, number = [], np.full(len(shapes.shape), -1, np.int32), 0
     for kind, instances in (*inside.items(), *sorted(outside.items(), key=lambda item: item[0].distant)):
         place = (*path, len(made))
-        covers, codes = _textures(instances, dtype, (*place, "textures"), parameters)
+        covers, codes, images = _textures(instances, dtype, (*place, "textures"), parameters)
         table = kind.build(instances, dtype, (*place, "table"), parameters, codes.get)
         for key in kind.declared if codes else ():
             table = _with_means(table, key, [instance.values[key] for instance in instances])
+            names = [f"{each.name}.{key}" for each in instances if any(each.values[key] is image for image in images)]
+            parameters.refused.update({name: f"{name} is the image of a light, and no parameter" for name in names})
         shining = [lamp for lamp in lamps if emitters[lamp.shape].kind is kind]  # of kinds outside of shapes: nothing
         for lamp in shining:
             light[lamp.primitive : lamp.primitive + lamp.count] = number
@@ -109,15 +111,17 @@ def build(
     return tuple(made), replace(shapes, light=light)
 
 
-def _textures(instances: list[Instance], dtype, path: tuple, parameters: Parameters) -> tuple[Textures | None, dict]:
-    """Those of lights, and their codes. A texture has one place in a scene, by which its parameters are known."""
+def _textures(
+    instances: list[Instance], dtype, path: tuple, parameters: Parameters
+) -> tuple[Textures | None, dict, set[Instance]]:
+    """Those of lights, their codes, and those that are images. What is known by name has one place in a scene."""
     used = dict.fromkeys(v for each in instances for v in each.values.values() if isinstance(v, Instance))
     own = Parameters()
     made, codes = textures.build(list(used), dtype, path, own)
     for parameter in own.known.keys() & parameters.known.keys():
         raise InputError(f"{parameter} is of a texture of a bsdf and of a light; give each a texture of its own")
     parameters.known.update(own.known)
-    return made, codes
+    return made, codes, set(own.textures)
 
 
 def _with_means(table: Table, key: str, values: list) -> Table:

@@ -1,5 +1,6 @@
 """Lights that textures cover: against the same light cut into pieces, and against Mitsuba."""
 
+import jax
 import numpy as np
 import pytest
 
@@ -77,6 +78,25 @@ def test_images_are_linear_in_the_colours_of_a_light(make_scene):
     values = pj.parameters(scene)
     total = sum(np.asarray(J[name]) @ np.asarray(values[name]) for name in names)
     np.testing.assert_allclose(total, image, rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.slow
+def test_texels_of_a_floor_under_such_a_light_are_differentiated(make_scene, picture):
+    """By a sweep over the paths, against differences; images are all but linear in albedos of one bounce."""
+    reflectance = picture.replace("radiance", "reflectance").replace("four", "floor")
+    file = reflectance.split('value="')[1].split('"')[0]
+    write_exr(file, {channel: np.full((2, 2), 0.5, np.float32) for channel in "RGB"}, {})
+    floor = FLOOR.replace('<rgb name="reflectance" value="0.2, 0.5, 0.8"/>', reflectance)
+    scene = make_scene(floor + lamp(area(picture)), **VIEW | {"depth": 2})
+    with pytest.raises(pj.InputError, match="lamp.radiance is the image of a light"):
+        pj.with_parameters(scene, {"lamp.radiance": COLORS})
+
+    def total(texels):
+        return pj.render(pj.with_parameters(scene, {"floor.reflectance": texels}), 16).sum()
+
+    texels = pj.parameters(scene)["floor.reflectance"]
+    slope = np.asarray(jax.grad(total)(texels))
+    np.testing.assert_allclose(np.sum(slope * 0.5), total(texels) - total(0 * texels), rtol=1e-4)
 
 
 def test_what_cannot_cover_a_light_is_refused(make_scene, tmp_path):
