@@ -17,6 +17,9 @@ from pathjax.shapes.accel.leaves import numbers_of, pack, rows_of
 from pathjax.shapes.accel.traverse import Tree
 from pathjax.shapes.shape import Primitives, Shape, Table
 
+# Of the way to a lamp: what lies in its last part, seen from a point on the lamp itself, is that point.
+CLEAR = 1e-3
+
 
 @dataclass
 class Tube(Primitives):
@@ -130,6 +133,19 @@ class Cylinders(Table):
 
     def sample(self, row, u):
         return self.from_square(row, u)
+
+    def sample_lamp(self, lamps, lamp, ref, u, u_part):
+        """Of the inner wall seen from outside, only what is seen through the ends: a shadow ray passes its own lamp."""
+        drawn = super().sample_lamp(lamps, lamp, ref, u, u_part)
+        tube = at(self.tubes, drawn.primitive)
+        start, axis, radius, length = tube[:3], tube[3:6], tube[6], tube[7]
+        rise = dot(drawn.d, axis)
+        outward = drawn.n * at(self.sign, drawn.primitive)
+        # How far back along the ray the wall is met again; as far as `ref`, or farther, where that lies inside.
+        chord = safe_divide(2 * radius * dot(drawn.d, outward), 1 - rise * rise)
+        along = dot(ref - start, axis) + (drawn.distance - chord) * rise
+        enters = (chord > 0) & (chord < drawn.distance * (1 - CLEAR)) & (along > 0) & (along < length)
+        return drawn._replace(pdf=jnp.where(enters, 0, drawn.pdf))
 
     def areas(self):
         return _areas(np.asarray(self.tubes, float))
