@@ -314,7 +314,8 @@ def everything(alpha="MASK"):
     bumps[1:3, 1:3] = (90, 190, 220)
     pbr = {"baseColorTexture": file.texture(), "metallicRoughnessTexture": file.texture(), "roughnessFactor": 0.8}
     square = {"pbrMetallicRoughness": pbr, "normalTexture": file.texture(bumps), "alphaMode": alpha}
-    file.header["materials"] = [square, {"emissiveFactor": [0.5, 0.25, 0.125], "name": "glow"}]
+    file.header["materials"] = [square, {"emissiveFactor": [0.5, 0.25, 1], "name": "glow"}]
+    file.header["materials"][1]["emissiveTexture"] = file.texture()
     file.header["meshes"].append({"primitives": [file.primitive | {"material": 1}]})
     file.node(mesh=1, translation=[0, 0, -1], name="back")
     file.node(camera=0, translation=[0.5, 0.25, 5])
@@ -325,10 +326,28 @@ def everything(alpha="MASK"):
 
 def test_a_file_is_a_scene_that_can_be_saved(write, tmp_path):
     scene = pj.load_scene(write(everything()), res=32)
-    assert {"back.radiance", "glow.roughness", "light.intensity"} < set(pj.parameters(scene))
-    assert len(pj.save_scene(scene, tmp_path / "saved.xml")) == 8
+    assert {"glow.base_color", "glow.roughness", "light.intensity"} < set(pj.parameters(scene))
+    assert len(pj.save_scene(scene, tmp_path / "saved.xml")) == 9
     again = pj.load_scene(tmp_path / "saved.xml")
     jax.tree.map(np.testing.assert_array_equal, *(replace(each, about=None) for each in (scene, again)))
+
+
+@pytest.mark.slow
+def test_normals_point_up_and_right_where_maps_say_so(write):
+    """As green and red above a half do; lit from where, the surface is brighter."""
+
+    def seen(pixel, axis):
+        file = Gltf(cameras=[CAMERA], extensions={"KHR_lights_punctual": {"lights": [LIGHTS[1]]}})
+        normals = file.texture(np.full((2, 2, 3), pixel, np.uint8))
+        file.header["materials"] = [{"pbrMetallicRoughness": {"metallicFactor": 0.0}, "normalTexture": normals}]
+        file.node(camera=0, translation=[0, 0, 5])
+        turn = [*(math.sin(math.pi / 8) * np.array(axis)), math.cos(math.pi / 8)]
+        file.node(rotation=turn, extensions={"KHR_lights_punctual": {"light": 0}})
+        return float(np.mean(pj.render(pj.load_scene(write(file), res=2), spp=4)))
+
+    from_above, from_the_right = [-1, 0, 0], [0, 1, 0]
+    assert seen((128, 218, 218), from_above) > 20 * seen((128, 38, 218), from_above) > 0
+    assert seen((218, 128, 218), from_the_right) > 20 * seen((38, 128, 218), from_the_right) > 0
 
 
 def test_what_was_read_is_not_overwritten(tmp_path):
@@ -340,7 +359,7 @@ def test_what_was_read_is_not_overwritten(tmp_path):
     scene = pj.load_scene(tmp_path / "a.gltf", res=32)
     with pytest.raises(pj.InputError, match=r"b_square\.ply: is read by the same command"):
         pj.save_scene(scene, tmp_path / "b.xml")
-    assert len(pj.save_scene(scene, tmp_path / "c.xml")) == 8
+    assert len(pj.save_scene(scene, tmp_path / "c.xml")) == 9
 
 
 @pytest.mark.slow
