@@ -36,15 +36,17 @@ def scene(path: Path, parameters: Mapping[str, object]) -> tuple[dict, list[str]
         raise InputError(f"{path}: holds no triangles")
     cameras = {name: each for name, each in objects.items() if "aspect" in each}
     if not cameras:
-        cameras = {"camera": _framing(np.concatenate([each["vertices"] for each in shapes]), path)}
+        cameras = {
+            gltf.unused("camera", objects): _framing(np.concatenate([each["vertices"] for each in shapes]), path)
+        }
         notes.append(f"{path}: has no camera; one that frames it is used")
     width = _whole(parameters.get("res", WIDTH), path)
     cameras = {name: _with_film(camera, width) for name, camera in cameras.items()}
     lit = any("emitter" in each or each["type"] in ("point", "spot", "directional") for each in objects.values())
     if not lit:
-        objects["sky"] = {"type": "constant"}
+        objects[gltf.unused("sky", objects)] = {"type": "constant"}
         notes.append(f"{path}: has no light; a sky of radiance 1 is used")
-    return {"type": "scene", "integrator": {"type": "path"}, **objects, **cameras}, notes, files
+    return {"type": "scene", gltf.unused("integrator", objects): {"type": "path"}, **objects, **cameras}, notes, files
 
 
 def _mesh(path: Path) -> tuple[dict[str, dict], list[str], list[Path]]:

@@ -7,8 +7,10 @@ and emission of 1 as a radiance of 1: so the format relates them, and images hav
 from __future__ import annotations
 
 import io
+import itertools
 import math
 import re
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +28,7 @@ KNOWN = re.compile(
     "KHR_(lights_punctual|mesh_quantization|texture_transform|materials_(ior|emissive_strength|unlit))|EXT_texture_webp"
 )
 MOST_PIXELS = 10**9
+NO_LIMIT = 1e10  # of what a camera sees: farther than anything
 
 
 def scene(path: Path) -> tuple[dict[str, dict], list[str], list[Path]]:
@@ -41,6 +44,12 @@ def scene(path: Path) -> tuple[dict[str, dict], list[str], list[Path]]:
         raise
     except Exception as error:  # brought about by a header that is not as the format says
         raise InputError(f"{path}: cannot be read as glTF ({type(error).__name__}: {error})"[:300]) from None
+
+
+def unused(name: str, taken: Mapping[str, object]) -> str:
+    """The name, or with a number where it is taken, or means something else in a dictionary."""
+    names = itertools.chain([name], (f"{name}_{number}" for number in itertools.count(1)))
+    return next(each for each in names if each not in taken and each not in ("type", "id"))
 
 
 class _Scene:
@@ -79,8 +88,7 @@ class _Scene:
 
     def free(self, name: str) -> str:
         """The name as a key, and with a number where it is taken."""
-        name = re.sub(r"[^\w-]+", "_", name) or "_"
-        return next(each for k in range(len(self.made) + 1) if (each := f"{name}_{k}" if k else name) not in self.made)
+        return unused(re.sub(r"[^\w-]+", "_", name) or "_", self.made)
 
     # ---- where it is seen from, and lit
 
@@ -88,7 +96,7 @@ class _Scene:
         """With `aspect` in place of a film."""
         seen = camera[camera["type"]]
         to_world = _looking(matrix)
-        clip = {"near_clip": float(seen["znear"] or 1e-2), "far_clip": float(seen.get("zfar", 1e4))}
+        clip = {"near_clip": float(seen["znear"] or 1e-2), "far_clip": float(seen.get("zfar", NO_LIMIT))}
         if camera["type"] == "perspective":
             fov = {"fov": math.degrees(seen["yfov"]), "fov_axis": "y"}
             return {"type": "perspective", "to_world": to_world, **fov, **clip, "aspect": seen.get("aspectRatio")}

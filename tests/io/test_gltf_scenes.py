@@ -243,6 +243,16 @@ def test_materials_are_shared_and_named(objects):
     assert made["square"]["bsdf"] == made["square_1"]["bsdf"] == {"type": "ref", "id": "red_paint_"}
 
 
+@pytest.mark.parametrize(
+    "name", ["type", "id", "camera", "sky", "integrator", "material", "a.b c", "$x", "\n", "\U0001f600"]
+)
+def test_nodes_may_have_any_name(write, name):
+    file = Gltf()
+    file.header["nodes"][0]["name"] = name
+    scene = pj.load_scene(write(file), res=8)
+    assert len(scene.about.description.shapes) == 1 and len(scene.emitters) == 1
+
+
 # ---- cameras and lights -------------------------------------------------------------------------------------------
 
 TURNED = {"translation": [1, 2, 3], "rotation": [0, math.sqrt(0.5), 0, math.sqrt(0.5)]}  # a quarter about y
