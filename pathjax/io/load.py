@@ -89,6 +89,8 @@ def save_scene(scene: Scene, file: str | os.PathLike) -> list[Path]:
     if any(is_traced(value) for value in values.values()):
         raise InputError(f"{file}: the scene's parameters are traced; save it outside of jit and derivatives")
     known = about(scene).description
+    if known.document is None:
+        raise InputError(f"{file}: the scene was built from records; what load_scene and load_dict return can be saved")
     for name, value in seen(known, scene.camera.origin.dtype).items():
         if not _equal(value, getattr(scene, name)):
             raise InputError(

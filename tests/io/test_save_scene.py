@@ -15,6 +15,7 @@ from pathjax import bsdfs
 from pathjax.bench import peers
 from pathjax.bsdfs import Diffuse
 from pathjax.kinds import Color, Number
+from pathjax.scene import build
 
 ROOT = Path(__file__).resolve().parents[2]
 FILES = sorted([*ROOT.glob("scenes/*.xml"), *ROOT.glob("tests/scenes/*.xml")])
@@ -236,6 +237,9 @@ def test_what_no_file_can_say_is_refused(make_scene, tmp_path):
     with pytest.raises(pj.InputError, match=r"scene.a\$b: .*'a\$b' cannot be written"):
         pj.save_scene(scene, tmp_path / "saved.xml")
     scene = make_scene('<shape type="sphere" id="ball"/><emitter type="constant"/>')
+    built = build(replace(scene.about.description, document=None))
+    with pytest.raises(pj.InputError, match="was built from records"):
+        pj.save_scene(built, tmp_path / "saved.xml")
     with pytest.raises(pj.InputError, match="max_depth was replaced after it was loaded"):
         pj.save_scene(replace(scene, max_depth=jnp.int32(3)), tmp_path / "saved.xml")
     with pytest.raises(pj.InputError, match="traced; save it outside"):
