@@ -325,7 +325,7 @@ def mutated(draw):
             parent = parent[step]
         match draw(st.sampled_from(["value", "key", "remove", "move", "cycle"])):
             case "value":
-                parent[key] = draw(st.sampled_from(VALUES))
+                parent[key] = copy.deepcopy(draw(st.sampled_from(VALUES)))
             case "key":
                 parent[draw(st.sampled_from(["type", "id", "radius", "bsdf", "x", "", "a.b", 3, None]))] = parent[key]
             case "remove":
