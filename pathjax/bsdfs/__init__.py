@@ -30,6 +30,7 @@ from pathjax.bsdfs.normalmap import NormalMap
 from pathjax.bsdfs.null import Null
 from pathjax.bsdfs.plastic import Plastic
 from pathjax.bsdfs.principled import Principled
+from pathjax.bsdfs.principledthin import PrincipledThin
 from pathjax.bsdfs.roughconductor import RoughConductor
 from pathjax.bsdfs.roughdielectric import RoughDielectric
 from pathjax.bsdfs.roughplastic import RoughPlastic
@@ -56,6 +57,7 @@ __all__ = [
     "Null",
     "Plastic",
     "Principled",
+    "PrincipledThin",
     "RoughConductor",
     "RoughDielectric",
     "RoughPlastic",
@@ -76,6 +78,7 @@ KINDS: dict[str, type[BSDF]] = {
     "null": Null,
     "roughplastic": RoughPlastic,
     "principled": Principled,
+    "principledthin": PrincipledThin,
     "twosided": TwoSided,
     "blendbsdf": BlendBSDF,
     "mask": Mask,

@@ -21,8 +21,9 @@ from pathjax.kinds import Color, Number, Row, Unused
 
 # Lobes are chosen as if nothing of them were darker: one that is black has a derivative all the same.
 LEAST_REFLECTANCE = 0.01
-# Between equal media facets turn nothing, so light that passes has no density. Mitsuba's least IOR of clear ones.
-LEAST_CLEAR_IOR = 1.001
+# Between equal media facets turn nothing, so light that passes has no density. Mitsuba's least `specular` of clear
+# ones, and their IOR where it is 1.
+LEAST_CLEAR_SPECULAR, LEAST_CLEAR_IOR = 1e-3, 1.001
 
 
 @dataclass(frozen=True)
@@ -139,13 +140,14 @@ class Look(NamedTuple):
 
 def _look(p: Row) -> Look:
     values = {name: getattr(p, name) for name in Look._fields if name != "eta"}
-    eta, specular = p.eta, p.specular
+    eta, specular, clear = p.eta, p.specular, values["spec_trans"] is not None
+    if eta is not None and clear:
+        eta = jnp.where(jnp.abs(eta - 1) < LEAST_CLEAR_IOR - 1, LEAST_CLEAR_IOR, eta)
     if specular is not None:
         # R0 = 0.08 specular. Rows with an eta of their own have no specular, and 0 in its place.
+        specular = larger(specular, LEAST_CLEAR_SPECULAR) if clear else specular
         of_specular = 2 / (1 - safe_sqrt(0.08 * specular)) - 1
-        eta = of_specular if eta is None else jnp.where(eta > 0, eta, of_specular)
-    if values["spec_trans"] is not None:
-        eta = jnp.where(jnp.abs(eta - 1) < LEAST_CLEAR_IOR - 1, LEAST_CLEAR_IOR, eta)
+        eta = of_specular if eta is None else jnp.where(p.eta > 0, eta, of_specular)
     return Look(**values, eta=eta)
 
 
@@ -169,7 +171,8 @@ def _reflectance(look: Look, cos: Float[Array, ""], inside: Bool[Array, ""] | No
     return jnp.broadcast_to(total, (3,)), exact, cos_t
 
 
-def _mean(color: Float[Array, "3"]) -> Float[Array, ""]:
+def mean(color: Float[Array, "3"]) -> Float[Array, ""]:
+    """Of the channels, for chances."""
     return larger(jnp.mean(color), LEAST_REFLECTANCE)
 
 
@@ -182,17 +185,17 @@ class Chances(NamedTuple):
     @classmethod
     def of(cls, look: Look, cos: Float[Array, ""], inside: Bool[Array, ""] | None) -> Chances:
         reflectance, exact, _ = _reflectance(look, cos, inside)
-        facets = _mean(reflectance) + look.clear * (1 - exact)
+        facets = mean(reflectance) + look.clear * (1 - exact)
         outside = 1.0 if inside is None else jnp.where(inside, 0.0, 1.0)
         coat = None if look.clearcoat is None else outside * look.clearcoat * burley.schlick(burley.COAT_R0, cos) * cos
         rest = facets if coat is None else facets + coat
-        base = outside * look.opaque * _mean(look.base_color)
+        base = outside * look.opaque * mean(look.base_color)
         return lax.stop_gradient(cls(base / (base + rest), None if coat is None else coat / rest))
 
 
 def _refracts(look: Look, reflectance: Float[Array, "3"], exact: Float[Array, ""]) -> Float[Array, ""]:
     """Chance that facets let through instead of reflecting; detached."""
-    through = look.clear * (1 - exact) * _mean(safe_sqrt(look.base_color))
+    through = look.clear * (1 - exact) * mean(safe_sqrt(look.base_color))
     return lax.stop_gradient(safe_divide(through, through + jnp.mean(reflectance)))
 
 

@@ -9,7 +9,7 @@ import pytest
 
 import pathjax as pj
 from pathjax import bsdfs, testing
-from pathjax.bsdfs import Principled
+from pathjax.bsdfs import Principled, PrincipledThin
 from pathjax.bsdfs.principled import ClearPrincipled
 
 ORANGE = {"base_color": np.array([0.9, 0.3, 0.1])}
@@ -18,6 +18,9 @@ BRUSHED = {**ORANGE, "metallic": 0.6, "anisotropic": 0.7, "roughness": 0.7, "spe
 CAR = {**ORANGE, "clearcoat": 0.8, "clearcoat_gloss": 0.05, "specular": 0.8}
 FROSTED = {**ORANGE, "spec_trans": 0.7, "eta": 1.5, "roughness": 0.8}
 ALL = {**BRUSHED, "spec_trans": 0.6, "sheen": 0.5, "sheen_tint": 0.5, "flatness": 0.4, "clearcoat": 0.5, "eta": 1.4}
+LEAF = {**ORANGE, "diff_trans": 0.8, "roughness": 0.7, "flatness": 0.3}
+PANE = {**ORANGE, "spec_trans": 0.7, "roughness": 0.8, "eta": 1.4}
+THIN = {**PANE, **LEAF, "anisotropic": 0.5, "spec_tint": 0.6, "sheen": 0.5, "sheen_tint": 0.5}
 slow = pytest.mark.slow
 
 
@@ -25,9 +28,9 @@ def kind_of(values):
     return ClearPrincipled if "spec_trans" in values else Principled
 
 
-def evaluated(values, wi, wo):
+def evaluated(kind, values, wi, wo):
     """Values (N, 3) and densities (N,)."""
-    materials, zero = testing.material(kind_of(values), **values), jnp.int32(0)
+    materials, zero = testing.material(kind, **values), jnp.int32(0)
 
     def of_pair(wi, wo):
         return bsdfs.evaluate(materials, zero, zero, testing._SURFACE, wi, wo)
@@ -62,6 +65,7 @@ def test_principled_passes_the_checks_of_all_kinds(values):
     testing.check_reciprocity(materials)
 
 
+@slow
 def test_all_lobes_are_drawn_with_the_density_that_is_stated():
     materials = testing.material(ClearPrincipled, **ALL)
     for wi in testing.directions(ClearPrincipled)[1::3]:  # one from either side
@@ -119,11 +123,55 @@ def pairs(n, seed=1, both=True):
 def test_values_are_those_of_mitsuba(mitsuba_values, values):
     """From both sides. Densities differ, as lobes are chosen otherwise."""
     wi, wo = pairs(300, both="spec_trans" in values)
-    f, _ = evaluated(values, wi, wo)
+    f, _ = evaluated(kind_of(values), values, wi, wo)
     expected, _ = mitsuba_values("principled", values, wi, wo)
     # Mitsuba's luminance has other digits; and of smooth coats the half vector's rounding moves D.
     np.testing.assert_allclose(f, expected, rtol=2e-3, atol=1e-6)
     assert (expected > 0).any()
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        THIN,
+        pytest.param({}, marks=slow),
+        pytest.param(LEAF, marks=slow),
+        pytest.param(PANE, marks=slow),
+        pytest.param({**PANE, "roughness": 0.2, "eta": 1.8, "spec_trans": 1.0}, marks=slow),
+        pytest.param({**LEAF, "diff_trans": 2.0}, marks=slow),
+    ],
+    ids=str,
+)
+def test_values_of_thin_ones_are_those_of_mitsuba(mitsuba_values, values):
+    wi, wo = pairs(300)
+    f, _ = evaluated(PrincipledThin, values, wi, wo)
+    expected, _ = mitsuba_values("principledthin", values, wi, wo)
+    np.testing.assert_allclose(f, expected, rtol=2e-3, atol=1e-6)
+
+
+@slow
+@pytest.mark.parametrize("values", [{}, LEAF, PANE, THIN, {**LEAF, "diff_trans": 2.0}], ids=str)
+def test_thin_ones_pass_the_checks_of_all_kinds(values):
+    materials = testing.material(PrincipledThin, **values)
+    for wi in testing.directions(PrincipledThin):
+        testing.check_range(materials, wi)
+        testing.check_weights(materials, wi)
+        testing.check_detached(materials, wi)
+        testing.check_chi_square(materials, wi, 50_000, 1e-4)
+        testing.check_derivatives(materials, wi, 50_000, 1e-4)
+        if "sheen" not in values:
+            testing.check_furnace(materials, wi, 50_000, 1e-4)
+    testing.check_reciprocity(materials)
+
+
+@slow
+@pytest.mark.parametrize("roughness", [0.0, 1.0])
+def test_extremes_of_thin_ones_are_finite(roughness):
+    for share in (0.0, 1.0):
+        values = {"base_color": share, "spec_trans": 1 - share / 2, "diff_trans": 2 * share, "sheen": 1.0}
+        materials = testing.material(PrincipledThin, roughness=roughness, **values)
+        for wi in testing.directions(PrincipledThin):
+            testing.check_range(materials, wi)
 
 
 # ---- files ----------------------------------------------------------------------------------------------------------
