@@ -19,6 +19,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from pathjax.bsdfs.wrapper import Turning, Wrapper
+from pathjax.compile import compute_once
 from pathjax.core.math import at, cross, dot, normalize, safe_divide, smaller, to_local, to_world
 from pathjax.core.types import Frame, Surface
 from pathjax.kinds import Instance, Row
@@ -112,12 +113,13 @@ def leaf(
                 same = upright, frame, wi, jnp.zeros_like(weight)
                 before = frame.n
                 turn = partial(_turned, table.kind, p, surface, upright, frame, wi)
-                upright, frame, wi, roughness = lax.cond(here, turn, lambda same=same: same)
+                # What is found at one level is read many times at the next.
+                upright, frame, wi, roughness = compute_once(lax.cond(here, turn, lambda same=same: same))
                 turns = (*turns, Turn(before, roughness))
                 node = jnp.where(here, _held(p, wi[2] > 0)[0], node)
             else:
                 choice = partial(_choice, table.kind, p, wi[2] > 0, u, weight, differentiated)
-                node, u, weight = lax.cond(here, choice, lambda same=(node, u, weight): same)
+                node, u, weight = compute_once(lax.cond(here, choice, lambda same=(node, u, weight): same))
             node, frame, wi, turns = _entered(node, frame, wi, turns)
     return Leaf(node[0], node[1], frame, wi, weight, turns)
 
@@ -149,13 +151,13 @@ def _choice(kind, p, front, u, weight, differentiated):
 
 def _turned(kind, p, surface, upright, frame, wi):
     """The frame around the turned normal. upright: the same frame, but never mirrored, to which textures refer."""
-    x, y, z = lax.stop_gradient(kind.normal(p, surface, partial(to_local, upright)))
+    x, y, z = compute_once(lax.stop_gradient(kind.normal(p, surface, partial(to_local, upright))))
     if (flips := p.flip_invalid_normals) is not None:
         away = flips & (wi[2] * (wi[0] * x + wi[1] * y + wi[2] * z) <= 0)
         x, y = jnp.where(away, -x, x), jnp.where(away, -y, y)
     n = normalize(jnp.stack([x, y, z]))
     up = jnp.stack([*jnp.zeros_like(n[:2]), jnp.ones_like(x)])
-    n = jnp.where(dot(n, n) > 0, n, up)
+    n = compute_once(jnp.where(dot(n, n) > 0, n, up))
     s = normalize(jnp.stack([1 - n[0] * n[0], -n[0] * n[1], -n[0] * n[2]]))
     t = cross(n, s)
     turned = [Frame(*(to_world(each, v) for v in (s, t, n))) for each in (upright, frame)]

@@ -25,7 +25,7 @@ class FirstHit(NamedTuple):
 
     depth: Float[Array, "1"]  # distance along the ray, from the near clip plane on
     normal: Float[Array, "3"]  # shading normal in world space, on the side that the shape's normals point to
-    albedo: Float[Array, "3"]  # share of light that a reflector sends back; 1 for glass, 0 for a side that absorbs
+    albedo: Float[Array, "3"]  # share of light that is sent back; 1 of glass and of null, 0 of a side that absorbs
 
 
 def mean(work: Work, scene: Scene) -> FirstHit:

@@ -32,7 +32,7 @@ def render_aovs(scene: Scene, names: Sequence[str], spp: int = MAX_SPP, seed: in
     Args:
         names: "depth" (1 channel), the distance along the ray from the near clip plane; "normal" (3), the shading
             normal in world space; "albedo" (3), the share of light that a reflector sends back, textures and Fresnel's
-            terms included, and 1 for glass.
+            terms included, and 1 for glass and where light goes straight on.
         spp: samples per pixel, of which at most 16 are used.
         seed: of `render_until`.
     Returns:
