@@ -70,7 +70,7 @@ def register(name: str):
 
 
 def _fault(kind: type[Emitter]) -> str:
-    declared = kind.declared.values()
+    declared = [parameter for name, parameter in kind.declared.items() if name not in Emitter.declared]
     if not declared:
         return "declares nothing; declare a Color(..., textured=False)"
     if kind.on_surfaces or not any(parameter.textured for parameter in declared):

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from typing import ClassVar
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -16,7 +18,7 @@ from pathjax.kinds import Color, Row, Unused
 class Constant(Background):
     radiance = Color(1.0, bounds=(0, math.inf), textured=False, radiance=True)
     left_to_bsdfs = True
-    unused = Background.unused | {"to_world": Unused("transform")}
+    unused: ClassVar[Mapping[str, Unused]] = {"to_world": Unused("transform")}
 
     @staticmethod
     def power(p) -> Float[Array, " R"]:

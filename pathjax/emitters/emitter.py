@@ -2,15 +2,26 @@
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
-from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 from jaxtyping import Array, Float
 
-from pathjax.kinds import Kind, Row, Unused
+from pathjax.kinds import Declared, Kind, Row
+
+
+@dataclass(frozen=True)
+class Weight(Declared):
+    """How often lights are sampled, relative to their `power`. No parameter: it changes noise alone."""
+
+    def read(self, loader, fields, name, owner):
+        return fields.float(name, None, at_least=self.bounds[0])
+
+    def standing_in(self):
+        return np.ones(())
 
 
 class Emitter(Kind):
@@ -21,9 +32,7 @@ class Emitter(Kind):
     written, so the derivative in a parameter that moves a light lacks the edges of shadows. The choice is detached.
     """
 
-    unused: ClassVar[Mapping[str, Unused]] = {
-        "sampling_weight": Unused("float", "how often a light is sampled changes noise alone", at_least=0)
-    }
+    sampling_weight = Weight(None, bounds=(0, math.inf))
     on_surfaces: ClassVar[bool] = False  # stands inside a shape
     distant: ClassVar[bool] = False  # infinitely far
     dirac: ClassVar[bool] = False  # shines from one direction at each point
@@ -78,8 +87,8 @@ class DiracEmitter(Emitter):
     """What shines from one direction at each point: no ray hits it, and no bsdf finds it."""
 
     dirac = True
-    # Mitsuba's image lacks such a light if it is never sampled.
-    unused = {"sampling_weight": replace(Emitter.unused["sampling_weight"], at_least=float(np.finfo(np.float32).tiny))}
+    # Of weight 0 nothing would find it.
+    sampling_weight = Weight(None, bounds=(float(np.finfo(np.float32).tiny), math.inf))
 
     @staticmethod
     @abstractmethod

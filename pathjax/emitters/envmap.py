@@ -46,7 +46,7 @@ class Envmap(Background):
     scale = Number(1.0, bounds=(0, math.inf))
     to_world = Rotation()
     single = True
-    unused: ClassVar[Mapping[str, Unused]] = Background.unused | {
+    unused: ClassVar[Mapping[str, Unused]] = {
         "mis_compensation": Unused("boolean", "how often a direction is sampled changes noise alone")
     }
 
@@ -62,7 +62,8 @@ class Envmap(Background):
             least = f"{count} texels of negative radiance, down to {texels.min():g}"
             loader.note(fields.where(key), f"has {least}, which is taken as 0")
             texels = np.maximum(texels, 0)
-        given = {key: cls.declared[key].read(loader, fields, key, name) for key in ("scale", "to_world")}
+        others = "scale", "to_world", "sampling_weight"
+        given = {key: cls.declared[key].read(loader, fields, key, name) for key in others}
         # Where the scene will use it, so that one copy of it is all there is.
         return cls.instance(name, texels=np.asarray(jax.device_put(texels)), **given)
 

@@ -33,7 +33,8 @@ class Projector(DiracEmitter):
             raise fields.error("to_world", "scales or shears; a projector can be turned and moved only")
         scale = cls.scale.read(loader, fields, "scale", name)
         lens = _extent(*field_of_view(fields), irradiance)
-        placed = {"position": to_world[:3, 3], "to_world": to_world[:3, :3]}
+        weight = cls.sampling_weight.read(loader, fields, "sampling_weight", name)
+        placed = {"sampling_weight": weight, "position": to_world[:3, 3], "to_world": to_world[:3, :3]}
         return cls.instance(name, irradiance=irradiance, scale=scale, **placed, **lens)
 
     @classmethod

@@ -47,9 +47,11 @@ class Lights:
         """Of the light of this number among those of this kind; surface: where it is met, if it has textures."""
         return Row(self.table, light if self.row is None else at(self.row, light), surface, self.textures)
 
-    def power(self) -> Float[Array, " R"]:
-        """`Emitter.power`, of surfaces times their area."""
-        power = self.kind.power(AllRows(self.table))
+    def power(self, weighted: bool = False) -> Float[Array, " R"]:
+        """`Emitter.power`, of surfaces times their area. weighted: times the weights that files give."""
+        power, weights = self.kind.power(AllRows(self.table)), self.table.column("sampling_weight")
+        if weighted and weights is not None:
+            power = power * weights.values
         return power if self.lamps is None else self.lamps.area * power[self.row]
 
     def dark(self) -> bool:
@@ -90,7 +92,8 @@ def choice(emitters: tuple[Lights, ...], strategy: str) -> Choice | None:
         sampled = strategy == "light" or not lights.left_to_bsdfs
         first.append(count if sampled else None)
         if sampled:
-            powers[lights.kind.distant].append(lights.power())
+            # Strategy "light" has to find what has the weight 0 too.
+            powers[lights.kind.distant].append(lights.power(weighted=strategy == "mis"))
             count += lights.count
     groups = [lax.stop_gradient(jnp.concatenate(group)) for group in powers.values() if group]
     if not groups:

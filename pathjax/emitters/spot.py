@@ -41,11 +41,12 @@ class Spot(Point):
         beam = fields.float("beam_width", None, at_least=0)
         if beam is not None and beam > cutoff:
             raise fields.error("beam_width", f"must not exceed cutoff_angle, {cutoff:g}; is {beam:g}")
+        weight = cls.sampling_weight.read(loader, fields, "sampling_weight", name)
         to_world = fields.transform("to_world")
         axes = to_world[:3, :3] / np.linalg.norm(to_world[:3, 2])
         if not np.allclose(axes.T @ axes, np.eye(3), atol=2e-3):
             raise fields.error("to_world", "shears or scales unevenly, and its cone would not be round")
-        placed = {"position": to_world[:3, 3], "direction": Direction.of(to_world[:3, 2])}
+        placed = {"sampling_weight": weight, "position": to_world[:3, 3], "direction": Direction.of(to_world[:3, 2])}
         if texture is not None:
             if cutoff >= 90:
                 raise fields.error("cutoff_angle", f"must be below 90 where a texture covers the cone, is {cutoff:g}")

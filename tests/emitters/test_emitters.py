@@ -14,6 +14,7 @@ from pathjax import emitters
 from pathjax.bsdfs import Diffuse
 from pathjax.core.types import Ray
 from pathjax.emitters import Area, Constant
+from pathjax.errors import InputError
 from pathjax.scene import build
 from pathjax.scene.parameters import with_parameters
 from pathjax.sensors import Perspective
@@ -336,3 +337,20 @@ def test_derivatives_of_the_choice_are_zero():
         return emitters.choice(changed.emitters, "mis").pdf
 
     np.testing.assert_array_equal(jax.jit(jax.jacfwd(pdf))(1.0), np.zeros(2))
+
+
+def test_lights_are_sampled_by_their_weights(make_scene):
+    """Of equal lamps; strategy "light" finds alone what has the weight 0."""
+    lamp = """<shape type="rectangle"><transform name="to_world"><translate x="{}"/></transform>
+      <emitter type="area">{}</emitter></shape>"""
+    weight = '<float name="sampling_weight" value="{}"/>'
+    scene = make_scene(lamp.format(0, weight.format(3)) + lamp.format(3, "") + lamp.format(6, weight.format(0)))
+    np.testing.assert_allclose(emitters.choice(scene.emitters, "mis").pdf, [3 / 4, 1 / 4, 0], rtol=1e-6)
+    np.testing.assert_allclose(emitters.choice(scene.emitters, "light").pdf, [1 / 3] * 3, rtol=1e-6)
+    plain = make_scene(lamp.format(0, "") + lamp.format(3, ""))
+    assert plain.emitters[0].table.column("sampling_weight") is None
+    for kind in ("point", "spot", "projector", "directional"):
+        light = f'<emitter type="{kind}">{{}}</emitter>'
+        assert make_scene(light.format(weight.format(2))).emitters[0].power(weighted=True).shape == (1,)
+        with pytest.raises(InputError, match="at least 1.17"):
+            make_scene(light.format(weight.format(0)))

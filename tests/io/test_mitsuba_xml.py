@@ -542,7 +542,7 @@ def test_constant_emitters_stand_in_the_scene_in_any_number(read):
     [
         ('<emitter type="sunsky"/>', '<emitter type="sunsky"> is not supported yet; use one of constant'),
         ('<emitter type="pint"/>', '<emitter type="pint"> is not supported; use one of constant'),
-        ('<emitter type="area"><rgb name="intensity" value="1"/></emitter>', "it has: radiance"),
+        ('<emitter type="area"><rgb name="intensity" value="1"/></emitter>', "sampling_weight, radiance"),
         (shape('<emitter type="constant"/>'), "shines from no surface; it stands directly in <scene>"),
         (shape('<emitter type="point"/>'), "shines from no surface; it stands directly in <scene>"),
         (shape('<emitter type="projector"/>'), "shines from no surface; it stands directly in <scene>"),
@@ -551,7 +551,7 @@ def test_constant_emitters_stand_in_the_scene_in_any_number(read):
         (shape('<emitter type="area"/>' * 2), "at most 1 <emitter>"),
         (shape('<emitter type="area"><rgb name="radiance" value="-1"/></emitter>'), "not be negative"),
         (shape('<emitter type="area"><texture name="radiance" type="bitmap"/></emitter>'), "needs <string name="),
-        (shape('<emitter type="area"><rgb name="intensity" value="1"/></emitter>'), "it has: radiance"),
+        (shape('<emitter type="area"><rgb name="intensity" value="1"/></emitter>'), "sampling_weight, radiance"),
     ],
 )
 def test_emitters_that_are_not_modelled_are_refused(refused, body, words):
@@ -721,9 +721,8 @@ WITHOUT_EFFECT = [
     ("sphere", shape("{}"), ["silhouette_sampling_weight"]),
     ("rectangle", shape("{}", "rectangle"), ["silhouette_sampling_weight", "face_normals"]),
     ("cube", shape("{}", "cube"), ["face_normals"]),
-    ("area", shape('<emitter type="area">{}</emitter>'), ["sampling_weight"]),
-    ("constant", '<emitter type="constant">{}</emitter>', ["sampling_weight", "to_world"]),
-    ("envmap", f'<emitter type="envmap">{PICTURE}{{}}</emitter>', ["sampling_weight", "mis_compensation"]),
+    ("constant", '<emitter type="constant">{}</emitter>', ["to_world"]),
+    ("envmap", f'<emitter type="envmap">{PICTURE}{{}}</emitter>', ["mis_compensation"]),
     (
         "bitmap",
         with_bsdf("diffuse", f'<texture type="bitmap" name="reflectance">{PICTURE}{{}}</texture>'),
@@ -739,7 +738,7 @@ WITHOUT_EFFECT = [
 ]
 VALUE_OF = {
     **dict.fromkeys(("focus_distance", "shutter_open", "shutter_close", "timeout"), ("float", "1")),
-    **dict.fromkeys(("sampling_weight", "silhouette_sampling_weight"), ("float", "0.5")),
+    "silhouette_sampling_weight": ("float", "0.5"),
     **dict.fromkeys(("kd_traversal_cost", "kd_intersection_cost", "kd_empty_space_bonus"), ("float", "0.5")),
     **dict.fromkeys(("block_size", "samples_per_pass", "seed", "strength"), ("integer", "2")),
     **dict.fromkeys(("shading_samples", "emitter_samples", "bsdf_samples"), ("integer", "4")),
