@@ -9,10 +9,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from pathjax.core.math import dot, luminance, safe_divide, safe_sqrt
+from pathjax.description.lens import field_of_view, half_extent
 from pathjax.emitters.emitter import DiracEmitter
 from pathjax.emitters.point import REACH
 from pathjax.kinds import Color, Instance, Number, PerRow, Position, Rotation, Row
-from pathjax.sensors.perspective import field_of_view, half_extent
 
 
 class Projector(DiracEmitter):

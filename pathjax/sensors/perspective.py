@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-import re
 from dataclasses import dataclass
 
 import jax
@@ -15,6 +13,7 @@ from pathjax.compile import compute_once
 from pathjax.core.math import dot
 from pathjax.core.types import Ray
 from pathjax.description.fields import Fields
+from pathjax.description.lens import field_of_view, half_extent
 from pathjax.kinds import Unused
 from pathjax.sensors.film import HDRFilm
 from pathjax.sensors.sensor import Camera, Sensor
@@ -95,30 +94,3 @@ class Perspective(Sensor):
         shift = 2 * half * np.array([-self.principal_point_offset[0], -self.principal_point_offset[1]])
         numbers = self.to_world[:3, 3], axes.T, half + shift, -2 * half, self.near_clip, self.far_clip
         return [np.asarray(x, dtype) for x in numbers]
-
-
-def half_extent(fov: float, fov_axis: str, aspect: float) -> np.ndarray:
-    """(2,) half of width and height of what is seen at distance 1. aspect: width over height."""
-    tan = math.tan(math.radians(fov) / 2)
-    tan_x = {
-        "x": tan,
-        "y": tan * aspect,
-        "diagonal": tan * aspect / math.hypot(aspect, 1),
-        "smaller": tan * max(aspect, 1),
-        "larger": tan * min(aspect, 1),
-    }[fov_axis]
-    return np.array([tan_x, tan_x / aspect])
-
-
-def field_of_view(fields: Fields) -> tuple[float, str]:
-    """Degrees, and the axis along which they are measured; a focal length is one of 35 mm film, 36 x 24 mm."""
-    if fields.has("focal_length") and (fields.has("fov") or fields.has("fov_axis")):
-        raise fields.error("focal_length", "excludes fov and fov_axis; give one or the other")
-    if fields.has("fov"):
-        axis = fields.string("fov_axis", "x", choices=("x", "y", "diagonal", "smaller", "larger"))
-        return fields.float("fov", above=0, below=180), axis
-    text = fields.string("focal_length", "50mm").strip()
-    length = re.fullmatch(r"(\d{1,9}(\.\d{1,9})?)\s*(mm)?", text)
-    if not length or float(length[1]) == 0:
-        raise fields.error("focal_length", f'must be like "50mm", is "{text[:40]}"')
-    return 2 * math.degrees(math.atan(math.hypot(36, 24) / (2 * float(length[1])))), "diagonal"

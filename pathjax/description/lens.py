@@ -1,0 +1,37 @@
+"""What a lens shows: how scene files say it of cameras and projectors."""
+
+from __future__ import annotations
+
+import math
+import re
+
+import numpy as np
+
+from pathjax.description.fields import Fields
+
+
+def half_extent(fov: float, fov_axis: str, aspect: float) -> np.ndarray:
+    """(2,) half of width and height of what is seen at distance 1. aspect: width over height."""
+    tan = math.tan(math.radians(fov) / 2)
+    tan_x = {
+        "x": tan,
+        "y": tan * aspect,
+        "diagonal": tan * aspect / math.hypot(aspect, 1),
+        "smaller": tan * max(aspect, 1),
+        "larger": tan * min(aspect, 1),
+    }[fov_axis]
+    return np.array([tan_x, tan_x / aspect])
+
+
+def field_of_view(fields: Fields) -> tuple[float, str]:
+    """Degrees, and the axis along which they are measured; a focal length is one of 35 mm film, 36 x 24 mm."""
+    if fields.has("focal_length") and (fields.has("fov") or fields.has("fov_axis")):
+        raise fields.error("focal_length", "excludes fov and fov_axis; give one or the other")
+    if fields.has("fov"):
+        axis = fields.string("fov_axis", "x", choices=("x", "y", "diagonal", "smaller", "larger"))
+        return fields.float("fov", above=0, below=180), axis
+    text = fields.string("focal_length", "50mm").strip()
+    length = re.fullmatch(r"(\d{1,9}(\.\d{1,9})?)\s*(mm)?", text)
+    if not length or float(length[1]) == 0:
+        raise fields.error("focal_length", f'must be like "50mm", is "{text[:40]}"')
+    return 2 * math.degrees(math.atan(math.hypot(36, 24) / (2 * float(length[1])))), "diagonal"
