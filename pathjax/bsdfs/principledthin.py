@@ -58,15 +58,16 @@ class PrincipledThin(BSDF):
         seen, u = wi * side, jnp.stack([u[2], u[0], u[1]])
         from_base, u = chosen(u, look.chance_of_base(seen))
         through, u = chosen(u, jnp.where(from_base, look.chance_through_base, look.chance_through_facets(seen)))
-        wo = square_to_cosine_hemisphere(u[1:])
+        wo, lost = square_to_cosine_hemisphere(u[1:]), jnp.bool_(False)
         if look.spec_trans is not None:
-            wo = jnp.where(from_base, wo, mirrored(seen, look.facets(through).detached().sample(seen, u[1:])))
-        above = wo[2] > 0
+            m = look.facets(through).detached().sample(seen, u[1:])
+            wo = jnp.where(from_base, wo, mirrored(seen, m))
+            lost = ~from_base & through & ~_leaves(wo, m)
+        lost = lost | (wo[2] <= 0)
         wo = lax.stop_gradient(jnp.stack([wo[0], wo[1], jnp.where(through, -wo[2], wo[2])]) * side)
         f, pdf = _evaluate(look, wi, wo)
-        pdf = jnp.where(above, pdf, 0)
-        one = jnp.ones_like(pdf)
-        return BSDFSample(wo, jnp.where(above, f * safe_divide(one, pdf), 0), pdf, jnp.bool_(False), one)
+        one, pdf = jnp.ones_like(pdf), jnp.where(lost, 0, pdf)
+        return BSDFSample(wo, jnp.where(lost, 0, f * safe_divide(one, pdf)), pdf, jnp.bool_(False), one)
 
 
 class Look(NamedTuple):
@@ -136,6 +137,11 @@ def _side(wi):
     return jnp.where(wi[2] < 0, -1, 1).astype(wi.dtype)
 
 
+def _leaves(wo, m):
+    """Whether wo, once it is on the far side, is also beyond the facet; else it is lost, as in Mitsuba."""
+    return wo[0] * m[0] + wo[1] * m[1] < wo[2] * m[2]
+
+
 def _evaluate(look: Look, wi: Float[Array, "3"], wo: Float[Array, "3"]) -> tuple[Float[Array, "3"], Float[Array, ""]]:
     side = _side(wi)
     wi, wo = wi * side, wo * side
@@ -165,8 +171,7 @@ def _evaluate(look: Look, wi: Float[Array, "3"], wo: Float[Array, "3"]) -> tuple
         value, _ = facets.reflected(wi, back)
         chance = look.chance_through_facets(wi)
         drawn = (1 - base) * jnp.where(through, chance, 1 - chance) * facets.reflected_pdf(wi, back)
-        # As in Mitsuba, what leaves on the side of the facet that it came from is lost.
-        seen = ~through | (dot(wo, m) < 0)
+        seen = ~through | _leaves(back, m)
         color = jnp.where(through, passed * look.base_color, reflected)
         f = f + jnp.where(seen, look.spec_trans * color * value, 0)
         pdf = pdf + jnp.where(seen, drawn, 0)
