@@ -210,6 +210,37 @@ def test_a_furnace_of_masks_stays_white(make_scene):
     np.testing.assert_allclose(pj.render(scene, spp=16), 1, rtol=1e-5)
 
 
+@pytest.fixture(scope="module")
+def screened(make_scene):
+    """A blend and a mask of half the opacity before it, under a lamp behind a screen of a quarter."""
+    half = '<float name="weight" value="0.4"/><bsdf type="diffuse"/>'
+    metal = '<bsdf type="roughconductor"><float name="alpha" value="0.4"/></bsdf>'
+    floor = f'<bsdf type="blendbsdf" id="floor">{half}{metal}</bsdf>'
+    leaf = f'<transform name="to_world"><scale value="0.5"/><translate z="1"/></transform>{HALF}'
+    screen = (
+        '<transform name="to_world"><scale value="2"/><translate z="2"/></transform><bsdf type="mask" id="screen">'
+        '<float name="opacity" value="0.25"/><bsdf type="twosided"><bsdf type="diffuse"/></bsdf></bsdf>'
+    )
+    lamp = (
+        '<transform name="to_world"><rotate y="1" angle="180"/><translate z="3"/></transform>'
+        '<emitter type="area"><rgb name="radiance" value="2"/></emitter>'
+    )
+    return make_scene("".join(map(PLATE.format, (floor, leaf, screen, lamp))), origin="3, 0, 1.3", res=16, depth=6)
+
+
+@pytest.mark.slow
+def test_light_samples_and_bsdf_samples_find_the_same_behind_masks(screened, estimate, agree):
+    both, light, bsdf = (estimate(screened, spp=256, strategy=each) for each in ("mis", "light", "bsdf"))
+    agree(both, light, rounding=1e-3)
+    agree(both, bsdf, rounding=1e-3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["floor.weight", "leaf.opacity", "screen.opacity"])
+def test_derivatives_in_shares_are_those_of_differences(screened, name):
+    assert pj.check_gradient(screened, name, spp=64).passed
+
+
 @pytest.fixture
 def load_text(write_scene):
     """(body, integrator, **camera) -> Scene."""
