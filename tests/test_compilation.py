@@ -16,12 +16,13 @@ from pathjax.compile import native
 from pathjax.compile.lanes import lanes
 from pathjax.compile.lanes.interpreter import Interpreter
 from pathjax.compile.lanes.scheduling import from_queue
-from pathjax.derivatives import ior_step, jacobian, tangents
+from pathjax.derivatives import ior_step, jacobian, record, tangents
 from pathjax.integrators import pixel
 from pathjax.integrators.options import DEFAULTS, Options
 from pathjax.rendering import aovs, bounces, query
 from pathjax.rendering.progressive import replicates
 from pathjax.rendering.render import pixel_means
+from pathjax.scene import parameters as named
 from pathjax.sensors.film import pixel_count
 from pathjax.transport import control, factors, patches, rays, view
 
@@ -127,6 +128,19 @@ def test_image_and_derivatives_are_one_native_kernel_and_finite(jacobian_kernel_
     _, colors, glass, _ = parts
     # Nothing is constant in the picture, but what it does not show.
     assert colors.size + glass.size > 0 and max(np.abs(x).max(initial=0) for x in (colors, glass)) > 1e-3
+
+
+@pytest.mark.slow
+def test_a_sweep_is_native(shipped):
+    """The paths of a part, and its last sweep."""
+    scene = shipped("cornell_box", res=16)
+    pixels = jnp.arange(pixel_count(scene.film), dtype=jnp.int32)
+    paths = tuple({parameter.path for parameter in scene.about.parameters.values()})
+    options = Options(derivative=True, by_vertex=True)
+    work = jnp.ones((len(pixels), 3)), pixels, *pixel.numbers(pixels, 0, 4, 1)
+    text = record.pullback.lower(named.nameless(scene), *work, paths=paths, options=options).compile().as_text()
+    entry = text[text.index("\nENTRY ") :]
+    assert entry.count("xla_cpu_small_call") == 2 and " while(" not in entry
 
 
 @pytest.mark.slow

@@ -28,7 +28,7 @@ from pathjax.scene.scene import Scene
 Paths = tuple[tuple, ...]
 # Of a table, where the values of its columns are in the scene -> place of the column.
 Columns = dict[tuple, int]
-# Of one number: places in the list, and their shares; of more than one place.
+# Of one number: places in the list, and their shares where there are several.
 Entries = tuple[tuple[Int[Array, ""], ...], tuple[Float[Array, ""], ...] | None]
 
 

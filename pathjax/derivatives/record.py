@@ -27,6 +27,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from pathjax import emitters
 from pathjax.compile import native_fold, persistent_loop, together
+from pathjax.compile.lanes import flags
 from pathjax.core import sampler
 from pathjax.core.math import at
 from pathjax.derivatives import places
@@ -34,6 +35,7 @@ from pathjax.emitters import Choice
 from pathjax.integrators import path, pixel
 from pathjax.integrators.options import Options
 from pathjax.integrators.random_numbers import Bounce, bounce_numbers
+from pathjax.scene import parameters as named
 from pathjax.scene.scene import Scene
 
 # Trips of the ring, a power of 2, and those between two sweeps. A path of more than the difference is not recorded
@@ -42,6 +44,7 @@ RING, WINDOW = 1024, 32
 # Entries of a list that every lane sums up by itself.
 FEW = 8
 
+# Bits of what a lane records.
 BEGINS, ENDS, HOLDS = 1, 2, 4
 
 
@@ -110,9 +113,9 @@ def extend(
 
 def columns_of(record: Record) -> list:
     """Its numbers, one after another, the two flags in one."""
-    flags = jnp.where(record.begins, BEGINS, 0) | jnp.where(record.ends, ENDS, 0)
+    bits = jnp.where(record.begins, BEGINS, 0) | jnp.where(record.ends, ENDS, 0)
     numbers = [x for leaf in jax.tree.leaves(record._replace(begins=None, ends=None)) for x in jnp.ravel(leaf)]
-    return [flags, *numbers]
+    return [bits, *numbers]
 
 
 # ---- the memory that lanes share ------------------------------------------------------------------------------------
@@ -149,9 +152,9 @@ def start(scene: Scene, record: Record, entries: int, lanes: int) -> Memory:
 
 def remember(structure: Record, memory: Memory, here: Bool[Array, " W"], columns: list) -> Memory:
     """Record a vertex of every lane; now and then, sweep."""
-    flags, *numbers = columns
+    bits, *numbers = columns
     # A lane without an item records nothing that is whole.
-    columns = [jnp.where(here, flags | HOLDS, BEGINS | ENDS), *numbers]
+    columns = [jnp.where(here, bits | HOLDS, BEGINS | ENDS), *numbers]
     row = memory.clock & (RING - 1)
 
     def with_row(buffer, x):
@@ -168,11 +171,11 @@ def sweep(structure: Record, memory: Memory, due: Bool[Array, ""]) -> Memory:
 
     def step(state: Sweep) -> Sweep:
         row = (memory.clock - 1 - state.back) & (RING - 1)
-        flags, *numbers = [
+        bits, *numbers = [
             lax.dynamic_index_in_dim(x, row, keepdims=False, allow_negative_indices=False) for x in memory.ring
         ]
         record = unflattened(structure, numbers)
-        begins, ends, holds = (flags & bit != 0 for bit in (BEGINS, ENDS, HOLDS))
+        begins, ends, holds = (bits & bit != 0 for bit in (BEGINS, ENDS, HOLDS))
         complete = (state.complete != 0) | ends
         here = complete & (state.stopped == 0) & holds
         # What is not finite in one path stays out of the one before.
@@ -226,10 +229,8 @@ def add(total, slot: Slot, change: list[Float[Array, " W"]]):
     return lax.fori_loop(0, len(change[0]), one, total)
 
 
-def all_set(flags: Bool[Array, " W"]) -> Bool[Array, ""]:
-    from pathjax.compile.lanes import flags as of_lanes
-
-    return ~of_lanes.any_set(of_lanes.packed(~flags))
+def all_set(of_lanes: Bool[Array, " W"]) -> Bool[Array, ""]:
+    return ~flags.any_set(flags.packed(~of_lanes))
 
 
 # ---- pixels ---------------------------------------------------------------------------------------------------------
@@ -289,13 +290,10 @@ def pullback(scene: Scene, adjoint, pixels, first_sample, spp, seed, *, paths, o
     begin, end = partial(start, scene, structure, entries), partial(finish, structure)
     work = adjoint, (pixels, first_sample, spp, seed)
     total = native_fold(f, work, scene, choice, lights, start=begin, finish=end, devices=devices)
-    return [_shaped(total, place, array) for place, array in ((first[p], _array(scene, p)) for p in paths)]
+    return [_of_array(total, first[path], named.get(scene, path)) for path in paths]
 
 
-def _array(scene, path):
-    return places.named.get(scene, path)
-
-
-def _shaped(total, begins, array):
+def _of_array(total, begins, array):
+    """Of the list, what belongs to an array of colours (R, 3) or of numbers (R,)."""
     rows = total[begins : begins + len(array)]
     return rows if array.ndim == 2 else rows.sum(1)

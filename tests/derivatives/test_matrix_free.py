@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import pathjax as pj
+from pathjax.compile import mapping
 from pathjax.derivatives import matrix_free, record
 from pathjax.images import write_exr
 from pathjax.integrators.options import Options
@@ -148,6 +149,16 @@ def test_the_jacobian_is_the_same(room):
         terms = np.asarray(J[name]).reshape(-1, 3, 3) * np.asarray(v)[..., None]
         gap = np.abs(pulled[name] - terms.sum((0, 1)))
         assert (gap <= ROUNDING * np.abs(terms).sum((0, 1))).all(), name
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(len(jax.local_devices()) < 2, reason="needs two devices")
+def test_sums_are_bitwise_the_same_on_any_number_of_devices(room, monkeypatch):
+    monkeypatch.setattr(mapping, "ITEMS_OF_A_PART", 24)  # three parts of an image
+    scene, v = limited(room(), 6, 3), jnp.ones((RES * RES, 3))
+    one, many = (parts(scene, devices=devices)[2](v) for devices in (1, None))
+    for name in one:
+        np.testing.assert_array_equal(one[name], many[name])
 
 
 @pytest.fixture(scope="module")
