@@ -11,6 +11,7 @@ from pathjax.bsdfs.dielectric import IndexOfRefraction
 from pathjax.bsdfs.interface import Interface
 from pathjax.bsdfs.ior import IOR
 from pathjax.bsdfs.rough import Rough
+from pathjax.compile import compute_once
 from pathjax.core.math import dot, normalize, safe_divide, smaller
 from pathjax.core.types import BSDFSample
 from pathjax.kinds import Row
@@ -20,7 +21,8 @@ class RoughDielectric(Rough, Interface):
     """Rough interface, whose facets reflect or refract once (Walter et al. 2007); `int_ior` lies on the side that the
     normal points away from.
 
-    No path moves with its IOR: directions are drawn by the present one, and the weights carry the derivative.
+    No path moves with its IOR: directions are drawn by the present one, and the weights carry the derivative. Of GGX an
+    edge is missing from it: facets stand upright too, with which f ends abruptly at directions that the IOR moves.
     """
 
     int_ior = IndexOfRefraction(IOR["bk7"])
@@ -44,7 +46,7 @@ class RoughDielectric(Rough, Interface):
         h = wi + wo * jnp.where(reflects, 1, eta)
         squared = dot(h, h)
         m = normalize(h)
-        m = m * jnp.where(m[2] < 0, -1, 1)
+        m = compute_once(m * jnp.where(m[2] < 0, -1, 1))
         i, o = dot(wi, m), dot(wo, m) * jnp.where(reflects, 1, -1)
         # Both see the side of the facet that they see of the surface.
         possible = (i > 0) & (o > 0) & (wi[2] > 0) & (wo[2] != 0)
@@ -53,7 +55,7 @@ class RoughDielectric(Rough, Interface):
         chance = jnp.where(reflects, reflectance, 1 - reflectance)
         # Times D (wi . m) dm/dwo, equations 14 and 17; 4 (wo . m)^2 is the square of h, too, where light is reflected.
         spread = safe_divide(i * o * jnp.where(reflects, 1, eta * eta), jnp.where(possible, squared, 0))
-        common = chance * facets.area(m) * spread
+        common = compute_once(chance * facets.area(m) * spread)
         far = jnp.stack([wo[0], wo[1], jnp.where(possible, jnp.abs(wo[2]), 1)])
         scale = jnp.where(reflects, 1, 1 / (eta * eta))
         above = jnp.stack([wi[0], wi[1], jnp.where(possible, wi[2], 1)])
@@ -66,13 +68,14 @@ class RoughDielectric(Rough, Interface):
         """Of a normal that wi sees reflect with the probability R, or else refract."""
         eta, side = lax.stop_gradient(_eta(p, wi)), _side(wi)
         seen = wi * side
-        m = Rough.facets(p).sample(seen, u)
+        m = compute_once(Rough.facets(p).sample(seen, u))
         i = jnp.clip(dot(seen, m), 0, 1)
         reflectance, cos_t = fresnel.dielectric(i, eta)
         reflects = u[2] < reflectance
         # 2 i m - wi, or (i / eta - cos_t) m - wi / eta.
         scale = jnp.where(reflects, 1, 1 / eta)
-        wo = lax.stop_gradient(((scale * i + jnp.where(reflects, i, -cos_t)) * m - scale * seen) * side)
+        wo = ((scale * i + jnp.where(reflects, i, -cos_t)) * m - scale * seen) * side
+        wo = compute_once(lax.stop_gradient(wo))
         f, pdf = RoughDielectric.evaluate(p, wi, wo)
         # What lies on the other side of the surface than what was drawn has another density.
         pdf = jnp.where((wo[2] * side > 0) == reflects, pdf, 0)
