@@ -22,10 +22,7 @@ ROUNDING = 1e-3
 
 @pytest.fixture
 def with_border(tmp_path):
-    """Copy of a scene for which Mitsuba samples beyond the border of the film, as pathjax always does.
-
-    Without, Mitsuba's pixels near the border look through a part of their filter only.
-    """
+    """Copy of a scene whose pixels look beyond the border of the film."""
 
     def copy(path):
         for folder in ("meshes", "textures"):

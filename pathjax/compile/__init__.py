@@ -16,7 +16,7 @@ from __future__ import annotations
 from pathjax.compile.cache import keep_kernels
 from pathjax.compile.jax_compat import is_symbolic_zero, is_traced
 from pathjax.compile.linear import linear
-from pathjax.compile.mapping import MANY_ITEMS, native_fold, native_map
+from pathjax.compile.mapping import MANY_ITEMS, native_fold, native_map, split_map
 from pathjax.compile.primitives import compute_once, one_by_one, persistent_loop, together
 from pathjax.compile.promotion import usual_promotion
 from pathjax.compile.threads import calls_at_once, concurrently, devices_of_a_call
@@ -38,6 +38,7 @@ __all__ = [
     "one_by_one",
     "persistent_loop",
     "setup",
+    "split_map",
     "together",
     "usual_promotion",
 ]

@@ -161,6 +161,30 @@ def _map(f, xs, shared, form, devices):
     return jax.tree.map(gather, mapped(jax.tree.map(deal, xs), *shared))
 
 
+def split_map(f: Callable, count: int, *shared, devices: int | None = None):
+    """`f(first, size, *shared)` -> (..., size), for runs of `count` columns, one run a device; joined, (..., count).
+
+    For arithmetic on whole arrays that every device holds: each computes a part of the columns.
+    """
+    chosen = jax.local_devices()[:devices]
+    size = -(-count // len(chosen))
+    if len(chosen) == 1:
+        return f(jnp.int32(0), size, *shared)
+
+    def on_one_device(*shared):
+        return f(lax.axis_index("device") * size, size, *shared)[None]
+
+    mapped = jax.shard_map(
+        on_one_device,
+        mesh=Mesh(np.array(chosen), ("device",)),
+        in_specs=PartitionSpec(),
+        out_specs=PartitionSpec("device"),
+        check_vma=False,
+    )
+    runs = jnp.moveaxis(mapped(*shared), 0, -2)
+    return runs.reshape(*runs.shape[:-2], size * len(chosen))[..., :count]
+
+
 def _loop(f, xs, shared):
     return lax.map(lambda x: f(x, *shared), xs)
 

@@ -18,12 +18,13 @@ from jaxtyping import Array, Float, Int
 
 from pathjax import emitters
 from pathjax.bsdfs import dielectric
-from pathjax.compile import is_traced, native_map, usual_promotion
+from pathjax.compile import is_traced, usual_promotion
 from pathjax.core.types import Number
 from pathjax.derivatives import ior, ior_difference, ior_step, rules, tangents
 from pathjax.errors import InputError
 from pathjax.integrators import pixel
 from pathjax.integrators.options import Counts, Options
+from pathjax.integrators.reconstruction import map_pixels
 from pathjax.kinds.parameter import Parameter
 from pathjax.scene import parameters as named
 from pathjax.scene.scene import Scene
@@ -98,13 +99,13 @@ def jacobian(
         raise InputError(f"method {method!r} is unknown; use one of {', '.join(METHODS)}")
     if step is not None and not is_traced(step) and not 0 < step < 1:
         raise InputError(f"step = {step}; it must lie between 0 and 1, in units of relative IOR")
-    options = Options(strategy)
+    options = Options(strategy, shared=scene.film.shared)
     options.check_counts(spp, seed)
     options.check_strategy(scene)
     wanted = {name: named.find(scene, name) for name in names}
-    pixels = jnp.arange(film.pixel_count(scene.film), dtype=jnp.int32)
+    pixels, scene = film.pixels(scene.film), named.nameless(named.attached(scene))
     image, derivatives, bias, used = pixel_jacobians(
-        named.nameless(named.attached(scene)), wanted, pixels, 0, spp, seed, options, method=method, step=step
+        scene, wanted, pixels, 0, spp, seed, options, method=method, step=step
     )
     shape = (*film.image_shape(scene.film), 3)
 
@@ -185,7 +186,7 @@ def _jacobians(scene, pixels, first_sample, spp, seed, steps, *, wanted, options
     one_pixel = partial(_pixel_jacobian, wanted=wanted, options=options)
     work = pixels, first_sample, spp, seed
     shared = scene, choice, tangents.unit_tangents(scene, wanted.colors), steps
-    return native_map(one_pixel, work, *shared, form=form, devices=devices)
+    return map_pixels(one_pixel, work, *shared, options=options, form=form, devices=devices)
 
 
 def _pixel_jacobian(work: pixel.Work, scene, choice, unit_tangents, steps, wanted: Wanted, options: Options):

@@ -40,6 +40,8 @@ class Options:
     split_depth: int = 0  # at most MOST_SPLITS
     sampler: str = "lattice"  # of SAMPLERS
     controlled: bool = False  # a `transport.Control` decides on roulette
+    # How films are sampled, of which users choose nothing but the filter.
+    shared: bool = False  # samples count in all pixels under the filter, so pixels are all of the film, in order
     # What other parts of the package ask for.
     derivative: bool = False  # follow also what carries nothing, since its derivative may; the value is the same
     by_vertex: bool = False  # `Path.L` is the Gain of the last vertex

@@ -7,7 +7,8 @@ samples. Then two independent renders A and B replace the square by a product: t
     g = (J_A' W r_B + J_B' W r_A) / 2,    r = image - target,
 
 has mean 0 at the truth, whatever the noise of the renders, and its matrix (J_A' W J_B + J_B' W J_A) / 2 is not too
-large either. Newton's method finds its root; its scatter over the pixels, which are independent, gives the covariance.
+large either. Newton's method finds its root; its scatter over the pixels gives the covariance. Pixels of the renders
+are independent. Those of a target may share samples under a wide filter: then the scatter is that of blocks of pixels.
 """
 
 from __future__ import annotations
@@ -91,7 +92,8 @@ def fit(
     Args:
         scene: a scene, or a list of views; views share parameters by name.
         target: linear RGB or a `Target`, as `read_target` returns it; or a list of them, one for each view.
-            Its noise must be independent from pixel to pixel; the fit finds out how large it is.
+            Its noise must be independent from pixel to pixel, but for what they share under the filter of the scene's
+            film; the fit finds out how large it is.
         names: of parameters to recover, as `parameters` lists them.
         start: values to begin with, by name; default: the scene's.
         spp: samples per pixel of each of the two independent renders of the last stage.

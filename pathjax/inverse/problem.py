@@ -10,6 +10,7 @@ import numpy as np
 
 from pathjax.errors import InputError
 from pathjax.images.metrics import ROUNDING
+from pathjax.inverse import uncertainty
 from pathjax.inverse.parameter_vector import ParameterVector
 from pathjax.inverse.target import Target
 from pathjax.scene import parameters as named
@@ -61,6 +62,25 @@ class Problem:
     groups: list[Views]
     vector: ParameterVector
     start: np.ndarray  # (n,) values
+
+    @property
+    def reach(self) -> int:
+        """How far the noise of targets may be correlated, in pixels: targets look as the scenes that are fitted."""
+        return max(each.film.reach if each.film.shared else 0 for each in self.scenes)
+
+    @property
+    def alike(self) -> float:
+        """Sum of squared correlations of a pixel's noise with that around it."""
+        return max(float((film.correlation(each.film) ** 2).sum()) for each in self.scenes)
+
+    def scatter(self, scores: np.ndarray) -> np.ndarray:
+        """(k, k) covariance of the sum of scores (N, k), which are those of `flat` and have the mean 0."""
+        if not self.reach:
+            return scores.T @ scores
+        shapes = [views.targets.shape[:3] for views in self.groups]
+        parts = np.split(scores, np.cumsum([np.prod(shape) for shape in shapes])[:-1])
+        images = [image for part, shape in zip(parts, shapes, strict=True) for image in part.reshape(*shape, -1)]
+        return uncertainty.scatter_of_blocks(images, 2 * self.reach + 1)
 
     @staticmethod
     def with_values(scene: Scene, values) -> Scene:
@@ -122,7 +142,9 @@ def build(scene, target, names, start) -> Problem:
         replace(t, image=t.image * exposure, step=t.step * exposure, ceiling=t.ceiling * exposure) for t in targets
     ]
     rounding = ROUNDING * max(level * exposure, np.finfo(np.float32).tiny ** 0.25)  # its square must be a number
-    groups = _groups(scenes, targets, exposure, names)
+    # Pixels that share samples are not independent, as the uncertainty of a fit supposes them to be.
+    own = [replace(each, film=film.with_own_samples(each.film)) for each in scenes]
+    groups = _groups(own, targets, exposure, names)
     return Problem(scenes, targets, exposure, rounding, groups, vector, vector.pack(values))
 
 

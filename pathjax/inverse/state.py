@@ -85,7 +85,7 @@ class State:
         self.weights = problem.flat(by_view).astype(self.dtype)
 
     def solve(self, free: np.ndarray) -> None:
-        self.solution = uncertainty.solve(self.evidence, self.weights, self.scale, free)
+        self.solution = uncertainty.solve(self.evidence, self.weights, self.scale, free, self.problem.scatter)
 
     def halves(self) -> weights.Halves:
         """Residuals of the two renders, (H, W, 3) each, of each view."""

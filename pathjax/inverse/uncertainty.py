@@ -53,11 +53,12 @@ class Solution(NamedTuple):
     inverse: np.ndarray  # (n, n) of the curvature, within what is determined
 
 
-def solve(evidence: Evidence, weights, scale, free) -> Solution:
+def solve(evidence: Evidence, weights, scale, free, scatter=None) -> Solution:
     """Eigenvectors of the curvature, those kept that noise cannot have made, and the sandwich covariance on them.
 
     Args:
         weights: (N, 3); scale: (n,) units of the components; free: (n,) bool, the others stay where they are.
+        scatter: (N, k) deviations of the scores -> (k, k) covariance of their sum; None: pixels are independent.
     """
     weights = np.asarray(weights, np.float64)
     jacobians = np.asarray(evidence.jacobians, np.float64)[..., free] * scale[free]
@@ -69,11 +70,11 @@ def solve(evidence: Evidence, weights, scale, free) -> Solution:
     # Columns that are the same up to the rounding of float32 leave a curvature of its square.
     rounding = curvature.max(initial=0) * (10 * np.finfo(np.float32).eps) ** 2
     significant = curvature > np.maximum(MIN_SIGNIFICANCE * noise, rounding)
-    # Pixels are independent: their scatter is that of the score, with target, renders and Jacobians (White 1980).
+    # The scatter of pixels is that of the score, with target, renders and Jacobians (White 1980).
     along = evidence.scores(weights, np) @ vectors
     spread = along - along.mean(0)
     inverse = np.where(significant, 1 / np.where(significant, curvature, 1), 0)
-    covariance = inverse[:, None] * (spread.T @ spread) * inverse
+    covariance = inverse[:, None] * (spread.T @ spread if scatter is None else scatter(spread)) * inverse
     kept = significant & (np.sqrt(np.diag(covariance)) < MAX_RELATIVE_ERROR)
 
     everywhere = np.zeros((len(free), len(vectors)))
@@ -83,6 +84,21 @@ def solve(evidence: Evidence, weights, scale, free) -> Solution:
     step = -inside @ (inverse * along.sum(0))[kept]
     inverse = (inside * inverse[kept]) @ inside.T
     return Solution(inside @ inside.T, covariance, everywhere[:, ~kept], step, inverse)
+
+
+def scatter_of_blocks(images: list[np.ndarray], side: int) -> np.ndarray:
+    """(k, k) covariance of the sum of images (H, W, k) whose pixels are correlated as far as some part of `side`.
+
+    That of sums over blocks, in all places (Bartlett's window; Conley 1999, J. Econometrics 92): it counts pairs of
+    pixels at the distance d by 1 - |d_x| / side and 1 - |d_y| / side, so it is never negative.
+    """
+    total = 0
+    for image in images:
+        sums = np.cumsum(np.cumsum(np.pad(image, [(side, side - 1)] * 2 + [(0, 0)]), 0), 1)
+        blocks = sums[side:, side:] - sums[:-side, side:] - sums[side:, :-side] + sums[:-side, :-side]
+        blocks = blocks.reshape(-1, image.shape[-1])
+        total = total + blocks.T @ blocks / side**2
+    return total
 
 
 def rounding_covariance(influence, step, phase, noise) -> np.ndarray:
@@ -110,7 +126,7 @@ def deviation(values) -> float:
     return float(np.median(np.abs(values)) / 0.6745) if values.size else 1.0
 
 
-def structure(misfits: list[np.ndarray]) -> tuple[float, float]:
+def structure(misfits: list[np.ndarray], apart: int = 1, alike: float = 1.0) -> tuple[float, float]:
     """Moran's I of the residuals, -1 to 1, and its significance.
 
     Noise is independent from pixel to pixel, and a wrong image is not: this tells a local minimum, or a scene that
@@ -120,6 +136,8 @@ def structure(misfits: list[np.ndarray]) -> tuple[float, float]:
 
     Args:
         misfits: of each view (H, W, 3) image - target in standard deviations, 0 where the target may look so.
+        apart, alike: where noise is correlated, the distance from which on it is not, and the sum of squared
+            correlations around a pixel: only pixels that far from each other are compared.
     """
     products, expected, variances = [], [], []
     for misfit in misfits:
@@ -130,7 +148,7 @@ def structure(misfits: list[np.ndarray]) -> tuple[float, float]:
         size = STRUCTURE_WINDOW, STRUCTURE_WINDOW, 1, 1
         squares = ndimage.uniform_filter(f[..., :, None] * f[..., None, :], size, mode="constant")
         squares /= np.where(present, share, 1)[..., None, None]
-        for down, right in STRUCTURE_PAIRS:
+        for down, right in STRUCTURE_PAIRS if apart == 1 else [(0, apart), (apart, -apart), (apart, 0), (apart, apart)]:
             one = np.s_[down:, max(right, 0) : f.shape[1] + min(right, 0)]
             other = np.s_[: f.shape[0] - down, max(-right, 0) : f.shape[1] + min(-right, 0)]
             both = present[one] & present[other]
@@ -138,4 +156,4 @@ def structure(misfits: list[np.ndarray]) -> tuple[float, float]:
             variances.append((squares[one] * squares[other]).sum((-2, -1))[both])
             expected.append(((f[one] ** 2 + f[other] ** 2).sum(-1) / 2)[both])
     shared, total, variance = (np.concatenate(parts).sum() for parts in (products, expected, variances))
-    return (float(shared / total), float(shared / np.sqrt(variance))) if total else (0.0, 0.0)
+    return (float(shared / total), float(shared / np.sqrt(alike * variance))) if total else (0.0, 0.0)

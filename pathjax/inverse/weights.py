@@ -105,7 +105,7 @@ def structure(halves: Halves, problem: Problem, noise: Noise, used: list[np.ndar
         # Of values that are clipped, or may be, only what is beyond noise is known to be wrong.
         misfit = target.misfit(target.image + mean, np.where(use, 0, CLIP_MARGIN * deviation * unit))
         misfits.append(np.where(np.abs(mean) > least, misfit, 0) / (deviation * unit))
-    agreement, significance = uncertainty.structure(misfits)
+    agreement, significance = uncertainty.structure(misfits, problem.reach + 1, problem.alike)
     return agreement, significance > uncertainty.STRUCTURE_SIGNIFICANCE
 
 

@@ -8,10 +8,11 @@ from functools import partial
 import jax
 import numpy as np
 
-from pathjax.compile import native_map, usual_promotion
+from pathjax.compile import usual_promotion
 from pathjax.errors import InputError
 from pathjax.integrators import aov, pixel
-from pathjax.integrators.options import check_counts
+from pathjax.integrators.options import DEFAULTS, Options, check_counts
+from pathjax.integrators.reconstruction import map_pixels
 from pathjax.rendering.progressive import replicates
 from pathjax.scene.parameters import nameless
 from pathjax.scene.scene import Scene
@@ -27,7 +28,8 @@ CHUNK_PIXELS = 1 << 14
 def render_aovs(scene: Scene, names: Sequence[str], spp: int = MAX_SPP, seed: int = 0) -> dict[str, np.ndarray]:
     """Return images of what the camera sees first, as Mitsuba's `aov` integrator does.
 
-    Each is the mean over the film positions of the first min(spp, 16) samples that `render_until` takes for this seed.
+    Each is the mean over the film positions of the first min(spp, 16) samples that `render_until` takes for this seed,
+    through the film's filter.
 
     Args:
         names: "depth" (1 channel), the distance along the ray from the near clip plane; "normal" (3), the shading
@@ -45,15 +47,17 @@ def render_aovs(scene: Scene, names: Sequence[str], spp: int = MAX_SPP, seed: in
     spp = min(spp, MAX_SPP)
     shares = replicates.shares(np.array([spp], np.int32))
     count, seeds = film.pixel_count(scene.film), replicates.seeds(seed)
-    chunk = min(CHUNK_PIXELS, count)
+    options = Options(shared=scene.film.shared)
+    sampled = film.pixel_count(film.of_samples(scene.film))
+    chunk = sampled if options.shared else min(CHUNK_PIXELS, count)
     images = [np.empty((count, width), np.float32) for width in (1, 3, 3)]
     for first in range(0, count, chunk):
         # The last call repeats the last pixel up to full length.
-        pixels = np.minimum(np.arange(first, first + chunk, dtype=np.int32), count - 1)
+        pixels = np.minimum(np.arange(first, first + chunk, dtype=np.int32), sampled - 1)
         tiled = np.tile(pixels, replicates.COUNT)
         numbers = pixel.numbers(tiled, 0, *(np.repeat(x, chunk) for x in (np.maximum(shares, 1), seeds)))
-        for image, means in zip(images, _render_aovs(nameless(scene), tiled, *numbers), strict=True):
-            means = np.asarray(means, np.float32).reshape(replicates.COUNT, chunk, -1)
+        for image, means in zip(images, _render_aovs(nameless(scene), tiled, *numbers, options=options), strict=True):
+            means = np.asarray(means, np.float32).reshape(replicates.COUNT, -1, image.shape[1])
             mean = (means * (shares / np.float32(spp))[..., None]).sum(0, dtype=np.float32)
             image[first : first + chunk] = mean[: count - first]
     height, width = film.image_shape(scene.film)
@@ -69,6 +73,7 @@ def check_names(names: Sequence[str], known: Sequence[str]) -> None:
             raise InputError(f"output variable {name} is named twice; name it once")
 
 
-@partial(jax.jit, static_argnames=("form", "devices"))
-def _render_aovs(scene, pixels, first_sample, spp, seed, *, form=None, devices=None):
-    return native_map(aov.mean, (pixels, first_sample, spp, seed), scene, form=form, devices=devices)
+@partial(jax.jit, static_argnames=("options", "form", "devices"))
+def _render_aovs(scene, pixels, first_sample, spp, seed, *, options=DEFAULTS, form=None, devices=None):
+    work = pixels, first_sample, spp, seed
+    return map_pixels(aov.mean, work, scene, options=options, form=form, devices=devices)

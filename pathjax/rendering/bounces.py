@@ -12,12 +12,13 @@ from jax import lax
 from jaxtyping import Array, Integer
 
 from pathjax import emitters
-from pathjax.compile import is_traced, native_map, usual_promotion
+from pathjax.compile import is_traced, usual_promotion
 from pathjax.core.types import Number
 from pathjax.derivatives import rules, tangents
 from pathjax.errors import InputError
 from pathjax.integrators import pixel, terms
 from pathjax.integrators.options import DEFAULTS, Options
+from pathjax.integrators.reconstruction import map_pixels
 from pathjax.rendering import tail
 from pathjax.rendering.progressive import error_estimate, replicates
 from pathjax.scene.scene import Scene
@@ -39,6 +40,7 @@ class Bounces:
     terms: jax.Array  # (depth, H, W, 3) linear RGB
     deviation: jax.Array  # (depth, H, W, 3) root of `variance`; float32 may not hold the variance itself
     samples: jax.Array  # (H, W) int32 of each pixel, from which the standard error is made
+    correlation: jax.Array  # (S, S) of the noise of pixels around one with its own, `film.correlation`
 
     @property
     def variance(self) -> jax.Array:
@@ -62,8 +64,7 @@ class Bounces:
         known = np.isfinite(means).all((0, 2))
         if not known.any():
             raise InputError("no pixel is finite, so nothing can be told of the light beyond these terms")
-        # Pixels are independent of each other.
-        error = np.sqrt((deviation[:, known] ** 2).sum(1)) / known.sum()
+        error = np.sqrt(np.asarray(self.correlation).sum() * (deviation[:, known] ** 2).sum(1)) / known.sum()
         return tail.fit(means[:, known].mean(1), error)
 
 
@@ -98,19 +99,20 @@ def render_bounces(
             anything but named parameters.
     """
     _check_depth(depth)
-    options = Options(strategy)
+    options = Options(strategy, shared=scene.film.shared)
     options.check_counts(spp, seed)
     options.check_strategy(scene)
     shape = film.image_shape(scene.film)
-    pixels = jnp.arange(film.pixel_count(scene.film), dtype=jnp.int32).reshape(shape)
-    return _bounces(scene, int(depth), pixels, spp, seed, options, errors)
+    samples = jnp.broadcast_to(jnp.asarray(spp, jnp.int32), shape)
+    return _bounces(scene, int(depth), film.pixels(scene.film), samples, seed, options, errors)
 
 
 def pilot(scene: Scene, seed: int = 0) -> tail.Tail:
     """The Tail after 12 terms, from 64 samples of at most 4096 pixels, spread evenly over the image."""
     count = film.pixel_count(scene.film)
     pixels = np.unique(np.linspace(0, count - 1, min(PILOT_PIXELS, count)).astype(np.int32))
-    return _bounces(scene, PILOT_TERMS, jnp.asarray(pixels)[None], PILOT_SPP, seed, DEFAULTS, True).tail()
+    samples = jnp.full((1, len(pixels)), PILOT_SPP, jnp.int32)
+    return _bounces(scene, PILOT_TERMS, jnp.asarray(pixels), samples, seed, DEFAULTS, True).tail()
 
 
 def _check_depth(depth) -> None:
@@ -121,22 +123,22 @@ def _check_depth(depth) -> None:
         )
 
 
-def _bounces(scene, depth, pixels, spp, seed, options, errors) -> Bounces:
-    """Of pixels (H, W)."""
-    samples = jnp.broadcast_to(jnp.asarray(spp, jnp.int32), pixels.shape)
+def _bounces(scene, depth, pixels, samples, seed, options, errors) -> Bounces:
+    """samples: (H, W); pixels: as many, or all of a film that shares samples."""
     shares = replicates.shares(samples.ravel()) if errors else samples.reshape(1, -1)
     seeds = replicates.seeds(seed) if errors else jnp.asarray(seed, jnp.uint32)[None]
     most = None if is_traced(shares) else int(shares.max())
     estimator = _TermSums(depth, replace(options, by_vertex=True))
     scene = replace(scene, max_depth=jnp.int32(depth))
     if most is None or most <= _PORTION:
-        sums = rules.estimate(estimator, scene, pixels.ravel(), 0, shares, seeds)
+        sums = rules.estimate(estimator, scene, pixels, 0, shares, seeds)
     else:
         sums = 0
         for first in range(0, most, _PORTION):
             portion = jnp.clip(shares - first, 0, _PORTION)
-            sums = sums + rules.estimate(estimator, scene, pixels.ravel(), first, portion, seeds)
-    return Bounces(*_moments(sums, shares, shape=pixels.shape), samples)
+            sums = sums + rules.estimate(estimator, scene, pixels, first, portion, seeds)
+    own = scene.film if options.shared else film.with_own_samples(scene.film)
+    return Bounces(*_moments(sums, shares, shape=samples.shape), samples, film.correlation(own))
 
 
 @partial(jax.jit, static_argnames="shape")
@@ -196,7 +198,11 @@ def _kernel(scene, pixels, first_sample, spp, seeds, *, depth, options: Options,
         sums, by_color, _ = tangents.by_tangent(of, scene, colors, unit_tangents)
         return sums, by_color
 
-    tiled = jnp.tile(pixels, len(seeds))
-    work = tiled, *pixel.numbers(tiled, first_sample, spp.ravel(), jnp.repeat(seeds, len(pixels)))
-    results = native_map(one_pixel, work, scene, choice, tangents.unit_tangents(scene, colors))
-    return tuple(x.reshape(*spp.shape, *x.shape[1:]) for x in results)
+    tiled, counts = jnp.tile(pixels, len(seeds)), spp
+    if options.shared:
+        counts = film.extended(scene.film, spp)
+    work = tiled, *pixel.numbers(tiled, first_sample, counts.ravel(), jnp.repeat(seeds, len(pixels)))
+    results = map_pixels(one_pixel, work, scene, choice, tangents.unit_tangents(scene, colors), options=options)
+    results = (x.reshape(*spp.shape, *x.shape[1:]) for x in results)
+    # Those of a film that shares samples are means.
+    return tuple(x * spp.reshape(*spp.shape, *[1] * (x.ndim - 2)) if options.shared else x for x in results)

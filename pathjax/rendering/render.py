@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import jax
@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from pathjax import emitters
-from pathjax.compile import native_map, usual_promotion
+from pathjax.compile import usual_promotion
 from pathjax.core.types import Number
 from pathjax.derivatives import matrix_free
 from pathjax.derivatives.jacobian import pixel_jacobians
@@ -18,6 +18,7 @@ from pathjax.derivatives.rules import estimate
 from pathjax.errors import InputError
 from pathjax.integrators import pixel
 from pathjax.integrators.options import DEFAULTS, Options
+from pathjax.integrators.reconstruction import map_pixels
 from pathjax.scene.scene import Scene
 from pathjax.sensors import film
 
@@ -39,11 +40,14 @@ def render(
 ) -> Float[Array, "height width 3"]:
     """Render a scene: linear RGB, unbiased up to the scene's max_depth (except with `fresnel="schlick"`).
 
+    Through a filter wider than a pixel, samples count in all pixels under it, and images are ratios of sums
+    (`integrators.reconstruction`): their bias is O(1/spp) of what light varies within a pixel.
+
     Pure. It may be called inside `jax.jit`, under `jax.vmap` over scenes that differ in parameters or cameras, and be
     differentiated in what `parameters` lists, forwards or backwards. The derivative is that of `jacobian`, which says
     how far it may be trusted. A kernel is compiled once for each scene structure, image size and set of the choices
-    below; other parameters, cameras, spp and seeds reuse it. A sample that is not finite leaves its pixel not finite,
-    and the others untouched.
+    below; other parameters, cameras, spp and seeds reuse it. A sample that is not finite leaves the pixels not finite
+    in which it counts, and the others untouched.
 
     Args:
         spp: samples per pixel, at least 1.
@@ -63,13 +67,13 @@ def render(
         InputError: a choice is unknown or refused, or spp, seed or split_depth is out of range; differentiation in
             anything but named parameters, or with another sampler, split_depth or control than the default.
     """
-    options = Options(strategy, fresnel, split_depth, sampler, controlled=control is not None)
+    shared = scene.film.shared
+    options = Options(strategy, fresnel, split_depth, sampler, controlled=control is not None, shared=shared)
     options.check_counts(spp, seed)
     options.check_strategy(scene)
     if control is not None:
         _check_control(control, scene)
-    pixels = jnp.arange(film.pixel_count(scene.film), dtype=jnp.int32)
-    image = render_pixels(scene, pixels, 0, spp, seed, options, control)
+    image = render_pixels(scene, film.pixels(scene.film), 0, spp, seed, options, control)
     return image.reshape(*film.image_shape(scene.film), 3)
 
 
@@ -117,11 +121,21 @@ class _PixelMeans:
 
     def push(self, scene, wanted, changes, control, pixels, *numbers):
         self.options.check_differentiable()
-        return matrix_free.push(scene, wanted, changes, pixels, *numbers, self.options, **dict(self.how))
+        options, *work = self._own_samples(scene, pixels, *numbers)
+        return matrix_free.push(scene, wanted, changes, *work, options, **dict(self.how))
 
     def pull(self, scene, wanted, adjoint, control, pixels, *numbers):
         self.options.check_differentiable()
-        return matrix_free.pull(scene, wanted, adjoint, pixels, *numbers, self.options, **dict(self.how))
+        options, *work = self._own_samples(scene, pixels, *numbers)
+        return matrix_free.pull(scene, wanted, adjoint, *work, options, **dict(self.how))
+
+    def _own_samples(self, scene, pixels, *numbers):
+        """What a sweep takes: it knows of pixels that draw their own samples alone, whose means are the same."""
+        if not self.options.shared:
+            return self.options, pixels, *numbers
+        pixels = jnp.arange(film.pixel_count(scene.film), dtype=jnp.int32)
+        numbers = (film.cropped(scene.film, x[None])[0] for x in numbers)
+        return replace(self.options, shared=False), pixels, *numbers
 
 
 @partial(jax.jit, static_argnames=("options", "form", "devices"))
@@ -130,4 +144,5 @@ def pixel_means(scene, pixels, first_sample, spp, seed, control=None, *, options
     scene = options.applied(scene)
     choice = emitters.choice(scene.emitters, options.strategy)
     work = pixels, first_sample, spp, seed
-    return native_map(partial(pixel.mean, options=options), work, scene, choice, control, form=form, devices=devices)
+    of_pixel = partial(pixel.mean, options=options)
+    return map_pixels(of_pixel, work, scene, choice, control, options=options, form=form, devices=devices)

@@ -2,20 +2,29 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
+from pathjax.core.math import at
 from pathjax.description.fields import Fields
 from pathjax.kinds import Unused
 from pathjax.sensors import filters
-from pathjax.sensors.filters import Filter, Gaussian
+from pathjax.sensors.filters import Box, Filter, Gaussian
 
 MAX_PIXELS = 10**9
+# Samples count in this many pixels to either side at most: work and program grow with the square. A filter that is
+# wider is sampled by importance, each pixel for itself.
+MOST_REACH = 4
+# At which the filter is looked at, over the width of a pixel.
+_POINTS = 256
 PIXEL_FORMATS = ("rgb", "rgba", "luminance", "luminance_alpha", "xyz", "xyza")
 
 
@@ -26,6 +35,11 @@ class Film:
     width: int = field(metadata={"static": True})
     height: int = field(metadata={"static": True})
     crop: tuple[int, int, int, int] = field(metadata={"static": True})  # offset x, y, width, height
+    reach: int = field(metadata={"static": True})  # pixels to either side of its own that the filter covers
+    # Whether a sample counts in all of these; else each pixel draws samples of its own, by importance of the filter.
+    shared: bool = field(metadata={"static": True})
+    border: bool = field(metadata={"static": True})  # whether what is just outside of the crop window is sampled too
+    running: jax.Array | None  # (2 reach + 2,) integral of the filter up to edges of pixels; None: not needed
 
 
 @dataclass(frozen=True)
@@ -36,11 +50,11 @@ class HDRFilm:
     height: int = 576
     crop: tuple[int, int, int, int] | None = None  # offset x, offset y, width, height; None: all of the film
     filter: Filter = Gaussian()
+    sample_border: bool = False
 
     unused: ClassVar[Mapping[str, Unused]] = {
         "file_format": Unused("string", choices=("openexr", "exr", "rgbe", "pfm")),
         "component_format": Unused("string", choices=("float16", "float32", "uint32")),
-        "sample_border": Unused("boolean"),
         "compensate": Unused("boolean"),
         "banner": Unused("boolean"),
     }
@@ -61,11 +75,14 @@ class HDRFilm:
             loader.note(fields.where("pixel_format"), f"asks for {pixel_format}; images are linear RGB here")
         nested = fields.objects("rfilter")
         filter = loader.make(nested[0], filters.KINDS) if nested else cls.filter
-        return cls(width, height, (x, y, crop_width, crop_height), filter)
+        return cls(width, height, (x, y, crop_width, crop_height), filter, fields.boolean("sample_border", False))
 
     def build(self, dtype) -> Film:
         crop = (0, 0, self.width, self.height) if self.crop is None else tuple(self.crop)
-        return Film(self.filter.build(dtype), self.width, self.height, crop)
+        filter, reach = self.filter.build(dtype), math.ceil(self.filter.radius - 0.5)
+        running = None if self.sample_border or not reach else np.asarray(_running(filter, reach), dtype)
+        shared = 0 < reach <= MOST_REACH
+        return Film(filter, self.width, self.height, crop, reach, shared, self.sample_border, running)
 
 
 # By the name that scene files give them.
@@ -85,7 +102,14 @@ def sample_position(
     x0, y0, width, _ = film.crop
     center = jnp.stack([pixel % width + x0, pixel // width + y0]).astype(u.dtype) + jnp.asarray(0.5, u.dtype)
     offset, weight = film.filter.sample(u)
+    if film.running is not None:
+        weight = weight * _inside(film, pixel, offset)
     return (center + offset) / jnp.array([film.width, film.height], u.dtype), weight
+
+
+def pixels(film: Film) -> Int[Array, " N"]:
+    """All pixels that are sampled for an image, row by row."""
+    return jnp.arange(pixel_count(of_samples(film)), dtype=jnp.int32)
 
 
 def pixel_count(film: Film) -> int:
@@ -95,3 +119,76 @@ def pixel_count(film: Film) -> int:
 def image_shape(film: Film) -> tuple[int, int]:
     """Height and width of the image, that of the crop window."""
     return film.crop[3], film.crop[2]
+
+
+def of_samples(film: Film) -> Film:
+    """The film on which the samples of one that shares them are drawn: evenly, each in its own pixel."""
+    x, y, width, height = film.crop
+    out = _outside(film)
+    window = x - out, y - out, width + 2 * out, height + 2 * out
+    return replace(film, filter=Box().build(film.filter.radius.dtype), crop=window, reach=0, shared=False, running=None)
+
+
+def cropped(film: Film, image: Float[Array, "R N *rest"]) -> Float[Array, "R HW *rest"]:
+    """Those pixels of `of_samples(film)` that are in the film's own crop window."""
+    _, _, width, height = of_samples(film).crop
+    out = _outside(film)
+    inside = image.reshape(len(image), height, width, *image.shape[2:])[:, out : height - out, out : width - out]
+    return inside.reshape(len(image), pixel_count(film), *image.shape[2:])
+
+
+def extended(film: Film, image: Float[Array, "R HW"]) -> Float[Array, "R N"]:
+    """An image as `cropped` gives it, continued beyond its borders."""
+    height, width = image_shape(film)
+    out = _outside(film)
+    inside = image.reshape(len(image), height, width)
+    return jnp.pad(inside, ((0, 0), (out, out), (out, out)), mode="edge").reshape(len(image), -1)
+
+
+@jax.jit
+def correlation(film: Film) -> Float[Array, "S S"]:
+    """Of the noise of pixels (y, x) with that of the one in the middle, for they share samples.
+
+    What a sample tells is taken to be independent of where in its pixel it lies.
+    """
+    if not film.shared:
+        return jnp.ones((1, 1), film.filter.radius.dtype)
+    heights = _heights(film.filter, film.reach)
+    lags = 2 * film.reach
+    padded = jnp.pad(heights, ((lags, lags), (0, 0)))
+    shared = jnp.stack([(padded[lag : lag + len(heights)] * heights).sum() for lag in range(2 * lags + 1)])
+    return jnp.outer(shared, shared) / shared[lags] ** 2
+
+
+def _heights(filter: Filter, reach: int) -> Float[Array, "S points"]:
+    """The filter over each pixel that it covers, at points of equal distance."""
+    steps = jnp.arange(-reach, reach + 1)[:, None]
+    x = (jnp.arange(_POINTS) + 0.5) / _POINTS - 0.5
+    return filter.evaluate((x + steps).astype(filter.radius.dtype))
+
+
+@partial(jax.jit, static_argnums=1)
+def _running(filter: Filter, reach: int) -> Float[Array, " S+1"]:
+    total = jnp.cumsum(_heights(filter, reach).sum(-1))
+    return jnp.concatenate([jnp.zeros_like(total[:1]), total]) / total[-1]
+
+
+def _inside(film: Film, pixel: Int[Array, ""], offset: Float[Array, "2"]) -> Float[Array, ""]:
+    """Weight of mean 1 by which a pixel looks through that part of its filter which lies in the crop window."""
+    _, _, *size = film.crop
+    weight = jnp.ones_like(offset[0])
+    for place, count, distance in zip((pixel % size[0], pixel // size[0]), size, offset, strict=True):
+        before, after = jnp.minimum(place, film.reach), jnp.minimum(count - 1 - place, film.reach)
+        share = at(film.running, film.reach + after + 1) - at(film.running, film.reach - before)
+        seen = place.astype(distance.dtype) + distance + jnp.asarray(0.5, distance.dtype)
+        weight = jnp.where((seen >= 0) & (seen <= count), weight / share, 0)
+    return weight
+
+
+def _outside(film: Film) -> int:
+    return film.reach if film.border and film.shared else 0
+
+
+def with_own_samples(film: Film) -> Film:
+    """The film whose pixels share no samples, and so are independent of each other; the mean image is the same."""
+    return replace(film, shared=False)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import jax
@@ -13,6 +13,7 @@ from pathjax.compile import native_map, usual_promotion
 from pathjax.core import sampler
 from pathjax.core.math import at, dot
 from pathjax.errors import InputError
+from pathjax.integrators import reconstruction
 from pathjax.integrators.options import check_counts
 from pathjax.integrators.pixel import camera_ray
 from pathjax.scene.parameters import nameless
@@ -64,11 +65,23 @@ def image(scene: Scene, light: Radiosity, spp: int = 16, seed: int = 0) -> jax.A
         raise InputError(
             "this scene hides its emitters from the camera, and patches show them; load it with hide_emitters false"
         )
-    pixels = jnp.arange(film.pixel_count(scene.film), dtype=jnp.int32)
+    pixels, shape = film.pixels(scene.film), (*film.image_shape(scene.film), 3)
+    if scene.film.shared:
+        return _shared(nameless(scene), light, pixels, jnp.uint32(seed), spp=spp).reshape(shape)
     total = jnp.zeros((len(pixels), 3), light.L.dtype)
     for number in range(spp):
         total = _with_sample(total, nameless(scene), light, pixels, jnp.uint32(number), jnp.uint32(seed))
-    return (total / spp).reshape(*film.image_shape(scene.film), 3)
+    return (total / spp).reshape(shape)
+
+
+@partial(jax.jit, static_argnames="spp")
+def _shared(scene, light, pixels, seed, *, spp):
+    """The image through a filter under which pixels share their samples."""
+    sampled = replace(scene, film=film.of_samples(scene.film))
+    numbers = jnp.broadcast_to(jnp.arange(spp, dtype=jnp.uint32)[:, None], (spp, len(pixels)))
+    seen = [_seen(sampled, light.patches, pixels, numbers[number, 0], seed)[0] for number in range(spp)]
+    u = reconstruction.film_numbers(sampled, pixels, numbers, seed)
+    return reconstruction.image_of_samples(scene.film, u, light.L[jnp.stack(seen)])
 
 
 @jax.jit

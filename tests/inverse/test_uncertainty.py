@@ -168,3 +168,49 @@ def test_pixels_without_noise_do_not_matter():
     wide[:, :40] = view
     np.testing.assert_allclose(structure(wide), structure(view))
     assert uncertainty.structure([np.zeros((40, 40, 3))]) == (0, 0)
+
+
+# What a Gaussian filter of standard deviation 1/2 does to noise.
+SHARED = np.exp(-2.0 * np.arange(-2, 3) ** 2)
+
+
+def shared_noise(rng, size=48):
+    """(size, size, 3) of variance 1, correlated as pixels that share samples."""
+    noise = rng.normal(size=(size + 4, size + 4, 3))
+    for axis in (0, 1):
+        noise = np.apply_along_axis(np.convolve, axis, noise, SHARED, "valid")
+    return noise / (SHARED**2).sum()
+
+
+def test_the_scatter_of_blocks_counts_pairs_by_their_distance():
+    image, side = np.random.default_rng(1).normal(size=(9, 12, 2)), 3
+    expected = np.zeros((2, 2))
+    for down, right in np.ndindex(5, 5):
+        down, right = down - 2, right - 2
+        one = image[max(down, 0) : 9 + min(down, 0), max(right, 0) : 12 + min(right, 0)].reshape(-1, 2)
+        other = image[max(-down, 0) : 9 + min(-down, 0), max(-right, 0) : 12 + min(-right, 0)].reshape(-1, 2)
+        expected += (1 - abs(down) / side) * (1 - abs(right) / side) * one.T @ other
+    np.testing.assert_allclose(uncertainty.scatter_of_blocks([image], side), expected, atol=1e-12)
+    independent = image.reshape(-1, 2)
+    np.testing.assert_allclose(uncertainty.scatter_of_blocks([image], 1), independent.T @ independent, atol=1e-12)
+
+
+def test_blocks_know_the_scatter_of_pixels_that_share_samples():
+    """Within 15 %, twice what 300 sums tell; taken for independent, it would be 0.41 of what it is."""
+    rng = np.random.default_rng(2)
+    noise = [shared_noise(rng) for _ in range(100)]
+    truth = np.mean([image.sum((0, 1)) ** 2 for image in noise])
+    found = np.mean([np.diag(uncertainty.scatter_of_blocks([image], 9)) for image in noise])
+    assert 0.85 < found / truth < 1.15
+    assert np.mean([(image**2).sum((0, 1)) for image in noise]) < 0.55 * truth
+
+
+def test_shared_samples_are_no_structure():
+    """Of 100 images of noise none is significant, and a smooth misfit below the noise is."""
+    rng = np.random.default_rng(3)
+    correlation = np.convolve(SHARED, SHARED) / (SHARED**2).sum()
+    alike = (correlation**2).sum() ** 2
+    found = np.array([uncertainty.structure([shared_noise(rng)], 3, alike)[1] for _ in range(100)])
+    assert np.abs(found).max() < 4 and 0.8 < found.std() < 1.2
+    slope = 0.5 * np.sin(np.arange(48) / 8)[:, None, None]
+    assert uncertainty.structure([shared_noise(rng) + slope], 3, alike)[1] > uncertainty.STRUCTURE_SIGNIFICANCE

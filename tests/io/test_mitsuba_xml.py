@@ -699,7 +699,7 @@ WITHOUT_EFFECT = [
     (
         "hdrfilm",
         '<sensor type="perspective"><film type="hdrfilm">{}</film></sensor>',
-        ["file_format", "component_format", "sample_border", "compensate", "banner"],
+        ["file_format", "component_format", "compensate", "banner"],
     ),
     ("path", '<integrator type="path">{}</integrator>', ["block_size", "samples_per_pass", "timeout"]),
     ("volpath", '<integrator type="volpath">{}</integrator>', ["block_size", "samples_per_pass", "timeout"]),

@@ -14,8 +14,8 @@ FALSE_ALARM = 1e-4
 N = 400_000
 
 
-def built(filter):
-    return film.HDRFilm(8, 6, (2, 1, 4, 3), filter).build(jnp.float32)
+def built(filter, border=True):
+    return film.HDRFilm(8, 6, (2, 1, 4, 3), filter, border).build(jnp.float32)
 
 
 def sampled(made, pixel, u):
@@ -105,6 +105,15 @@ def test_weights_vary_little(name):
     """Importance sampling: only the tails of a Gaussian leave a weight other than 1, most in the last of 1024 steps."""
     weights = sampled(built(FILTERS[name][0]), 0, uniform(50_000))[1]
     assert weights.min() >= 0 and weights.max() < 5 and weights.std() < (0.15 if "gaussian" in name else 1e-9)
+
+
+@pytest.mark.parametrize("name", FILTERS)
+def test_without_a_border_weights_of_mean_1_are_0_outside_of_the_crop_window(name):
+    """Pixel 0 is the upper left corner of the window."""
+    offsets, weights = sampled(built(FILTERS[name][0], border=False), 0, uniform(100_000))
+    assert abs(weights.mean() - 1) < 5 * max(weights.std() / np.sqrt(len(weights)), 1e-6)
+    outside = (offsets < -0.5 - 1e-5).any(1)
+    assert (weights[outside] == 0).all() and (outside.any() == (name != "box"))
 
 
 def test_box_samples_of_a_pixel_stay_in_it():

@@ -17,7 +17,7 @@ import numpy as np
 
 from pathjax import version
 from pathjax.errors import InputError, InputWarning
-from pathjax.rendering.progressive.passes import State, plan
+from pathjax.rendering.progressive.passes import State
 from pathjax.rendering.progressive.replicates import one_if_equal
 from pathjax.scene.parameters import nameless
 from pathjax.scene.scene import Scene
@@ -29,8 +29,6 @@ from pathjax.system.json_text import json_text
 COST = 200
 # What the first is thought to cost: it is made after a second.
 _FIRST_COST = 0.005
-# Arrays that hold one number for each pixel, or one for all.
-OF_PIXELS = ("count", "weights")
 
 
 def identity(scene: Scene, seed: int, strategy: str, adaptive: bool) -> dict[str, str | int]:
@@ -80,7 +78,7 @@ class Checkpoint:
             with np.load(self.path, allow_pickle=False) as file:
                 facts = json.loads(str(file["facts"]))
                 identity, spp, seconds = facts["identity"], int(facts["spp"]), float(facts["seconds"])
-                arrays = {name: file[name] for name in ("means", *OF_PIXELS)} if file.files != ["facts"] else {}
+                arrays = {name: file[name] for name in ("means", *fresh.of_pixels)} if file.files != ["facts"] else {}
         except Exception as error:  # zipfile, zlib, NumPy and json raise what they like, as the file's bytes have it
             raise self._refusal(f"is not a checkpoint, or is damaged ({error})") from None
         for name, ours in self.identity.items():
@@ -92,11 +90,11 @@ class Checkpoint:
         state = replace(fresh, seconds=seconds)
         for name, array in arrays.items():
             wanted = getattr(fresh, name)
-            shapes = (wanted.shape, (1,)) if name in OF_PIXELS else (wanted.shape,)
+            shapes = (wanted.shape, (1,)) if name in fresh.of_pixels else (wanted.shape,)
             if array.dtype != wanted.dtype or array.shape not in shapes:
                 raise self._refusal(f"is damaged: {name} is {array.dtype}{list(array.shape)}")
             setattr(state, name, np.broadcast_to(array, wanted.shape).copy())
-        plan(state, spp)
+        state.resume(spp)
         return state
 
     def save(self, state: State) -> None:
@@ -107,7 +105,7 @@ class Checkpoint:
         # Before the first sample nothing needs to be kept, only to be known to be writable.
         arrays = {}
         if state.count.any():
-            arrays = {"means": state.means} | {name: one_if_equal(getattr(state, name)) for name in OF_PIXELS}
+            arrays = {"means": state.means} | {name: one_if_equal(getattr(state, name)) for name in state.of_pixels}
         facts = json_text({"identity": self.identity, "spp": state.spp, "seconds": state.seconds})
 
         try:

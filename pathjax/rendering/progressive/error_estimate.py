@@ -73,18 +73,20 @@ def _floor(image: np.ndarray) -> float:
     return RELATIVE_FLOOR * level(image) ** 2
 
 
-def image_error(image: np.ndarray, variance: np.ndarray) -> ImageError:
+def image_error(image: np.ndarray, variance: np.ndarray, alike: float = 1.0) -> ImageError:
     """Of (..., 3). Pixels that are not finite are left out; nan where the image has no `images.level`.
 
     The bound takes pixels as draws from a population: where few of them make up most of the error, their number is
     small and the bound high. Where single samples do (skewness beyond 6), the error exceeds it more often.
+
+    alike: how many pixels tell as much of variances as one that shares no samples: sum of squared correlations.
     """
     shares = contributions(image, variance)
     known = shares[np.isfinite(shares)]
     if not known.size:
         return ImageError(np.nan, np.nan)
     total = known.sum()
-    uncertainty = np.sqrt((known**2).sum()) / total if total > 0 else 0.0
+    uncertainty = np.sqrt(alike * (known**2).sum()) / total if total > 0 else 0.0
     square = total / known.size
     return ImageError(float(np.sqrt(square)), float(np.sqrt(square * (1 + CONFIDENCE * uncertainty))))
 

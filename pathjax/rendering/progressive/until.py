@@ -165,7 +165,7 @@ class Render:
             if math.isnan(error.bound) and self.spp == MAX_SPP and self.time_limit is None:
                 return "no estimate", found
             if state.spp == PILOT_SPP:
-                state.weights = error_estimate.sample_weights(image, variance).ravel()
+                state.spread(error_estimate.sample_weights(image, variance))
             passes.plan(state, min(_next_spp(state.spp, error, self.target_error), self.spp))
 
     def _on_target(self, error: error_estimate.ImageError) -> bool:
@@ -177,11 +177,12 @@ class Render:
         image, variance = (x.reshape(shape) for x in self.state.moments())
         # While some pixels know nothing of their error, neither does the image.
         known = self.state.count.min() >= 2
-        return image, variance, error_estimate.image_error(image, variance) if known else UNKNOWN
+        alike = float((film.correlation(self.scene.film) ** 2).sum())
+        return image, variance, error_estimate.image_error(image, variance, alike) if known else UNKNOWN
 
     def _result(self, reason, found) -> RenderResult:
         image, variance, error = found
-        count = self.state.count.reshape(image.shape[:2])
+        count = self.state.samples().reshape(image.shape[:2])
         if reason != "interrupted" and self._on_target(error):
             reason = "target error" if np.isfinite(image).all() else "no estimate"
         standard_error = error_estimate.standard_error(image, variance, count)

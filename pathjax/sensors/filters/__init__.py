@@ -1,7 +1,7 @@
 """Reconstruction filters, a file a kind: through one of them each pixel looks.
 
-Filters are sampled by importance: a pixel gathers only its own samples, with weights that average to 1, so that pixels
-stay independent of each other.
+Samples count in all pixels under the filter by its height there, `evaluate`. Where pixels are to be independent of each
+other, each draws its own by importance instead, `sample`, with weights that average to 1.
 """
 
 from __future__ import annotations

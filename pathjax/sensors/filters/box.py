@@ -22,3 +22,6 @@ class Box(Filter):
 
     def sample(self, u: Float[Array, "2"]) -> tuple[Float[Array, "2"], Float[Array, ""]]:
         return (2 * u - 1) * self.radius, jnp.ones_like(u[0])
+
+    def evaluate(self, x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+        return (jnp.abs(x) <= self.radius).astype(x.dtype)

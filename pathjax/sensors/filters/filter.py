@@ -18,6 +18,7 @@ class Filter(ABC):
     """A filter, a pytree: of numbers as a scene file has them, and once built of arrays."""
 
     unused: ClassVar[Mapping[str, Unused]] = {}
+    radius: jax.Array | float  # () pixels, beyond which it is 0
 
     @classmethod
     @abstractmethod
@@ -36,3 +37,7 @@ class Filter(ABC):
             offset from the middle of the pixel, in pixels, and weight of mean 1: weighted samples have the filter for
             their density.
         """
+
+    @abstractmethod
+    def evaluate(self, x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+        """Height at a distance in pixels along one axis, up to a factor; 0 beyond the radius."""

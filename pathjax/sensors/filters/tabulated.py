@@ -49,5 +49,4 @@ class Tabulated(Filter):
         return x, weights[0] * weights[1]
 
     def evaluate(self, x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-        """Height at a distance in pixels along one axis, up to a factor; 0 beyond the radius."""
         return jnp.where(jnp.abs(x) <= self.radius, self.height(x, jnp), 0)

@@ -23,3 +23,6 @@ class Tent(Filter):
 
     def sample(self, u: Float[Array, "2"]) -> tuple[Float[Array, "2"], Float[Array, ""]]:
         return tent(u) * self.radius, jnp.ones_like(u[0])
+
+    def evaluate(self, x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+        return jnp.maximum(1 - jnp.abs(x) / self.radius, 0)

@@ -1,0 +1,197 @@
+"""Images from samples that count in all pixels under the film's filter.
+
+A sample of pixel q, at an offset d from its middle, weighs w_k = f(d_x - k_x) f(d_y - k_y) in pixel q + k. With n_q
+samples of each pixel the image is
+
+    I(p) = A(p) / W(p),    A(p) = sum_k 1/n_(p-k) sum_i w_ki L_i,    W the same without L.
+
+So a constant stays constant, at borders too, where pixels around have no samples; and pixels with many samples weigh no
+more than others. W does not depend on the scene, so I is linear in what is sampled, and derivatives go the same way.
+
+Kernels know nothing of it: they give single samples of pixels that look through a box. The rest is sums of shifted
+images, outside of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from math import prod
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float, Int, UInt
+
+from pathjax.compile import native_map, split_map
+from pathjax.core import sampler
+from pathjax.core.math import safe_divide
+from pathjax.integrators.options import Options
+from pathjax.integrators.pixel import Work, add_compensated
+from pathjax.integrators.random_numbers import camera_numbers
+from pathjax.scene.scene import Scene
+from pathjax.sensors import film
+from pathjax.sensors.film import Film
+
+# Pixels in a row of `film.of_samples`, of R images: the first, and of each (R, n) first sample, spp, seed, and what a
+# sample weighs, 1/n_q above.
+Run = tuple[Int[Array, ""], UInt[Array, "R n"], UInt[Array, "R n"], UInt[Array, "R n"], Float[Array, "R n"]]
+
+# Samples that a call of the kernel gives: so many that few lanes are idle at its end; of one pixel at most, since few
+# may be asked for; and numbers of which they consist at most, where there are many derivatives.
+_SAMPLES, _OF_PIXEL, _NUMBERS = 1 << 16, 16, 1 << 24
+
+
+def map_pixels(of_pixel: Callable, work: Work, scene: Scene, *shared, options: Options, **how) -> object:
+    """`native_map` of pixels; of a film that shares samples, the images that these make.
+
+    Args:
+        of_pixel: (`pixel.Work`, scene, *shared) -> pytree, the mean over samples of a pixel.
+        work: arrays (N,); where samples are shared `film.pixels` of one image or of some, one after another.
+        how: `form` and `devices` of `native_map`.
+    Returns:
+        pytree of (N, ...); of a film that shares samples, without the pixels outside of its crop window.
+    """
+    if not options.shared:
+        return native_map(of_pixel, work, scene, *shared, **how)
+    count = film.pixel_count(film.of_samples(scene.film))
+    _, first_sample, spp, seed = (x.reshape(-1, count) for x in work)
+    scale = 1 / jnp.maximum(spp, 1).astype(scene.camera.origin.dtype)
+    run = jnp.int32(0), first_sample, spp, seed, scale
+    totals, weights = sums(of_pixel, run, scene, *shared, options=options, **how)
+    return jax.tree.map(lambda total: _images(scene.film, total, weights), totals)
+
+
+def _images(
+    through: Film, totals: Float[Array, "R m *rest"], weights: Float[Array, "R m"]
+) -> Float[Array, "pixels ..."]:
+    """A / W, of all pixels and the halo around them."""
+    mean = safe_divide(totals, weights.reshape(*weights.shape, *[1] * (totals.ndim - 2)))
+    edge = halo(through)
+    mean = film.cropped(through, mean[:, edge : mean.shape[1] - edge])
+    return mean.reshape(mean.shape[0] * mean.shape[1], *mean.shape[2:])
+
+
+def halo(made: Film) -> int:
+    """How many pixels before and after a run, row by row, its samples reach."""
+    return made.reach * (film.of_samples(made).crop[2] + 1)
+
+
+def sums(
+    of_pixel: Callable, run: Run, scene: Scene, *shared, options: Options, **how
+) -> tuple[object, Float[Array, "R m"]]:
+    """A and W of the samples of pixels in a row: pytree of (R, m, ...), (R, m), m = n + 2 `halo`, which begin before.
+
+    Arguments as for `map_pixels`.
+    """
+    first_pixel, first_sample, spp, seed, scale = run
+    through, sampled = scene.film, replace(scene, film=film.of_samples(scene.film))
+    copies, count = spp.shape
+    pixels = first_pixel + jnp.arange(count, dtype=jnp.int32)
+    one = jax.tree.map(lambda x: jax.ShapeDtypeStruct((), x.dtype), (pixels, first_sample, spp, seed))
+    leaves, structure = jax.tree.flatten(jax.eval_shape(of_pixel, one, sampled, *shared))
+    places = np.cumsum([prod(leaf.shape) for leaf in leaves])
+    block = max(min(_SAMPLES // spp.size, _NUMBERS // (spp.size * places[-1]), _OF_PIXEL), 1)
+
+    def add(number_of_block, state):
+        done = jnp.uint32(block) * number_of_block.astype(jnp.uint32) + jnp.arange(block, dtype=jnp.uint32)
+        done = done[:, None, None]
+        numbers, there = first_sample + done, done < spp
+        work = pixels, numbers, there.astype(jnp.uint32), seed
+        work = tuple(jnp.broadcast_to(x, numbers.shape).ravel() for x in work)
+        values = jax.tree.leaves(native_map(of_pixel, work, sampled, *shared, **how))
+        values = jnp.concatenate([x.reshape(*numbers.shape, -1) for x in values], -1)
+        values = jnp.where(there[..., None], values, 0)
+        u = film_numbers(sampled, pixels, numbers, seed, options.sampler)
+        spread = spread_samples(through, first_pixel, u, jnp.where(there, scale, 0), values, how.get("devices"))
+        return add_compensated(state, spread)
+
+    zero = jnp.zeros((copies, places[-1] + 1, count + 2 * halo(through)), scale.dtype)
+    blocks = (jnp.max(spp) + jnp.uint32(block - 1)) // jnp.uint32(block)
+    total, _ = lax.fori_loop(0, blocks.astype(jnp.int32), add, (zero, zero))
+    parts = jnp.split(jnp.moveaxis(total, 1, 2), places, axis=-1)
+    parts = [part.reshape(*part.shape[:2], *leaf.shape) for part, leaf in zip(parts, leaves, strict=False)]
+    return jax.tree.unflatten(structure, parts), total[:, -1]
+
+
+def film_numbers(
+    sampled: Scene,
+    pixels: Int[Array, "#*shape"],
+    numbers: UInt[Array, "*shape"],
+    seed: UInt[Array, "#*shape"],
+    points: str = "lattice",
+) -> Float[Array, "*shape 2"]:
+    """Where in their pixels the samples lie that have these numbers."""
+
+    def one(stream, number):
+        return camera_numbers(sampled, stream, number, points)[0]
+
+    streams = jnp.broadcast_to(sampler.pixel_stream(seed, pixels), numbers.shape)
+    return jax.vmap(one)(streams.ravel(), numbers.ravel()).reshape(*numbers.shape, 2)
+
+
+def spread_samples(
+    through: Film,
+    first_pixel: Int[Array, ""],
+    u: Float[Array, "B R n 2"],
+    scale: Float[Array, "B R n"],
+    values: Float[Array, "B R n C"],
+    devices: int | None = None,
+) -> Float[Array, "R C+1 m"]:
+    """Sums as `sums` gives them, the weights last, of B samples of each pixel; linear in the values."""
+    edge = halo(through)
+    ones = jnp.ones_like(scale)[..., None]
+    weighted = jnp.concatenate([values, ones], -1) * scale[..., None]
+    # Columns are pixels: those around the run, and what the last device has too many, have no samples.
+    spare = 2 * edge + len(jax.local_devices())
+    ends = (0, 0), (0, 0), (0, 0), (2 * edge, spare)
+    u, weighted = (jnp.pad(jnp.moveaxis(x, -1, 2), ends) for x in (u, weighted))
+
+    def of_run(first, size, some, u, weighted):
+        def window(x):
+            return lax.dynamic_slice_in_dim(x, first, size + 2 * edge, axis=-1)
+
+        x = first_pixel - 2 * edge + first + jnp.arange(size + 2 * edge)
+        spread = jax.vmap(partial(_spread, through, x))
+
+        def add(total, sample):
+            some, *sample = sample
+            return lax.cond(some, lambda: total + spread(*sample), lambda: total), None
+
+        total = jnp.zeros((*weighted.shape[1:3], size), weighted.dtype)
+        return lax.scan(add, total, (some, window(u), window(weighted)))[0]
+
+    some = (scale != 0).any((1, 2))
+    return split_map(of_run, values.shape[2] + 2 * edge, some, u, weighted, devices=devices)
+
+
+def _spread(
+    through: Film, pixels: Int[Array, " n"], u: Float[Array, "2 n"], weighted: Float[Array, "C n"]
+) -> Float[Array, "C m"]:
+    """One sample of each of n pixels in a row, spread; m = n - 2 `halo`, so that all that reach a pixel are there."""
+    reach, width, edge = through.reach, film.of_samples(through).crop[2], halo(through)
+    steps = jnp.arange(-reach, reach + 1)[:, None]
+    by_x, by_y = (through.filter.evaluate(u[axis] - 0.5 - steps.astype(u.dtype)) for axis in (0, 1))
+    # What lies beyond a row's ends is in no pixel.
+    x = pixels % width + steps
+    by_x = jnp.where((x >= 0) & (x < width), by_x, 0)
+    by_x, by_y, weighted = lax.optimization_barrier((by_x, by_y, weighted))
+    total = 0
+    for b in range(2 * reach + 1):
+        for a in range(2 * reach + 1):
+            first = edge - (b - reach) * width - (a - reach)
+            here = np.s_[..., first : first + len(pixels) - 2 * edge]
+            weight = by_x[a][here] * by_y[b][here]
+            # What is not finite spoils no pixel in which it does not count.
+            total = total + jnp.where(weight != 0, weight * weighted[here], 0)
+    return total
+
+
+def image_of_samples(
+    through: Film, u: Float[Array, "B N 2"], values: Float[Array, "B N C"]
+) -> Float[Array, "pixels C"]:
+    """The image that B samples of each of all pixels make, `film_numbers` u; linear in their values."""
+    total = spread_samples(through, jnp.int32(0), u[:, None], jnp.ones_like(u[:, None, :, 0]), values[:, None])
+    return _images(through, jnp.moveaxis(total[:, :-1], 1, 2), total[:, -1])
