@@ -11,17 +11,19 @@ from pathjax import bsdfs, testing
 from pathjax.bsdfs import Plastic, fresnel
 
 COLORS = {"diffuse_reflectance": np.array([0.9, 0.3, 0.0]), "specular_reflectance": np.array([0.2, 0.5, 1.0])}
+slow = pytest.mark.slow
 
 
+@slow
 @pytest.mark.parametrize(
     "values",
     [
         {},
-        pytest.param({"nonlinear": True, "diffuse_reflectance": np.array([0.95, 0.5, 0.1])}, marks=pytest.mark.slow),
-        pytest.param({**COLORS, "int_ior": 1.9}, marks=pytest.mark.slow),
-        pytest.param({"int_ior": 1.3, "ext_ior": 1.3}, marks=pytest.mark.slow),
-        pytest.param({"int_ior": 1.0, "ext_ior": 1.5}, marks=pytest.mark.slow),
-        pytest.param({"int_ior": 9.0, "nonlinear": True, "diffuse_reflectance": 1.0}, marks=pytest.mark.slow),
+        {"nonlinear": True, "diffuse_reflectance": np.array([0.95, 0.5, 0.1])},
+        {**COLORS, "int_ior": 1.9},
+        {"int_ior": 1.3, "ext_ior": 1.3},
+        {"int_ior": 1.0, "ext_ior": 1.5},
+        {"int_ior": 9.0, "nonlinear": True, "diffuse_reflectance": 1.0},
     ],
 )
 def test_plastic_passes_the_checks_of_all_kinds(values):
@@ -48,7 +50,7 @@ def scattered(materials, wi):
     return testing._on_sphere(materials, wi)[0].sum(0) + mirrored
 
 
-@pytest.mark.parametrize("nonlinear", [None, True])
+@pytest.mark.parametrize("nonlinear", [pytest.param(None, marks=slow), True])
 def test_samples_scatter_what_base_and_coat_do_and_so_do_their_derivatives(nonlinear):
     """`check_bsdf` leaves out the mean of the weights where Dirac lobes are part of it."""
     count, sigmas, step = 200_000, 4.5, 0.01

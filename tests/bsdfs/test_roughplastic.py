@@ -96,7 +96,8 @@ def test_rough_plastic_passes_the_checks_of_all_kinds(values):
     testing.check_bsdf(RoughPlastic, samples=50_000, **values)
 
 
-@pytest.mark.parametrize("distribution", ["beckmann", pytest.param("ggx", marks=slow)])
+@slow
+@pytest.mark.parametrize("distribution", ["beckmann", "ggx"])
 def test_the_smoothest_the_roughest_and_none_are_finite(distribution):
     for values in ({"alpha": 0.0}, {"alpha": 1.0}, {"int_ior": 1.3, "ext_ior": 1.3}):
         materials = testing.material(RoughPlastic, distribution=distribution, **COLORS, **values)
