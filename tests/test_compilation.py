@@ -30,7 +30,10 @@ ROOT = Path(__file__).resolve().parents[1]
 NAMES = sorted(path.stem for path in (*ROOT.glob("scenes/*.xml"), *ROOT.glob("tests/scenes/*.xml")))
 
 # Those whose kernels take longest to compile, among the scenes made for tests.
-LARGE = ("more_shapes", "normals", "rough_glass", "rough_metals", "shapes_and_filters", "textures")
+LARGE = (
+    *("more_shapes", "nested", "normals", "plastics", "principled"),
+    *("rough_glass", "rough_metals", "shapes_and_filters", "textures", "turned"),
+)
 SCENES = [pytest.param(name, marks=pytest.mark.slow if name in LARGE else ()) for name in NAMES]
 
 pytestmark = pytest.mark.skipif(not native(), reason="native loops are off")

@@ -29,12 +29,14 @@ from pathjax.compile import native_map, split_map
 from pathjax.core import sampler
 from pathjax.core.math import safe_divide
 from pathjax.integrators.options import Options
-from pathjax.integrators.pixel import Work, add_compensated
+from pathjax.integrators.pixel import add_compensated
 from pathjax.integrators.random_numbers import camera_numbers
 from pathjax.scene.scene import Scene
 from pathjax.sensors import film
 from pathjax.sensors.film import Film
 
+# Of each of N pixels what `pixel.Work` is of one.
+Works = tuple[Int[Array, " N"], UInt[Array, " N"], UInt[Array, " N"], UInt[Array, " N"]]
 # Pixels in a row of `film.of_samples`, of R images: the first, and of each (R, n) first sample, spp, seed, and what a
 # sample weighs, 1/n_q above.
 Run = tuple[Int[Array, ""], UInt[Array, "R n"], UInt[Array, "R n"], UInt[Array, "R n"], Float[Array, "R n"]]
@@ -44,7 +46,7 @@ Run = tuple[Int[Array, ""], UInt[Array, "R n"], UInt[Array, "R n"], UInt[Array, 
 _SAMPLES, _OF_PIXEL, _NUMBERS = 1 << 16, 16, 1 << 24
 
 
-def map_pixels(of_pixel: Callable, work: Work, scene: Scene, *shared, options: Options, **how) -> object:
+def map_pixels(of_pixel: Callable, work: Works, scene: Scene, *shared, options: Options, **how) -> object:
     """`native_map` of pixels; of a film that shares samples, the images that these make.
 
     Args:

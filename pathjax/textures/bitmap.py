@@ -19,6 +19,8 @@ from pathjax.textures.texture import Texture
 
 WRAPS = ("repeat", "mirror", "clamp")
 FILTERS = ("bilinear", "nearest")
+# From here on float32 does not tell texels apart.
+_FAR = 2.0**24
 
 
 class Bitmap(Texture):
@@ -138,6 +140,7 @@ def _wrapped(low, size, wrap):
 
 def _modulo(a, b):
     """a mod b, int32, of a whole a and b > 0, without division of integers, for which there is no SIMD."""
+    a = jnp.where(jnp.abs(a) < _FAR, a, 0)
     quotient = jnp.floor(a / b.astype(a.dtype)).astype(jnp.int32)
     rest = a.astype(jnp.int32) - quotient * b  # the rounding of the quotient moves it by b, at most
     rest = jnp.where(rest < 0, rest + b, rest)

@@ -117,7 +117,7 @@ def test_what_cannot_cover_a_light_is_refused(make_scene, tmp_path):
 
 @pytest.mark.slow
 def test_light_samples_find_what_bsdf_samples_do(make_scene, picture, estimate, agree):
-    """Of a cube, whose faces share one picture; Mitsuba samples one of its faces alone."""
+    """Of a cube, whose faces share one picture."""
     scene = make_scene(FLOOR + lamp(area(picture), half=0.4).replace('"rectangle"', '"cube"'), **VIEW)
     agree(estimate(scene, 256, strategy="bsdf"), estimate(scene, 256, strategy="light", first_seed=90))
 

@@ -27,7 +27,9 @@ def test_a_mesh_is_in_view_as_a_whole_whatever_its_size(ball, kind, size):
     mesh = trimesh.creation.icosphere(2, size)
     mesh.apply_translation([5 * size, -2 * size, size])
     scene = pj.load_scene(ball(kind, mesh), res=32)
-    hit = np.asarray(pj.render_aovs(scene, ["depth"], spp=4)["depth"]).reshape(24, 32) > 0
+    seen = np.asarray(pj.render_aovs(scene, ["depth"], spp=4)["depth"]).reshape(24, 32)
+    # Samples count in pixels around their own too, where they show less than half of it.
+    hit = seen > seen.max() / 2
     assert hit[12, 16]
     assert not (hit[0].any() or hit[-1].any() or hit[:, 0].any() or hit[:, -1].any())
     # The sphere in the sphere around its box fills 1/sqrt(3) of the height.
