@@ -90,10 +90,10 @@ def native_fold(f: Callable, xs, *shared, start: Callable, finish: Callable, dev
         devices: how many local devices to use; None: all.
     """
     count = jax.tree.leaves(xs)[0].shape[0]
-    devices = jax.local_devices()[:devices]
+    used = jax.local_devices()[:devices]
     nbytes = sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(jax.eval_shape(lambda: finish(start(_LANES)))))
     parts = min(MOST_PARTS, -(-count // ITEMS_OF_A_PART), max(1, MOST_BYTES // nbytes))
-    rounds = -(-parts // len(devices))
+    rounds = -(-parts // len(used))
     each = -(-count // parts)
     width = _LANES if each >= MANY_ITEMS else _FEW_LANES
 
@@ -101,8 +101,8 @@ def native_fold(f: Callable, xs, *shared, start: Callable, finish: Callable, dev
         """(N, ...) -> (devices, rounds, items, ...): item i belongs to part i % parts."""
         x = jnp.pad(x, [(0, each * parts - count), *[(0, 0)] * (x.ndim - 1)])
         x = x.reshape(each, parts, *x.shape[1:]).swapaxes(0, 1)
-        x = jnp.pad(x, [(0, rounds * len(devices) - parts), *[(0, 0)] * (x.ndim - 1)])
-        return x.reshape(len(devices), rounds, *x.shape[1:])
+        x = jnp.pad(x, [(0, rounds * len(used) - parts), *[(0, 0)] * (x.ndim - 1)])
+        return x.reshape(len(used), rounds, *x.shape[1:])
 
     def part(xs, shared):
         (memory,) = lanes(lambda *args: (f(*args),), width, memory=start(width))(xs, *shared)
@@ -111,13 +111,13 @@ def native_fold(f: Callable, xs, *shared, start: Callable, finish: Callable, dev
     def on_one_device(xs, *shared):
         return lax.map(lambda xs: part(xs, shared), jax.tree.map(lambda x: x[0], xs))
 
-    if len(devices) == 1:
+    if len(used) == 1:
         sums = on_one_device(jax.tree.map(deal, xs), *shared)
     else:
         spec = PartitionSpec("device")
         sums = jax.shard_map(
             on_one_device,
-            mesh=Mesh(np.array(devices), ("device",)),
+            mesh=Mesh(np.array(used), ("device",)),
             in_specs=(spec, *(PartitionSpec() for _ in shared)),
             out_specs=spec,
             check_vma=False,

@@ -27,7 +27,9 @@ def vectorised(f: Callable, xs, shared):
         outputs, result = jax.tree.flatten(f(jax.tree.unflatten(structure, leaves), *shared))
         return outputs
 
-    program, consts = program_of(flat, *item)
+    # Some accelerators round the factors of a product of matrices to 10 bits unless they are told not to.
+    with jax.default_matmul_precision("highest"):
+        program, consts = program_of(flat, *item)
     rows = jax.vmap(lambda *leaves: _evaluate(program, *consts, *leaves))(*jax.tree.leaves(xs))
     return jax.tree.unflatten(result, rows)
 

@@ -17,7 +17,7 @@ def chosen(u: Float[Array, " numbers"], chance: Float[Array, ""]) -> tuple[Bool[
     """
     first = u[0] < chance
     rest = safe_divide(u[0] - jnp.where(first, 0, chance), jnp.where(first, chance, 1 - chance))
-    below_1 = 1 - jnp.finfo(u.dtype).epsneg
+    below_1 = float(1 - jnp.finfo(u.dtype).epsneg)
     return first, jnp.concatenate([smaller(rest, below_1)[None], u[1:]])
 
 

@@ -154,3 +154,11 @@ def test_items_share_memory(monkeypatch, count):
 def test_one_item_alone_is_the_only_lane():
     table = histogram(jnp.int32(3), jnp.array([0, 3, 3, 1, 2], jnp.int32), jnp.zeros(4))
     np.testing.assert_allclose(table, [1, 0, 0, 1 / 2 + 1 / 3])
+
+
+def test_products_of_the_vectorised_form_are_not_rounded_to_fewer_bits():
+    """As accelerators do unless told otherwise; a CPU never does, so the program must say it."""
+    xs, m = jnp.ones((5, 3)), jnp.eye(3)
+    program = jax.jit(lambda xs, m: native_map(lambda x, m: m @ x, xs, m, form="vmap", devices=1)).lower(xs, m)
+    (product,) = [line for line in program.as_text().splitlines() if "dot_general" in line]
+    assert "precision = [HIGHEST, HIGHEST]" in product
