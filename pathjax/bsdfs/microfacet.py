@@ -151,7 +151,7 @@ class Beckmann(Distribution):
         """
         w = self._stretched(wi)
         cos, sin = smaller(w[2], 1), safe_sqrt(w[0] * w[0] + w[1] * w[1])
-        tip = 1 - jnp.finfo(cos.dtype).eps / 2
+        tip = float(1 - jnp.finfo(cos.dtype).eps / 2)
         cot = jnp.where(sin > 0, cos / jnp.where(sin > 0, sin, 1), 9)
         most = smaller(lax.erf(cot), tip)
 
@@ -164,7 +164,7 @@ class Beckmann(Distribution):
         for _ in range(2):
             y = jnp.clip(y, -tip, most)
             slope = lax.erf_inv(y)
-            y = y - (integral(y, slope) - target) / larger(cos - slope * sin, jnp.finfo(cos.dtype).tiny)
+            y = y - (integral(y, slope) - target) / larger(cos - slope * sin, float(jnp.finfo(cos.dtype).tiny))
         along = lax.erf_inv(jnp.clip(y, -tip, most))
         across = lax.erf_inv(jnp.clip(2 * u[1] - 1, -tip, tip))
         # Azimuth of wi; any where it has none.

@@ -130,7 +130,9 @@ def film_numbers(
     def one(stream, number):
         return camera_numbers(sampled, stream, number, points)[0]
 
-    streams = jnp.broadcast_to(sampler.pixel_stream(seed, pixels), numbers.shape)
+    seed, pixels = jnp.broadcast_arrays(seed, pixels)
+    streams = jax.vmap(sampler.pixel_stream)(seed.ravel(), pixels.ravel()).reshape(seed.shape)
+    streams = jnp.broadcast_to(streams, numbers.shape)
     return jax.vmap(one)(streams.ravel(), numbers.ravel()).reshape(*numbers.shape, 2)
 
 

@@ -11,7 +11,7 @@ from typing import ClassVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, Real
 
 from pathjax.core.math import at
 from pathjax.description.fields import Fields
@@ -137,7 +137,7 @@ def cropped(film: Film, image: Float[Array, "R N *rest"]) -> Float[Array, "R HW 
     return inside.reshape(len(image), pixel_count(film), *image.shape[2:])
 
 
-def extended(film: Film, image: Float[Array, "R HW"]) -> Float[Array, "R N"]:
+def extended(film: Film, image: Real[Array, "R HW"]) -> Real[Array, "R N"]:
     """An image as `cropped` gives it, continued beyond its borders."""
     height, width = image_shape(film)
     out = _outside(film)
@@ -168,7 +168,7 @@ def _heights(filter: Filter, reach: int) -> Float[Array, "S points"]:
 
 
 @partial(jax.jit, static_argnums=1)
-def _running(filter: Filter, reach: int) -> Float[Array, " S+1"]:
+def _running(filter: Filter, reach: int) -> Float[Array, " edges"]:
     total = jnp.cumsum(_heights(filter, reach).sum(-1))
     return jnp.concatenate([jnp.zeros_like(total[:1]), total]) / total[-1]
 

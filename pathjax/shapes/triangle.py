@@ -68,7 +68,7 @@ class Triangles(Table):
     margins: jax.Array | None  # (P,) of `coincident`, beside their own; None: nothing flat lies in any of these
     area_cdf: jax.Array | None  # (P,) running share of the area of each mesh that emits; None: none does
     # (P, 3, 3) by row: vertex, channel; 0 where a mesh has none of that name.
-    attributes: Mapping[str, jax.Array] = field(default_factory=dict)
+    attributes: Mapping[str, jax.Array | np.ndarray] = field(default_factory=dict)
 
     kind = "triangle"
     polygons = triangular = True
