@@ -57,8 +57,8 @@ class BSDF(Kind):
 
     @classmethod
     def capable(cls, table: Table, capability: str) -> bool:
-        """Whether rows of a table are: of what is the same for all rows of the kind, as the class says."""
-        return getattr(cls, capability)
+        """Whether rows of a table are: as the class says, or, of what is one of its parameters, where a row has it."""
+        return table.column(capability) is not None if capability in cls.declared else getattr(cls, capability)
 
     @classmethod
     def sides(cls, instance: Instance) -> tuple[Instance | None, Instance | None]:

@@ -79,12 +79,6 @@ class Principled(BSDF):
             values["specular"] = 0.5
         return super().instance(name, **values)
 
-    @classmethod
-    def capable(cls, table, capability):
-        if capability == "anisotropic":
-            return table.column("anisotropic") is not None
-        return super().capable(table, capability)
-
     @staticmethod
     def evaluate(p: Row, wi: Float[Array, "3"], wo: Float[Array, "3"]) -> tuple[Float[Array, "3"], Float[Array, ""]]:
         return _evaluate(_look(p), wi, wo)

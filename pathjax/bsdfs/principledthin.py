@@ -41,12 +41,6 @@ class PrincipledThin(BSDF):
         for way in ("reflectance", "transmittance")
     }
 
-    @classmethod
-    def capable(cls, table, capability):
-        if capability == "anisotropic":
-            return table.column("anisotropic") is not None
-        return super().capable(table, capability)
-
     @staticmethod
     def evaluate(p: Row, wi: Float[Array, "3"], wo: Float[Array, "3"]) -> tuple[Float[Array, "3"], Float[Array, ""]]:
         return _evaluate(Look.of(p), wi, wo)

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from functools import partial
 
 import jax
+import jax.numpy as jnp
 from jax import lax
 from jax.custom_batching import custom_vmap
 
@@ -97,4 +98,4 @@ def _switch(branches, which, operands) -> list:
 def _pick(which, cases):
     """Of each lane the row of one of the cases (N, ...)."""
     shape = (len(which),) + (1,) * (cases[0].ndim - 1)
-    return lax.select_n(jax.numpy.broadcast_to(which.reshape(shape), cases[0].shape), *cases)
+    return lax.select_n(jnp.broadcast_to(which.reshape(shape), cases[0].shape), *cases)
