@@ -178,9 +178,11 @@ class PerRow(Declared):
     """What a kind's own builder fills for each row: `shape` and `dtype` are its own."""
 
 
+@dataclass(frozen=True)
 class Shared(Declared):
     """An array that belongs to all rows together, filled by the kind's own builder."""
 
+    by_number: bool = False  # read at numbers that rows of the table tell, never as a whole: it may be longer
     shared = True
 
 

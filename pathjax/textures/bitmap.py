@@ -26,7 +26,7 @@ _FAR = 2.0**24
 class Bitmap(Texture):
     """An image. An `Instance` holds `texels` (H, W, 3), linear, `to_uv`, `interpolation` and `wrap`."""
 
-    texels = Shared()  # (N, 3), all images one after another, rows from the top
+    texels = Shared(by_number=True)  # (N, 3), all images one after another, rows from the top
     first = PerRow()  # () int32 first texel
     size = PerRow()  # (2,) int32 height, width
     nearest = PerRow()  # () bool, no interpolation

@@ -1,0 +1,116 @@
+"""Scenes of one structure as scenes of the same array sizes, so that they share compiled kernels.
+
+A kernel is compiled for the sizes of a scene's arrays. What is counted in thousands (triangles, nodes and leaves of
+hierarchies, texels) and what is counted in pieces (shapes, bsdfs, textures) is padded up to rungs of a coarse ladder
+here. Whatever is read is found by number, and nothing holds the number of a padded entry: no ray searches it, no light
+is chosen there, and images are those of the scene itself, bit for bit.
+
+What stays as it is, and so tells kernels apart: lights, shapes of a kind of which there are so few that rays test them
+all, and environment maps.
+"""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+
+import jax
+import numpy as np
+from jaxtyping import Shaped
+
+from pathjax.kinds import Table
+from pathjax.scene.scene import Scene
+from pathjax.shapes import Geometry
+from pathjax.shapes.shape import Table as ShapeTable
+
+# The lowest rung of what is many, in bytes: it is filled in a millisecond, and holds meshes of some 10^5 triangles. Of
+# what is few, in rows. Each rung is STEP times the one below.
+MANY_BYTES, FEW_ROWS, STEP = 1 << 22, 64, 4
+# Levels of a hierarchy: the stack of a search holds one number for each.
+LEVELS = 16
+
+
+def padded(scene: Scene) -> Scene:
+    """The scene with arrays of the ladder's sizes, for kernels alone: who counts its rows finds more than there are."""
+    materials = scene.materials
+    textures = materials.textures
+    if textures is not None:
+        textures = replace(textures, tables=tuple(map(_kind, textures.tables)))
+    materials = replace(
+        materials,
+        tables=tuple(map(_kind, materials.tables)),
+        wrappers=tuple(map(_kind, materials.wrappers)),
+        sides=_rows(materials.sides, _few(len(materials.sides))),
+        textures=textures,
+    )
+    return replace(scene, geometry=_geometry(scene.geometry), materials=materials)
+
+
+def _geometry(geometry: Geometry) -> Geometry:
+    tables = tuple(map(_shapes, geometry.tables))
+    counts = [table.count for table in geometry.tables]
+    parted = np.cumsum(counts)[:-1]
+
+    def numbered(values):
+        """Of all primitives, which are numbered through the tables."""
+        parts = zip(np.split(np.asarray(values), parted), tables, strict=True)
+        return np.concatenate([_rows(part, table.count) for part, table in parts]) if tables else values
+
+    return replace(geometry, tables=tables, shape=numbered(geometry.shape), light=numbered(geometry.light))
+
+
+def _shapes(table: ShapeTable) -> ShapeTable:
+    """Primitives of one kind. Where there is no tree, rays test all leaves, padded ones too: those stay."""
+    if table.tree is None:
+        return table
+    of_rows = {f.name: getattr(table, f.name) for f in fields(table) if f.name not in ("leaves", "tree")}
+    arrays = [x for x in jax.tree.leaves(of_rows) if len(x) == table.count]
+    rows = _many(table.count, sum(_row_bytes(x) for x in arrays))
+    tree = table.tree
+    tree = replace(tree, nodes=_many_rows(tree.nodes), depth=-(-tree.depth // LEVELS) * LEVELS)
+    of_rows = jax.tree.map(lambda x: _rows(x, rows) if len(x) == table.count else x, of_rows)
+    return replace(table, leaves=_many_rows(table.leaves), tree=tree, **of_rows)
+
+
+def _kind(table: Table) -> Table:
+    """Rows of one kind of bsdf or texture; texels, which they share."""
+
+    def of(declared, column):
+        if column is None or (declared.shared and not declared.by_number):
+            return column
+        if declared.shared:
+            return replace(column, values=_many_rows(column.values))
+        rows = _few(len(column.values))
+        texture = None if column.texture is None else _rows(column.texture, rows)
+        return replace(column, values=_rows(column.values, rows), texture=texture)
+
+    return replace(table, columns=tuple(map(of, table.kind.declared.values(), table.columns)))
+
+
+def _rows(values: Shaped[np.ndarray, "R ..."], rows: int) -> Shaped[np.ndarray, "rows ..."]:
+    values = np.asarray(values)
+    whole = np.zeros((rows, *values.shape[1:]), values.dtype)
+    whole[: len(values)] = values
+    return whole
+
+
+def _many_rows(values):
+    return _rows(values, _many(len(values), _row_bytes(values)))
+
+
+def _row_bytes(values) -> int:
+    return int(np.prod(values.shape[1:], dtype=int)) * values.dtype.itemsize
+
+
+def _many(rows: int, row_bytes: int) -> int:
+    return _rung(rows, 1 << (MANY_BYTES // row_bytes).bit_length())
+
+
+def _few(rows: int) -> int:
+    """A table of one row stays so, where XLA leaves out the look-up: that is another program, with other last bits."""
+    return rows if rows == 1 else _rung(rows, FEW_ROWS)
+
+
+def _rung(rows: int, lowest: int) -> int:
+    while lowest < rows:
+        lowest *= STEP
+    return lowest
