@@ -3,6 +3,7 @@
 from typing import TYPE_CHECKING
 
 import pathjax.compile  # noqa: F401  first: sets XLA up before a backend starts
+from pathjax.batch import render_batch
 from pathjax.derivatives.jacobian import Jacobian, jacobian
 from pathjax.description.transform import Transform
 from pathjax.errors import InputError, InputWarning
@@ -38,6 +39,7 @@ __all__ = [
     "read_target",
     "render",
     "render_aovs",
+    "render_batch",
     "render_bounces",
     "render_until",
     "save_scene",

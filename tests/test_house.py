@@ -30,6 +30,7 @@ ROOMS = (
     "rendering",
     "inverse",
     "io",
+    "batch",
     "bench",
     "testing",
     "cli",

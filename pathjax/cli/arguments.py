@@ -28,6 +28,13 @@ def parser() -> argparse.ArgumentParser:
     render.add_argument("--strategy", default="mis", metavar="{mis,light,bsdf}", help="how light is sampled")
     render.add_argument("--json", action="store_true", help="print one JSON object on stdout")
 
+    batch = subparsers.add_parser("batch", help="render many scenes, which share kernels")
+    batch.add_argument("jobs", metavar="JOBS.jsonl", help="a JSON object a line: see `pathjax help batch`")
+    batch.add_argument("-o", "--output", required=True, metavar="DIR", help="the folder of the images")
+    part = "every N-th job alone, from the I-th on, counted from 0: so that N processes share the work"
+    batch.add_argument("--part", type=_part, default=(0, 1), metavar="I/N", help=part)
+    batch.add_argument("--json", action="store_true", help="print one JSON object on stdout")
+
     fit = subparsers.add_parser("fit", help="recover parameters from an image of the scene")
     _add_scene(fit)
     fit.add_argument("target", metavar="TARGET.{exr,png}")
@@ -109,6 +116,13 @@ def _pair(text: str) -> tuple[str, str]:
     if not name or not equals:
         raise argparse.ArgumentTypeError(f"{text!r} is not of the form name=value")
     return name, value
+
+
+def _part(text: str) -> tuple[int, int]:
+    index, slash, count = text.partition("/")
+    if not slash or not index.isdecimal() or not count.isdecimal() or not int(index) < int(count):
+        raise argparse.ArgumentTypeError(f"{text!r} is not of the form I/N with 0 <= I < N")
+    return int(index), int(count)
 
 
 def _whole(text: str) -> int:

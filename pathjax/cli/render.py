@@ -9,10 +9,11 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 
-from pathjax import bsdfs, emitters, images
+from pathjax import bsdfs, emitters
 from pathjax.cli import DONE, FAILED
 from pathjax.cli.inputs import load
 from pathjax.errors import InputError
+from pathjax.io import picture
 from pathjax.rendering import aovs, bounces
 from pathjax.rendering.progressive.until import Render, RenderResult
 from pathjax.scene.scene import Scene
@@ -20,7 +21,6 @@ from pathjax.system.files import check_writable
 from pathjax.system.interrupts import Interrupts, wait_for
 from pathjax.system.json_text import json_text
 from pathjax.system.output import Output, say
-from pathjax.version import __version__
 
 # Output variables and their channels in an EXR file.
 CHANNELS = {"error": "RGB", "depth": "Z", "normal": "XYZ", "albedo": "RGB"}
@@ -51,7 +51,8 @@ def run(options, output: Output) -> int:
         channels = {name: layers[name] for name in layers if name.partition(".")[0] in options.aov}
         if "bounces" in options.aov:
             channels |= _bounces(scene, result, options, interrupts, output)
-        place = output.file(path, lambda place: _write(place, result, channels, options))
+        made_of = {"scene": options.scene, "parameters": dict(options.defines + options.settings), "seed": options.seed}
+        place = output.file(path, lambda place: picture.write(place, result, channels, **made_of))
         saved = render.checkpoint is not None and render.checkpoint.problem is None
         missed = result.reason == "interrupted" or (options.error is not None and result.reason != "target error")
         lost = int((~np.isfinite(result.image)).any(-1).sum())
@@ -119,20 +120,6 @@ def _bounces(scene, result: RenderResult, options, interrupts: Interrupts, outpu
         for k, term in enumerate(images)
         for i, channel in enumerate("RGB")
     }
-
-
-def _write(path: Path, result: RenderResult, channels: dict, options) -> None:
-    if path.suffix.lower() == ".png":
-        images.write_png(path, result.image)
-        return
-    header = {
-        "pathjax.version": __version__,
-        "pathjax.scene": str(options.scene),
-        "pathjax.parameters": " ".join(f"{name}={value}" for name, value in options.defines + options.settings),
-        "pathjax.spp": result.spp,
-        "pathjax.seed": options.seed,
-    }
-    images.write_exr(path, {name: result.image[..., i] for i, name in enumerate("RGB")} | channels, header)
 
 
 def _reached(result: RenderResult, lost: int, place: Path | None, saved: bool, options) -> str:

@@ -14,6 +14,7 @@ from __future__ import annotations
 from dataclasses import fields, replace
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Shaped
 
@@ -42,7 +43,8 @@ def padded(scene: Scene) -> Scene:
         sides=_rows(materials.sides, _few(len(materials.sides))),
         textures=textures,
     )
-    return replace(scene, geometry=_geometry(scene.geometry), materials=materials)
+    scene = replace(scene, geometry=_geometry(scene.geometry), materials=materials)
+    return jax.tree.map(jnp.asarray, scene)  # which each call of a kernel would do again
 
 
 def _geometry(geometry: Geometry) -> Geometry:

@@ -1,0 +1,102 @@
+"""What a batch is made of: one job a line, checked before anything is rendered."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+
+from pathjax.description.elements import nearest
+from pathjax.errors import InputError
+from pathjax.integrators.options import Options, check_counts
+
+
+@dataclass(frozen=True)
+class Job:
+    """One image. The fields but the last are the keys of a line of a jobs file."""
+
+    scene: str | os.PathLike  # a scene file, glTF or a mesh; relative to the jobs file
+    output: str | os.PathLike  # .exr or .png; relative to the folder of the batch
+    parameters: Mapping[str, object] = field(default_factory=dict)  # of the file's `$parameters`
+    set: Mapping[str, object] = field(default_factory=dict)  # of the scene's parameters
+    sensor: int | str = 0
+    spp: int | None = None  # default: the file's, if neither `error` nor `time` is given
+    error: float | None = None
+    time: float | None = None
+    seed: int = 0
+    strategy: str = "mis"
+    place: str = ""  # where the job stands, for messages
+
+
+KEYS = tuple(f.name for f in fields(Job))[:-1]
+
+
+def read(file: str | os.PathLike) -> list[Job]:
+    """Jobs of a JSON Lines file: on each line an object with the fields of `Job`; empty lines are left out.
+
+    Raises:
+        InputError: the file cannot be read, a line is no job, or two jobs have one output; with file and lines.
+    """
+    file = Path(file)
+    try:
+        text = file.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        why = getattr(error, "strerror", None) or "it is not UTF-8"
+        raise InputError(f"{file}: the jobs cannot be read: {why}") from None
+    # Not `splitlines`, which also ends lines within strings, at U+2028.
+    numbered = ((f"{file}:{number}", line) for number, line in enumerate(text.split("\n"), 1) if line.strip())
+    return checked((place, _object(place, line)) for place, line in numbered)
+
+
+def checked(numbered: Iterable[tuple[str, Mapping]]) -> list[Job]:
+    """Jobs of mappings with the fields of `Job`, and of each the place where it stands."""
+    jobs = [_job(place, values) for place, values in numbered]
+    if not jobs:
+        raise InputError("the batch is empty; give at least one job, such as " + _EXAMPLE)
+    first: dict[str, Job] = {}
+    for job in jobs:
+        other = first.setdefault(os.path.normpath(job.output), job)
+        if other is not job:
+            raise InputError(f"{job.place}: {job.output} is the output of {other.place} too; give each its own")
+    return jobs
+
+
+_EXAMPLE = '{"scene": "box.xml", "output": "box.exr", "spp": 16}'
+
+
+def _object(place: str, line: str) -> Mapping:
+    try:
+        values = json.loads(line)
+    except json.JSONDecodeError as error:
+        raise InputError(f"{place}: column {error.colno}: {error.msg}; a line is one JSON object: {_EXAMPLE}") from None
+    if not isinstance(values, dict):
+        raise InputError(f"{place}: a line is one JSON object, such as {_EXAMPLE}, not {line.strip()[:40]}")
+    return values
+
+
+def _job(place: str, values: Mapping) -> Job:
+    for key in values:
+        if key not in KEYS:
+            raise InputError(f'{place}: a job has no "{key}"{nearest(key, KEYS)}; its keys are {", ".join(KEYS)}')
+    for key in ("scene", "output"):
+        if not isinstance(values.get(key), str | os.PathLike) or not str(values[key]):
+            raise InputError(f'{place}: a job needs "{key}", the name of a file; for instance {_EXAMPLE}')
+    for key in ("parameters", "set"):
+        if not isinstance(values.get(key, {}), Mapping):
+            raise InputError(f'{place}: "{key}" = {values[key]!r}; it is an object of names and values')
+    job = Job(**values, place=place)
+    if Path(job.output).suffix.lower() not in (".exr", ".png"):
+        raise InputError(f"{place}: {job.output}: images are written as .exr or .png")
+    for key in ("error", "time"):
+        value = values.get(key)
+        if value is not None and (type(value) not in (int, float) or not 0 < value < math.inf):
+            raise InputError(f'{place}: "{key}" = {value!r}; it is a positive number')
+    try:
+        check_counts(1 if job.spp is None else job.spp, job.seed)
+        Options(job.strategy)
+    except InputError as error:
+        raise InputError(f"{place}: {error}") from None
+    return job

@@ -1,0 +1,161 @@
+"""Rendering the jobs of a batch, one after another; the next scene is loaded while the present one is rendered."""
+
+from __future__ import annotations
+
+import math
+import os
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from pathjax.batch import jobs as job_lists
+from pathjax.batch.jobs import Job
+from pathjax.errors import InputError
+from pathjax.io import picture
+from pathjax.io.load import load_scene
+from pathjax.rendering.progressive.until import Render
+from pathjax.scene.ladder import padded
+from pathjax.scene.parameters import with_parameters
+from pathjax.scene.scene import Scene
+from pathjax.system.interrupts import Interrupts
+
+# Scenes that are loaded ahead.
+_AHEAD = 2
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Of one job."""
+
+    job: Job
+    output: Path
+    status: str  # "done"; "skipped", as the output was there; "failed"; "unwritten"; "waiting", as the batch ended
+    message: str = ""  # why it failed, or what it has not reached; with the place of the job
+    spp: float = 0.0
+    error: float = math.nan  # of `RenderResult`
+    load_seconds: float = 0.0
+    compile_seconds: float = 0.0  # next to nothing, where an earlier scene has left its kernel
+    run_seconds: float = 0.0
+
+
+def render_batch(
+    jobs: str | os.PathLike | Iterable[Mapping],
+    folder: str | os.PathLike = ".",
+    *,
+    part: tuple[int, int] = (0, 1),
+    progress: bool | Callable[[Outcome], None] = False,
+) -> list[Outcome]:
+    """Render many scenes to image files; those of one structure share a kernel, whatever they hold how many of.
+
+    Images are those that `render_until` gives with the limits of the job, bit for bit. An output that exists is kept,
+    and its job skipped, so that a batch which was stopped, or killed, goes on when it is called again; outputs appear
+    whole or not at all. A job that fails does not end the others; but an output that cannot be written does, as the
+    rest would be lost too.
+
+    Args:
+        jobs: a file of JSON Lines, or mappings: each with the keys of `Job`. Scenes are relative to the file's folder;
+            those of mappings to the current one.
+        folder: for outputs; it is made where it is missing, and so are folders within.
+        part: (I, N): every N-th job alone, beginning with the I-th from 0; so N processes share a batch.
+        progress: True for a bar on stderr, or a function that is called with each outcome.
+    Returns:
+        the outcome of each job of this part. Ctrl-C ends the batch, without the image that it is at.
+    Raises:
+        InputError: the list of jobs is wrong, with the place of what is, or the folder cannot be made; nothing was
+            rendered then.
+    """
+    if isinstance(jobs, str | os.PathLike):
+        listed, beside = job_lists.read(jobs), Path(jobs).parent
+    else:
+        listed, beside = job_lists.checked((f"job {number}", job) for number, job in enumerate(jobs)), Path()
+    index, parts = part
+    if not 0 <= index < parts:
+        raise InputError(f"part = {part}; (I, N) is part I of N, from 0 to N - 1")
+    mine, folder = listed[index::parts], Path(folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{folder}: the folder cannot be made: {error.strerror or error}") from None
+    outcomes: list[Outcome] = []
+    with Interrupts() as interrupts, _told(progress, len(mine)) as tell, ThreadPoolExecutor(1) as thread:
+        for job, output, scene in _loaded(mine, beside, folder, thread):
+            outcome = _outcome(job, output, scene, interrupts)
+            if outcome is not None:
+                outcomes.append(outcome)
+                tell(outcome)
+            if outcome is None or outcome.status == "unwritten":
+                thread.shutdown(cancel_futures=True)
+                break
+    return outcomes + [Outcome(job, folder / job.output, "waiting") for job in mine[len(outcomes) :]]
+
+
+def _loaded(jobs: list[Job], beside: Path, folder: Path, thread: ThreadPoolExecutor) -> Iterator:
+    """Jobs, their outputs and their scenes to come; None of outputs that are there. Some are loaded ahead."""
+    waiting: deque[tuple[Job, Path, Future | None]] = deque()
+    for job in jobs:
+        output = folder / job.output
+        waiting.append((job, output, None if output.exists() else thread.submit(_load, job, beside)))
+        if len(waiting) > _AHEAD:
+            yield waiting.popleft()
+    yield from waiting
+
+
+def _load(job: Job, beside: Path) -> tuple[Scene, float]:
+    started = time.perf_counter()
+    scene = load_scene(beside / job.scene, sensor=job.sensor, parameters=job.parameters)
+    return with_parameters(scene, job.set), time.perf_counter() - started
+
+
+def _outcome(job: Job, output: Path, loading: Future | None, interrupts: Interrupts) -> Outcome | None:
+    """None: a signal came before the image was whole."""
+    if interrupts.heard:
+        return None
+    if loading is None:
+        return Outcome(job, output, "skipped")
+    try:
+        scene, load_seconds = loading.result()
+        no_limit = job.spp is None and job.error is None and job.time is None
+        spp = scene.about.description.spp if no_limit else job.spp
+        render = Render(padded(scene), job.error, job.time, spp, job.seed, job.strategy, None)
+        render.compile()
+        result = render.run()
+    except Exception as error:  # whatever it is, the other jobs are not to blame
+        return Outcome(job, output, "failed", f"{job.place}: {error or type(error).__name__}")
+    if result.reason == "interrupted":
+        return None
+    figures = result.spp, result.error, load_seconds, result.compile_seconds, result.run_seconds
+    try:
+        output.parent.mkdir(parents=True, exist_ok=True)
+        made_of = {"scene": job.scene, "parameters": {**job.parameters, **job.set}, "seed": job.seed}
+        picture.write(output, result, {}, **made_of)
+    except (InputError, OSError) as error:
+        return Outcome(job, output, "unwritten", f"{job.place}: {error}; the batch ends here", *figures)
+    if job.error is not None and result.reason != "target error":
+        missed = f"{job.place}: its error is {result.error_bound:.3g}, not yet {job.error:g}"
+        return Outcome(job, output, "done", missed, *figures)
+    return Outcome(job, output, "done", "", *figures)
+
+
+@contextmanager
+def _told(progress: bool | Callable[[Outcome], None], count: int) -> Iterator[Callable[[Outcome], None]]:
+    """What to tell outcomes to."""
+    if progress is not True:
+        yield progress or (lambda outcome: None)
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = BarColumn(), MofNCompleteColumn(), TextColumn("{task.description}"), TimeRemainingColumn()
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("", total=count)
+
+        def tell(outcome: Outcome) -> None:
+            if outcome.message:
+                bar.console.print(f"pathjax: {outcome.message}", markup=False, highlight=False, soft_wrap=True)
+            bar.update(task, advance=1, description=outcome.output.name)
+
+        yield tell

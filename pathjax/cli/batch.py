@@ -1,0 +1,26 @@
+"""`pathjax batch`: the images of a list of jobs."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+from pathjax.batch import Outcome, render_batch
+from pathjax.cli import DONE, FAILED
+from pathjax.compile import keep_kernels
+from pathjax.system.json_text import json_text
+from pathjax.system.output import Output, say
+
+
+def run(options, output: Output) -> int:
+    keep_kernels()
+    outcomes = render_batch(options.jobs, options.output, part=options.part, progress=True)
+    counts = Counter(outcome.status for outcome in outcomes)
+    output.written = counts["done"] > 0
+    say(", ".join(f"{count} {status}" for status, count in counts.items()))
+    if options.json:
+        output.text(json_text({"jobs": [_facts(outcome) for outcome in outcomes]}))
+    return DONE if not counts.keys() - {"done", "skipped"} else FAILED
+
+
+def _facts(outcome: Outcome) -> dict:
+    return vars(outcome) | {"job": outcome.job.place, "output": str(outcome.output)}
