@@ -11,7 +11,7 @@ from pathjax.io.load import load_dict, load_scene, save_scene
 from pathjax.rendering.aovs import render_aovs
 from pathjax.rendering.bounces import Bounces, render_bounces
 from pathjax.rendering.progressive.until import RenderResult, render_until
-from pathjax.rendering.query import closest_hit
+from pathjax.rendering.query import any_hit, closest_hit
 from pathjax.rendering.render import render
 from pathjax.scene.parameters import parameters, with_parameters
 from pathjax.scene.scene import Scene
@@ -29,6 +29,7 @@ __all__ = [
     "Target",
     "Transform",
     "__version__",
+    "any_hit",
     "check_gradient",
     "closest_hit",
     "fit",

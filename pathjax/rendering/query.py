@@ -1,4 +1,4 @@
-"""Ray queries on a scene, many rays at a time."""
+"""Ray queries on a scene, many rays at a time; inside of jit, vmap and loops too."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Real
+from jax.typing import ArrayLike
+from jaxtyping import Array, Bool, Real
 
 from pathjax.compile import native_map, usual_promotion
 from pathjax.core.math import normalize, rescale
@@ -31,11 +32,37 @@ def closest_hit(scene: Scene, origins: Vectors, directions: Vectors) -> Hit:
     return _closest_hit(scene.geometry, jnp.asarray(origins, dtype), jnp.asarray(directions, dtype))
 
 
+@usual_promotion
+def any_hit(
+    scene: Scene, origins: Vectors, directions: Vectors, distances: Real[ArrayLike, "..."] = jnp.inf
+) -> Bool[Array, " N"]:
+    """Return whether each ray meets anything before a distance: cheaper than to ask for the first of what it meets.
+
+    Args:
+        directions: of any positive length.
+        distances: (N,) or one for all, in units of the scene, whatever the length of the directions; inf: no limit.
+    """
+    dtype = scene.camera.origin.dtype
+    origins, directions = jnp.asarray(origins, dtype), jnp.asarray(directions, dtype)
+    distances = jnp.broadcast_to(jnp.asarray(distances, dtype), origins.shape[:1])
+    return _any_hit(scene.geometry, origins, directions, distances)
+
+
 @partial(jax.jit, static_argnames=("form", "devices"))
 def _closest_hit(shapes, origins, directions, form=None, devices=None):
     def one(ray, shapes):
-        o, d = ray
-        ray = Ray(o, normalize(rescale(d)), jnp.full_like(o[0], jnp.inf), jnp.int32(-1))
-        return geometry.closest_hit(shapes, ray)
+        return geometry.closest_hit(shapes, _ray(*ray, jnp.inf))
 
     return native_map(one, (origins, directions), shapes, form=form, devices=devices)
+
+
+@partial(jax.jit, static_argnames=("form", "devices"))
+def _any_hit(shapes, origins, directions, distances, form=None, devices=None):
+    def one(ray, shapes):
+        return geometry.occluded(shapes, _ray(*ray), jnp.int32(-1))
+
+    return native_map(one, (origins, directions, distances), shapes, form=form, devices=devices)
+
+
+def _ray(o, d, t_max):
+    return Ray(o, normalize(rescale(d)), jnp.full_like(o[0], t_max), jnp.int32(-1))
