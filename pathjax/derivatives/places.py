@@ -145,8 +145,10 @@ def of_hit(scene: Scene, places: LightPlaces, slot: int, hit: Hit) -> Int[Array,
     return jnp.where(hit.primitive >= 0, at(places.on_surfaces[slot], number), places.background[slot])
 
 
-def of_light_sample(choice: Choice, places: LightPlaces, slot: int, u: Bounce) -> Int[Array, ""]:
-    number, _, _ = emitters.choose(choice, u.light)
+def of_light_sample(
+    choice: Choice, places: LightPlaces, slot: int, ref: Float[Array, "3"], u: Bounce
+) -> Int[Array, ""]:
+    number, _, _ = emitters.choose(choice, ref, u.light)
     return at(places.sampled[slot], number)
 
 

@@ -107,7 +107,8 @@ def extend(
         k = 1 + slots.of_bsdfs + s
         found.append(Slot((places.of_hit(scene, lights, s, hit),), None, scale * Le[k], None))
         if choice is not None:
-            found.append(Slot((places.of_light_sample(choice, lights, s, u),), None, scale * n[k], None))
+            sampled = places.of_light_sample(choice, lights, s, here.surface.p, u)
+            found.append(Slot((sampled,), None, scale * n[k], None))
     return on, Record(jnp.bool_(False), ~on.alive, Le[0] + n[0], w[0], found)
 
 

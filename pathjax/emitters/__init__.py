@@ -17,6 +17,7 @@ from jaxtyping import Array, Float
 from pathjax import textures
 from pathjax.core.math import at, dot, larger
 from pathjax.core.types import EmitterSample, Hit, Ray, Surface
+from pathjax.emitters import light_tree
 from pathjax.emitters.area import Area
 from pathjax.emitters.constant import Constant
 from pathjax.emitters.directional import Directional
@@ -24,10 +25,10 @@ from pathjax.emitters.emitter import Background, DiracEmitter, Emitter, SurfaceE
 from pathjax.emitters.envmap import Envmap
 from pathjax.emitters.point import Point
 from pathjax.emitters.projector import Projector
-from pathjax.emitters.selection import Choice, Lights, choice, choose
+from pathjax.emitters.selection import Choice, Lights, choice, choose, probability
 from pathjax.emitters.spot import Spot
 from pathjax.errors import InputError
-from pathjax.kinds import Instance, Parameters, Table, ordered
+from pathjax.kinds import Instance, Parameters, Position, Table, ordered
 from pathjax.kinds import register as register_kind
 from pathjax.shapes import Geometry, Lamp, geometry, lamp_table
 from pathjax.textures import Textures
@@ -91,7 +92,7 @@ def build(
     of_shapes = dict.fromkeys(emitters[lamp.shape] for lamp in lamps)
     inside = ordered(of_shapes, KINDS)
     outside = ordered([each for each in emitters if each is not None and each not in of_shapes], KINDS)
-    made, light, number = [], np.full(len(shapes.shape), -1, np.int32), 0
+    made, boxes, light, number = [], [], np.full(len(shapes.shape), -1, np.int32), 0
     for kind, instances in (*inside.items(), *sorted(outside.items(), key=lambda item: item[0].distant)):
         place = (*path, len(made))
         covers, codes, images = _textures(instances, dtype, (*place, "textures"), parameters)
@@ -108,7 +109,32 @@ def build(
         row_of = np.asarray([rows[emitters[lamp.shape]] for lamp in shining], np.int32)
         lamps_of = (lamp_table(shining, dtype), row_of) if shining else (None, None)
         made.append(Lights(table, *lamps_of, covers))
-    return tuple(made), replace(shapes, light=light)
+        boxes.append(_boxes(made[-1], shining))
+    return _arranged(made, boxes, dtype), replace(shapes, light=light)
+
+
+def _boxes(lights: Lights, lamps: list[Lamp]) -> np.ndarray | None:
+    """(R, 2, 3) around each light that is near; None where nobody knows where they are."""
+    if lights.lamps is not None:
+        return np.stack([lamp.box for lamp in lamps])
+    places = [key for key, declared in lights.kind.declared.items() if isinstance(declared, Position)]
+    if not places:
+        return None
+    return np.repeat(np.asarray(lights.table.column(places[0]).values)[:, None], 2, 1)
+
+
+def _arranged(made: list[Lights], boxes: list[np.ndarray | None], dtype) -> tuple[Lights, ...]:
+    """The lights, those that are near in the tree by which they are chosen where there are many."""
+    near = [(lights, box) for lights, box in zip(made, boxes, strict=True) if not lights.kind.distant]
+    if sum(lights.count for lights, _ in near) < light_tree.FEWEST or any(box is None for _, box in near):
+        return tuple(made)
+    ends = np.cumsum([lights.count for lights, _ in near])[:-1]
+    leaves = np.split(light_tree.arranged(np.concatenate([box for _, box in near])), ends)
+    placed = [
+        replace(lights, boxes=np.asarray(box, dtype), leaf=leaf)
+        for (lights, box), leaf in zip(near, leaves, strict=True)
+    ]
+    return (*placed, *made[len(near) :])
 
 
 def _textures(
@@ -140,6 +166,11 @@ def _mean(value) -> np.ndarray | None:
 def name(lights: Lights) -> str:
     """What scene files call a kind."""
     return next(name for name, kind in KINDS.items() if kind is lights.kind)
+
+
+def chosen_by_place(emitters: tuple[Lights, ...]) -> bool:
+    """Whether the choice of a light depends on the point that it is to shine on."""
+    return any(lights.boxes is not None for lights in emitters)
 
 
 def usual_name(kind: str) -> str:
@@ -213,7 +244,7 @@ def sample(
     Returns:
         EmitterSample; pdf and Le are 0 where nothing arrives from there.
     """
-    number, probability, u = choose(chosen, u)
+    number, likely, u = choose(chosen, ref, u)
     sampled = [(lights, first) for lights, first in zip(emitters, chosen.first, strict=True) if first is not None]
     some_dirac = any(lights.kind.dirac for lights, _ in sampled)
 
@@ -228,14 +259,14 @@ def sample(
                     there = Hit(distance, primitive, jnp.int32(0))
                     p = lights.parameters(light, geometry.surface(shapes, Ray(ref, d, distance, jnp.int32(-1)), there))
                 Le = jnp.where(front, lights.kind.emitted(p, d), 0)
-                pdf = jnp.where(front, pdf, 0) * probability
+                pdf = jnp.where(front, pdf, 0) * likely
             elif not lights.kind.dirac:
                 d = lights.kind.sample(p, u, u_part)
                 distance, primitive = jnp.full_like(d[0], jnp.inf), jnp.int32(-1)
                 Le, pdf = background(emitters, chosen, d)
             else:
                 d, distance, Le = lights.kind.sample(p, ref)
-                primitive, pdf = jnp.int32(-1), probability
+                primitive, pdf = jnp.int32(-1), likely
             delta = jnp.bool_(lights.kind.dirac) if some_dirac else None
             return EmitterSample(d, distance, primitive, Le, pdf, delta)
 
@@ -247,7 +278,10 @@ def sample(
 def hit(
     emitters: tuple[Lights, ...], shapes: Geometry, chosen: Choice | None, ray: Ray, hit: Hit, surface: Surface
 ) -> tuple[Float[Array, "3"], Float[Array, ""]]:
-    """Radiance received from the surface that was hit and the density [1/sr] of `sample` for it; 0, 0 if dark."""
+    """Radiance received from the surface that was hit and the density [1/sr] of `sample` for it; 0, 0 if dark.
+
+    ray: from the point that `sample` had.
+    """
     zero = jnp.zeros_like(ray.o)
     on_surfaces = [lights for lights in emitters if lights.lamps is not None]
     if not on_surfaces:
@@ -261,7 +295,7 @@ def hit(
             front = dot(surface.n, ray.d) < 0
             Le = jnp.where(front, lights.kind.emitted(lights.parameters(light, surface), ray.d), 0)
             pdf = geometry.lamp_density(shapes, lights.lamps, light, ray, hit, surface)
-            return Le, larger(pdf, jnp.zeros_like(pdf)) * at(chosen.pdf, number)
+            return Le, larger(pdf, jnp.zeros_like(pdf)) * probability(chosen, ray.o, number)
 
         return lit
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +12,9 @@ from jaxtyping import Array, Float, Int
 
 from pathjax.core.math import at
 from pathjax.core.types import Number, Surface
+from pathjax.emitters import light_tree
 from pathjax.emitters.emitter import Background, Emitter
+from pathjax.emitters.light_tree import LightTree
 from pathjax.kinds import Color, Row, Table
 from pathjax.shapes import Lamps
 from pathjax.textures import Textures
@@ -27,6 +29,8 @@ class Lights:
     lamps: Lamps | None  # what shines, of kinds that stand inside shapes; None: each row is one light
     row: Int[Array, " R"] | None  # row of the table, of each lamp
     textures: Textures | None = None  # in the place of parameters; None: there are none
+    boxes: Float[Array, "R 2 3"] | None = None  # lower and upper corner around each; None: nothing chooses by them
+    leaf: Int[Array, " R"] | None = None  # of each in the tree by which they are chosen
 
     @property
     def kind(self) -> type[Emitter]:
@@ -81,10 +85,16 @@ class Choice:
     pdf: Float[Array, " R"]
     cdf: Float[Array, " R"]  # ends at 1
     first: tuple[int | None, ...] = field(metadata={"static": True})  # by table, its first number; None: not sampled
+    # By which those that are not distant are chosen, and the probability that one of them is; None: all by `cdf`.
+    tree: LightTree | None = None
+    near: Float[Array, ""] | None = None
 
 
 def choice(emitters: tuple[Lights, ...], strategy: str) -> Choice | None:
-    """Lights by power, near ones and distant ones half of the time each; None where there is nothing to choose from."""
+    """Near lights and distant ones half of the time each, and among those by power, of many near ones also by place.
+
+    None where there is nothing to choose from.
+    """
     first: list[int | None] = []
     powers: dict[bool, list] = {False: [], True: []}  # by whether they are distant, as tables are ordered
     count = 0
@@ -103,7 +113,13 @@ def choice(emitters: tuple[Lights, ...], strategy: str) -> Choice | None:
         power = jnp.concatenate([_over(group, jnp.sum(group), 0) for group in groups])
     # Lights of power 0 throughout: any choice will do, and 0 / 0 will not.
     pdf = _over(power, jnp.sum(power), 1 / len(power))
-    return Choice(pdf, jnp.cumsum(pdf), tuple(first))
+    chosen = Choice(pdf, jnp.cumsum(pdf), tuple(first))
+    placed = [lights for lights in emitters if lights.boxes is not None]
+    if not placed:
+        return chosen
+    boxes, leaf = (jnp.concatenate(each) for each in zip(*((x.boxes, x.leaf) for x in placed), strict=True))
+    near = pdf[: len(leaf)]
+    return replace(chosen, tree=light_tree.built(boxes, leaf, near), near=jnp.sum(near))
 
 
 def _over(power, total, otherwise):
@@ -111,14 +127,37 @@ def _over(power, total, otherwise):
     return jnp.where(total > 0, power / jnp.where(total > 0, total, 1), otherwise)
 
 
-def choose(chosen: Choice, u: Float[Array, "2"]) -> tuple[Int[Array, ""], Float[Array, ""], Float[Array, "2"]]:
-    """Choose a light: its number, the probability, and u, of which the first number is used anew."""
+def choose(
+    chosen: Choice, ref: Float[Array, "3"], u: Float[Array, "2"]
+) -> tuple[Int[Array, ""], Float[Array, ""], Float[Array, "2"]]:
+    """Choose a light for the point ref: its number, the probability, and u, of which the first number is used anew."""
     count = chosen.pdf.shape[0]
     if count == 1:
         return jnp.int32(0), jnp.ones_like(u[0]), u
+    if chosen.tree is None:
+        return _by_power(chosen, u)
+
+    def from_tree():
+        number, probability, again = light_tree.choose(chosen.tree, ref, u[0] / chosen.near)
+        return number, probability * chosen.near, jnp.stack([again, u[1]])
+
+    if count == chosen.tree.leaf.shape[0]:
+        return from_tree()
+    # Distant lights have the last numbers.
+    return lax.cond(u[0] < chosen.near, from_tree, lambda: _by_power(chosen, u))
+
+
+def _by_power(chosen: Choice, u):
     number = jnp.searchsorted(chosen.cdf, u[0], side="right").astype(jnp.int32)
-    number = jnp.minimum(number, count - 1)
+    number = jnp.minimum(number, chosen.pdf.shape[0] - 1)
     pdf = at(chosen.pdf, number)
     below = at(chosen.cdf, number) - pdf
     again = jnp.clip((u[0] - below) / jnp.where(pdf > 0, pdf, 1), 0, 1 - 2**-24)
     return number, pdf, jnp.stack([again, u[1]])
+
+
+def probability(chosen: Choice, ref: Float[Array, "3"], number: Int[Array, ""]) -> Float[Array, ""]:
+    """With which `choose` finds a light that is not distant."""
+    if chosen.tree is None:
+        return at(chosen.pdf, number)
+    return light_tree.probability(chosen.tree, ref, number) * chosen.near

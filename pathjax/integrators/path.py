@@ -79,7 +79,7 @@ def start(scene: Scene, ray: Ray, options: Options) -> Path:
         one * jnp.inf,
         jnp.int32(0),
         scene.max_depth > 0,
-        ray.o if passes else None,
+        ray.o if passes or emitters.chosen_by_place(scene.emitters) else None,
         jnp.int32(0) if scene.free_passes else None,
         one if transmits else None,
         jnp.int32(0) if options.watch_moving else None,

@@ -63,6 +63,7 @@ class Lamp(NamedTuple):
     count: int
     area: float
     primitive: int  # number of the first one among all of the geometry
+    box: np.ndarray  # (2, 3) around it
 
 
 class _Part(NamedTuple):
@@ -113,7 +114,7 @@ def build(
 
 def lamp_table(lamps: list[Lamp], dtype) -> Lamps:
     """For kernels."""
-    _, table, first, count, area, _ = zip(*lamps, strict=True)
+    _, table, first, count, area, *_ = zip(*lamps, strict=True)
     tables = tuple(sorted(set(table)))
     integers = (np.asarray(x, np.int32) for x in ([tables.index(each) for each in table], first, count))
     return Lamps(*integers, np.asarray(area, dtype), tables)
@@ -124,10 +125,14 @@ def _lamps(parts: list[_Part], table, primitive):
     first = 0
     for shape, primitives, _, lamp in parts:
         areas = primitives.areas
-        if lamp and primitives.one_lamp:
-            yield Lamp(shape, table, first, len(areas), areas.sum(), primitive + first)
-        elif lamp:
-            yield from (Lamp(shape, table, first + i, 1, a, primitive + first + i) for i, a in enumerate(areas))
+        if lamp:
+            boxes = np.stack(primitives.boxes(), 1)
+            if primitives.one_lamp:
+                around = np.stack([boxes[:, 0].min(0), boxes[:, 1].max(0)])
+                yield Lamp(shape, table, first, len(areas), areas.sum(), primitive + first, around)
+            else:
+                each = enumerate(zip(areas, boxes, strict=True), first)
+                yield from (Lamp(shape, table, row, 1, area, primitive + row, box) for row, (area, box) in each)
         first += len(areas)
 
 

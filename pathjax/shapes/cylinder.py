@@ -31,6 +31,9 @@ class Tube(Primitives):
     def areas(self):
         return _areas(self.tubes)
 
+    def boxes(self):
+        return bounds(self.tubes)
+
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)

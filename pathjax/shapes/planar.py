@@ -36,6 +36,11 @@ class Frames(Primitives):
         """(F,) of the body that the face closes; inf: it is a sheet."""
         return np.full(len(self.frames), np.inf)
 
+    def boxes(self):
+        c, a, b, _ = np.moveaxis(self.frames, 1, 0)
+        reach = np.abs(a) + np.abs(b)
+        return c - reach, c + reach
+
     def faces(self, glass, lamp, dtype):
         return Faces(corners(self.frames), self.frames[:, 3], self.depths(), glass, lamp)
 

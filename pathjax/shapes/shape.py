@@ -77,6 +77,10 @@ class Primitives(ABC):
     areas: np.ndarray  # (P,)
     one_lamp: ClassVar[bool] = False  # they shine as one lamp, which is sampled uniformly in area; else each is one
 
+    @abstractmethod
+    def boxes(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lower and upper corners (P, 3) of boxes around them."""
+
     def faces(self, glass: bool, lamp: bool, dtype) -> Faces | None:
         """The flat faces, which may touch those of other shapes; None: they are curved."""
         return None

@@ -43,6 +43,9 @@ class Ball(Primitives):
     def areas(self):
         return _areas(self.balls)
 
+    def boxes(self):
+        return bounds(self.balls)
+
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)

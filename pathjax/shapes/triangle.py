@@ -38,6 +38,9 @@ class Facets(Primitives):
     def areas(self):
         return _areas(self.vertices)
 
+    def boxes(self):
+        return bounds(self.vertices)
+
     def faces(self, glass, lamp, dtype):
         """One face if all triangles lie in one plane."""
         some = self.vertices[:_SOME]
