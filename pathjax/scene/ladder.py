@@ -11,7 +11,7 @@ all, and environment maps.
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -64,13 +64,11 @@ def _shapes(table: ShapeTable) -> ShapeTable:
     """Primitives of one kind. Where there is no tree, rays test all leaves, padded ones too: those stay."""
     if table.tree is None:
         return table
-    of_rows = {f.name: getattr(table, f.name) for f in fields(table) if f.name not in ("leaves", "tree")}
-    arrays = [x for x in jax.tree.leaves(of_rows) if len(x) == table.count]
-    rows = _many(table.count, sum(_row_bytes(x) for x in arrays))
-    tree = table.tree
+    by_row, tree = table.by_row(), table.tree
+    rows = _many(table.count, sum(map(_row_bytes, jax.tree.leaves(by_row))))
     tree = replace(tree, nodes=_many_rows(tree.nodes), depth=-(-tree.depth // LEVELS) * LEVELS)
-    of_rows = jax.tree.map(lambda x: _rows(x, rows) if len(x) == table.count else x, of_rows)
-    return replace(table, leaves=_many_rows(table.leaves), tree=tree, **of_rows)
+    by_row = jax.tree.map(lambda x: _rows(x, rows), by_row)
+    return replace(table, leaves=_many_rows(table.leaves), tree=tree, **by_row)
 
 
 def _kind(table: Table) -> Table:

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from types import MappingProxyType
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -174,6 +174,11 @@ class Table(Searched):
     @property
     @abstractmethod
     def count(self) -> int: ...
+
+    def by_row(self) -> dict[str, Any]:
+        """What has an entry for each primitive: fields, which are arrays (P, ...), mappings to such, or None."""
+        values = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("leaves", "tree")}
+        return {name: value for name, value in values.items() if not isinstance(value, Searched)}
 
     def searched(self) -> list[Searched]:
         """What rays search to find its primitives."""
