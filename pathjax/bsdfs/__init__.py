@@ -87,6 +87,8 @@ KINDS: dict[str, type[BSDF]] = {
 }
 # Place of the table of a kind, row in it, or place of a shape; -1: none.
 Index = Int[Array, ""]
+# For each of `Table.textured`, what was looked up there.
+Colors = tuple[Float[Array, "3"], ...]
 FRESNEL = Dielectric.fresnel.options
 
 
@@ -225,14 +227,39 @@ def is_tree(materials: Materials, shape: Index, front: Bool[Array, ""]) -> Bool[
     return select(materials, shape, front)[0] >= len(materials.tables)
 
 
+def colors(materials: Materials, kind: Index, row: Index, surface: Surface) -> Colors | None:
+    """Colours of the textures that a bsdf has at a point, as `Row` takes them; None where no bsdf has any.
+
+    A path asks for them several times, and of all kinds together there are seldom more than one or two.
+    """
+    textured = [table.textured for table in materials.tables]
+
+    def codes(table, columns):
+        found = [at(table.columns[place].texture, row) for place in columns]
+        return found + [jnp.full((2,), -1, jnp.int32)] * (most - len(found))
+
+    most = max(map(len, textured), default=0)
+    if not most:
+        return None
+    calls = [partial(codes, *each) for each in zip(materials.tables, textured, strict=True)]
+    found = calls[0]() if len(calls) == 1 else lax.switch(jnp.maximum(kind, 0), calls)
+    return tuple(materials.textures.look_up(code, surface) for code in found)
+
+
 def evaluate(
-    materials: Materials, kind: Index, row: Index, surface: Surface, wi: Float[Array, "3"], wo: Float[Array, "3"]
+    materials: Materials,
+    kind: Index,
+    row: Index,
+    surface: Surface,
+    wi: Float[Array, "3"],
+    wo: Float[Array, "3"],
+    colors: Colors | None = None,
 ) -> tuple[Float[Array, "3"], Float[Array, ""]]:
-    """f |cos theta_o| and pdf of a smooth bsdf; 0 for the others."""
+    """f |cos theta_o| and pdf of a smooth bsdf; 0 for the others. colors: of `colors`, if they are known already."""
     smooth = [(i, table) for i, table in enumerate(materials.tables) if table.kind.smooth]
 
     def of(table):
-        return lambda: table.kind.evaluate(Row(table, row, surface, materials.textures), wi, wo)
+        return lambda: table.kind.evaluate(Row(table, row, surface, materials.textures, colors), wi, wo)
 
     if not smooth:
         return jnp.zeros_like(wi), jnp.zeros_like(wi[2])
@@ -243,12 +270,21 @@ def evaluate(
 
 
 def sample(
-    materials: Materials, kind: Index, row: Index, surface: Surface, wi: Float[Array, "3"], u: Float[Array, " numbers"]
+    materials: Materials,
+    kind: Index,
+    row: Index,
+    surface: Surface,
+    wi: Float[Array, "3"],
+    u: Float[Array, " numbers"],
+    colors: Colors | None = None,
 ) -> BSDFSample:
-    """Draw `wo` and its weight from the bsdf. u: 2 numbers, or 3 where a kind with `lobes` is present."""
+    """Draw `wo` and its weight from the bsdf.
+
+    u: 2 numbers, or 3 where a kind with `lobes` is present; colors: of `colors`, if they are known already.
+    """
 
     def of(table):
-        return lambda: table.kind.sample(Row(table, row, surface, materials.textures), wi, _numbers(table, u))
+        return lambda: table.kind.sample(Row(table, row, surface, materials.textures, colors), wi, _numbers(table, u))
 
     if len(materials.tables) == 1:
         return of(materials.tables[0])()

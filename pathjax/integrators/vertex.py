@@ -25,6 +25,7 @@ class Vertex(NamedTuple):
     # Where bsdfs hold others, of `tree.Leaf`:
     weight: Float[Array, ""] | None = None
     turns: tuple[tree.Turn, ...] = ()
+    colors: bsdfs.Colors | None = None  # of the textures of the bsdf; None: there are none
 
 
 def vertex(
@@ -46,12 +47,14 @@ def vertex(
     side = jnp.where(bsdfs.has(scene.materials, kind, "sided") | (wi[2] > 0), 1, -1).astype(wi.dtype)
     frame, wi = frame._replace(n=frame.n * side), jnp.stack([wi[0], wi[1], wi[2] * side])
     turns = tuple(turn._replace(n=turn.n * side) for turn in turns)
-    return Vertex(hit, surface, frame, wi, kind, row, weight, turns)
+    colors = bsdfs.colors(scene.materials, kind, row, surface)
+    return Vertex(hit, surface, frame, wi, kind, row, weight, turns, colors)
 
 
 def evaluate(scene: Scene, here: Vertex, d: Float[Array, "3"]) -> tuple[Float[Array, "3"], Float[Array, ""]]:
     """f |cos theta| and pdf of the bsdf for light from the unit direction d, in world space."""
-    f, pdf = bsdfs.evaluate(scene.materials, here.kind, here.row, here.surface, here.wi, to_local(here.frame, d))
+    wo = to_local(here.frame, d)
+    f, pdf = bsdfs.evaluate(scene.materials, here.kind, here.row, here.surface, here.wi, wo, here.colors)
     if here.turns:
         share = tree.seen_by_turned(here.turns, here.frame.n, d)
         f, pdf = f * share, jnp.where(share > 0, pdf, 0)
@@ -68,7 +71,7 @@ def sample(
     if other:
         drawn = bsdfs.sample_other(scene.materials, here.row, here.surface, here.wi, u)
     else:
-        drawn = bsdfs.sample(scene.materials, here.kind, here.row, here.surface, here.wi, u)
+        drawn = bsdfs.sample(scene.materials, here.kind, here.row, here.surface, here.wi, u, here.colors)
     d = to_world(here.frame, drawn.wo)
     if here.turns:
         share = tree.seen_by_turned(here.turns, here.frame.n, d)

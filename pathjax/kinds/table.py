@@ -50,6 +50,11 @@ class Table:
             columns[place] = replace(columns[place], nudge=nudge)
         return replace(self, columns=tuple(columns))
 
+    @property
+    def textured(self) -> tuple[int, ...]:
+        """Places of the columns in which some row has a texture."""
+        return tuple(i for i, column in enumerate(self.columns) if column is not None and column.texture is not None)
+
     def with_setting(self, name: str, value: str) -> Table:
         return Table(self.columns, self.kind, tuple((dict(self.settings) | {name: value}).items()))
 
@@ -57,9 +62,12 @@ class Table:
 class Row:
     """Parameters of one row as attributes, looked up as they are asked for: at a point of the surface if textured."""
 
-    def __init__(self, table: Table, row: Number, surface: Surface | None = None, textures=None):
-        """surface, textures: what `look_up` of a texture takes; not used where no row has one."""
-        self._table, self._row, self._surface, self._textures = table, row, surface, textures
+    def __init__(self, table: Table, row: Number, surface: Surface | None = None, textures=None, colors=None):
+        """surface, textures: what `look_up` of a texture takes; not used where no row has one.
+
+        colors: what was looked up at this point already, for each of `Table.textured`; None: nothing.
+        """
+        self._table, self._row, self._surface, self._textures, self._colors = table, row, surface, textures, colors
 
     def on(self, uv: Float[Array, "2"]) -> Row:
         """The same, with textures looked up at uv."""
@@ -78,11 +86,16 @@ class Row:
         if column.texture is not None:
 
             def look_up():
-                color = self._textures.look_up(at(column.texture, self._row), self._surface)
+                color = self._color(name, column)
                 return color if constant.shape else luminance(color)
 
             value = lax.cond(at(column.texture, self._row, 0) >= 0, look_up, lambda: constant)
         return value if column.nudge is None else value + column.nudge
+
+    def _color(self, name, column):
+        if self._colors is not None:
+            return self._colors[self._table.textured.index(self._table.kind.place(name))]
+        return self._textures.look_up(at(column.texture, self._row), self._surface)
 
     def gradient(self, name: str) -> Float[Array, "2"]:
         """How a number changes with u and v of the surface."""

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from pathjax.compile import compute_once
 from pathjax.core.math import at
 from pathjax.core.types import Surface
 from pathjax.images import read_rgb
@@ -122,7 +123,9 @@ def _corners(p, uv):
     place = vu * size - jnp.where(p.nearest, 0, jnp.asarray(0.5, uv.dtype))
     low = jnp.floor(place)
     fraction = jnp.where(p.nearest, 0, place - low)
+    # Twelve numbers are read at these places.
     corners = _wrapped(low, size, p.wrap), _wrapped(low + 1, size, p.wrap)
+    corners, fraction = compute_once((corners, fraction))
 
     def index(i, j):
         return p.first + corners[i][0] * size[1] + corners[j][1]
