@@ -11,7 +11,7 @@ import numpy as np
 
 from pathjax.description import spectra
 from pathjax.description.elements import Document, Element, nearest, require_attributes
-from pathjax.description.transform import Transform
+from pathjax.description.transform import Transform, rotation
 from pathjax.errors import InputError
 from pathjax.kinds import Unused
 
@@ -335,10 +335,10 @@ def _scale(step: Element) -> np.ndarray:
 def _rotate(step: Element) -> np.ndarray:
     axis = triple(step, default=0.0, extra=("angle",))
     require_attributes(step, required=("angle",), optional=("value", "x", "y", "z"))
-    length = np.linalg.norm(axis)
-    if abs(length - 1) > 0.02:  # Mitsuba takes the axis as it is, and shears if it is not of unit length
-        raise step.error(f"{step}: the axis must have length 1, has {length:g}")
-    return Transform().rotate(axis, number(step, step.attributes["angle"])).matrix
+    if not axis.any():
+        raise step.error(f"{step}: the axis is the zero vector")
+    # As Mitsuba, which takes the axis as it is: one that is not of unit length scales too.
+    return rotation(axis, number(step, step.attributes["angle"]))
 
 
 def _lookat(step: Element) -> np.ndarray:

@@ -52,12 +52,8 @@ class Transform:
         Raises:
             InputError: the axis is 0.
         """
-        x, y, z = _unit("the axis of rotate", _numbers("rotate", axis, (3,)), "is the zero vector")
-        turn = math.radians(math.fmod(float(_numbers("rotate", angle, ())), 360))
-        cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-        matrix = np.eye(4)
-        matrix[:3, :3] += math.sin(turn) * cross + (1 - math.cos(turn)) * cross @ cross
-        return self @ Transform(matrix)
+        axis = _unit("the axis of rotate", _numbers("rotate", axis, (3,)), "is the zero vector")
+        return self @ Transform(rotation(axis, float(_numbers("rotate", angle, ()))))
 
     def look_at(self, origin: ArrayLike, target: ArrayLike, up: ArrayLike = (0, 0, 0)) -> Transform:
         """What carries the origin to `origin` and the z axis towards `target`, y being up: to_world of a camera.
@@ -96,6 +92,16 @@ class Transform:
         if isinstance(other, Transform):
             return Transform(self.matrix @ other.matrix)
         return np.asarray(other, float) @ self.matrix[:3, :3].T + self.matrix[:3, 3]
+
+
+def rotation(axis: np.ndarray, angle: float) -> np.ndarray:
+    """(4, 4) of Rodrigues' formula, which is a rotation if the axis (3,) is unit; angle in degrees."""
+    x, y, z = axis
+    turn = math.radians(math.fmod(angle, 360))
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    matrix = np.eye(4)
+    matrix[:3, :3] = math.cos(turn) * np.eye(3) + math.sin(turn) * cross + (1 - math.cos(turn)) * np.outer(axis, axis)
+    return matrix
 
 
 def _numbers(what: str, value: ArrayLike, shape: tuple[int, ...]) -> np.ndarray:

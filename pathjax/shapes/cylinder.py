@@ -15,7 +15,7 @@ from pathjax.description.fields import Fields
 from pathjax.shapes import coincident
 from pathjax.shapes.accel.leaves import numbers_of, pack, rows_of
 from pathjax.shapes.accel.traverse import Tree
-from pathjax.shapes.shape import Primitives, Shape, Table
+from pathjax.shapes.shape import ROUND, Primitives, Shape, Table
 
 # Of the way to a lamp: what lies in its last part, seen from a point on the lamp itself, is that point.
 CLEAR = 1e-3
@@ -204,7 +204,7 @@ class Cylinder(Shape):
         with np.errstate(all="ignore"):
             radius, length = np.linalg.norm(x), np.linalg.norm(z)
             unit = np.stack([x / radius, y / radius, z / length])
-            round_enough = np.allclose(unit @ unit.T, np.eye(3), atol=1e-3)
+            round_enough = np.allclose(unit @ unit.T, np.eye(3), atol=ROUND)
             sizes = np.float32([radius, length])
         return cls(to_world) if round_enough and (sizes > 0).all() and (sizes < np.inf).all() else None
 

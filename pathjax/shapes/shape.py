@@ -26,6 +26,10 @@ from pathjax.shapes.accel.build import Tree as BuiltTree
 from pathjax.shapes.accel.traverse import Tree
 from pathjax.shapes.coincident import Faces
 
+# How far the squares of axes may be from equal, and axes from upright, where a shape must stay round. Axes of rotations
+# that files give by three digits leave it so.
+ROUND = 5e-3
+
 # ---- as a scene file has it -----------------------------------------------------------------------------------------
 
 

@@ -30,7 +30,7 @@ from pathjax.description.fields import Fields
 from pathjax.shapes import coincident
 from pathjax.shapes.accel.leaves import numbers_of, pack, rows_of
 from pathjax.shapes.accel.traverse import Tree
-from pathjax.shapes.shape import LampSample, Primitives, Shape, Table
+from pathjax.shapes.shape import ROUND, LampSample, Primitives, Shape, Table
 
 
 @dataclass
@@ -203,7 +203,7 @@ class Sphere(Shape):
         radius = float(np.linalg.norm(to_world[:3, 0]))
         with np.errstate(all="ignore"):
             unit = to_world[:3, :3] / radius
-            round_enough = np.allclose(unit.T @ unit, np.eye(3), atol=1e-3)
+            round_enough = np.allclose(unit.T @ unit, np.eye(3), atol=ROUND)
             return cls(to_world[:3, 3], radius, to_world) if round_enough and 0 < np.float32(radius) < np.inf else None
 
     def placed(self, to_world):
