@@ -36,7 +36,7 @@ class RoughPlastic(Plastic):
         return made
 
     @classmethod
-    def derived(cls, table):
+    def derived(cls, table, changed=()):
         alpha, inside, outside = (table.column(name).values for name in ("alpha", "int_ior", "ext_ior"))
         return table.with_column("coat", coat.coats(dict(table.settings)["distribution"], alpha, inside / outside))
 

@@ -131,9 +131,14 @@ def turns(y: Float[Array, ""], x: Float[Array, ""]) -> Float[Array, ""]:
     return jnp.where(angle < 0, angle + 1, angle)
 
 
+# Of red, green and blue in luminance: Rec. 709.
+LUMINANCE = 0.2126, 0.7152, 0.0722
+
+
 def luminance(rgb: Float[Array, "*shape 3"]) -> Float[Array, "*shape"]:
     """Rec. 709 luminance of linear RGB."""
-    return rgb[..., 0] * 0.2126 + rgb[..., 1] * 0.7152 + rgb[..., 2] * 0.0722
+    red, green, blue = LUMINANCE
+    return rgb[..., 0] * red + rgb[..., 1] * green + rgb[..., 2] * blue
 
 
 def frame_from_normal(n: Float[Array, "3"]) -> Frame:

@@ -27,26 +27,7 @@ Changes = dict[str, Float[Array, "..."]]
 
 def is_swept(scene: Scene, parameter: Parameter) -> bool:
     """Whether the recorded sweep finds the parameter at the vertices of paths."""
-    path = parameter.path
-    if parameter.moves_paths:
-        return False
-    for number, columns in enumerate(places.columns_of_textures(scene)):
-        if path in columns:
-            # A number that is textured is the luminance of the colours, which the sweep does not know of.
-            summed = scene.materials.textures.tables[number].kind.parts > 0
-            return parameter.is_texture or (summed and not _textured_numbers(scene))
-    for number, columns in enumerate(places.columns_of_lights(scene)):
-        if path in columns:
-            # A direction in which nothing is hit has the light of all backgrounds.
-            behind = emitters.backgrounds(scene.emitters)
-            return number not in behind or sum(scene.emitters[each].count for each in behind) == 1
-    return any(path in columns for columns in places.columns_of_bsdfs(scene))
-
-
-def _textured_numbers(scene: Scene) -> bool:
-    tables = *scene.materials.tables, *scene.materials.wrappers
-    columns = [column for table in tables for column in table.columns if column is not None]
-    return any(column.texture is not None and column.values.ndim == 1 for column in columns)
+    return not parameter.moves_paths and parameter.path in places.paths(scene)
 
 
 @usual_promotion
@@ -81,7 +62,8 @@ def pull(
     numbers = pixel.numbers(pixels, first_sample, spp, seed)
     options = replace(options, derivative=True, by_vertex=True)
     arrays = record.pullback(scene, adjoint, pixels, *numbers, paths=paths, options=options, devices=devices)
-    return {name: parameter.get(arrays[paths.index(parameter.path)]) for name, parameter in wanted.items()}
+    by_path = dict(zip(paths, arrays, strict=True))
+    return {name: parameter.transposed(by_path[parameter.path]) for name, parameter in wanted.items()}
 
 
 def _paths(wanted):

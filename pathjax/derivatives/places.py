@@ -2,13 +2,15 @@
 
 The list holds the entries of all arrays that are differentiated, one array after another: the row of a constant, a
 texel. A vertex of a path looks up a few numbers, each of one entry, or the sum of some (of four texels, say). A slot is
-one such number: the first that a bsdf looks up, or the second, whatever the kind of the bsdf is.
+one such number: the first colour that a bsdf looks up, or the second, or the first number, whatever the kind of the
+bsdf is.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from functools import partial
+from types import SimpleNamespace
 
 import jax.numpy as jnp
 import numpy as np
@@ -17,177 +19,254 @@ from jaxtyping import Array, Float, Int
 
 from pathjax import emitters
 from pathjax.core.math import at
-from pathjax.core.types import Hit
+from pathjax.core.types import EmitterSample, Hit, Ray
 from pathjax.emitters import Choice
 from pathjax.integrators.random_numbers import Bounce
 from pathjax.integrators.vertex import Vertex
+from pathjax.kinds import Declared
 from pathjax.scene import parameters as named
 from pathjax.scene.scene import Scene
+from pathjax.shapes import geometry
+from pathjax.textures import alike
 
 # Of the arrays that are differentiated, where they are in the scene.
 Paths = tuple[tuple, ...]
-# Of a table, where the values of its columns are in the scene -> place of the column.
-Columns = dict[tuple, int]
 # Of one number: places in the list, and their shares where there are several.
-Entries = tuple[tuple[Int[Array, ""], ...], tuple[Float[Array, ""], ...] | None]
+Entries = tuple[tuple[Int[Array, ""], ...], tuple[Float[Array, "..."], ...] | None]
+# The same, one after another; shares are numbers, or colours.
+Pairs = tuple[tuple[Int[Array, ""], Float[Array, "..."]], ...]
+# By slot, the column that is looked up; None: none.
+Columns = tuple[int | None, ...]
+
+BSDFS, TEXTURES = ("materials", "tables"), ("materials", "textures")
 
 
 @dataclass(frozen=True)
 class Slots:
-    """What is differentiated, by slot: of each table (of bsdfs; of lights), the column that is looked up."""
+    """What is differentiated, by slot; of bsdfs those of colours come before those of numbers."""
 
-    materials: tuple[tuple[int, ...], ...]  # by table of bsdfs
-    lights: tuple[tuple[int, ...], ...]  # by table of lights
+    bsdfs: tuple[Columns, ...]  # by table
+    lights: tuple[Columns, ...]  # by table; none of backgrounds
+    backgrounds: tuple[tuple[int, int, int], ...]  # table, row, column: of all at once, as all are met at once
+    colors: int  # of the slots of bsdfs
 
     @property
     def of_bsdfs(self) -> int:
-        return max(map(len, self.materials), default=0)
+        return max(map(len, self.bsdfs), default=0)
 
     @property
     def of_lights(self) -> int:
-        return max(map(len, self.lights), default=0)
+        return max([len(self.backgrounds), *map(len, self.lights)])
 
 
-def columns_of_bsdfs(scene: Scene) -> list[Columns]:
-    """By table."""
-    return [_columns(table, ("materials", "tables", i)) for i, table in enumerate(scene.materials.tables)]
+# ---- what is differentiated -----------------------------------------------------------------------------------------
 
 
-def columns_of_textures(scene: Scene) -> list[Columns]:
-    textures = scene.materials.textures
-    tables = textures.tables if textures else ()
-    return [_columns(table, ("materials", "textures", "tables", i)) for i, table in enumerate(tables)]
+def tables_of_textures(scene: Scene, path: tuple) -> list[tuple]:
+    """Paths of the tables of the textures that are at a path."""
+    textures = named.get(scene, path)
+    return [(*path, "tables", i) for i in range(len(textures.tables))] if textures else []
 
 
-def columns_of_lights(scene: Scene) -> list[Columns]:
-    return [_columns(lights.table, ("emitters", i, "table")) for i, lights in enumerate(scene.emitters)]
+def paths(scene: Scene) -> set[tuple]:
+    """Of all arrays that may be differentiated."""
+    tables = [(*BSDFS, i) for i in range(len(scene.materials.tables))] + tables_of_textures(scene, TEXTURES)
+    for i in range(len(scene.emitters)):
+        tables += [("emitters", i, "table"), *tables_of_textures(scene, ("emitters", i, "textures"))]
+    return {path for table in tables for path in _columns(scene, table)}
 
 
-def _columns(table, path):
-    return {(*path, "columns", i, "values"): i for i, column in enumerate(table.columns) if column is not None}
+def _columns(scene: Scene, table: tuple) -> dict[tuple, int]:
+    """Of a table, where the values of its columns are -> place of the column."""
+    columns = named.get(scene, table).columns
+    return {(*table, "columns", i, "values"): i for i, column in enumerate(columns) if column is not None}
 
 
 def slots(scene: Scene, paths: Paths) -> Slots:
-    textured = any(path in columns for columns in columns_of_textures(scene) for path in paths)
+    def looked_up(table, textures):
+        """Colours and numbers that are looked up in a table."""
+        textured = any(path in paths for each in tables_of_textures(scene, textures) for path in _columns(scene, each))
+        columns = named.get(scene, table).columns
+        held = _columns(scene, table).items()
+        found = [i for path, i in held if path in paths or (textured and columns[i].texture is not None)]
+        return [i for i in found if columns[i].values.ndim > 1], [i for i in found if columns[i].values.ndim == 1]
 
-    def looked_up(table, columns, textured):
-        held = ((i, table.columns[i]) for i in columns.values())
-        colors = [i for i, column in held if column.texture is not None and column.values.ndim == 2]
-        return tuple(i for path, i in columns.items() if path in paths or (textured and i in colors))
+    def joined(found):
+        """All colours, and all numbers behind the most colours that any table has."""
+        most, numbers = (max(map(len, each), default=0) for each in zip(*found, strict=True)) if found else (0, 0)
 
-    bsdfs = zip(scene.materials.tables, columns_of_bsdfs(scene), strict=True)
-    lights = zip(scene.emitters, columns_of_lights(scene), strict=True)
-    return Slots(
-        tuple(looked_up(table, columns, textured) for table, columns in bsdfs),
-        tuple(looked_up(each.table, columns, False) for each, columns in lights),  # their textures are their own
-    )
+        def filled(columns, count):
+            return (*columns, *[None] * (count - len(columns)))
+
+        return tuple(filled(c, most) + filled(n, numbers) for c, n in found), most
+
+    bsdfs, colors = joined([looked_up((*BSDFS, i), TEXTURES) for i in range(len(scene.materials.tables))])
+    of_lights = [looked_up(("emitters", i, "table"), ("emitters", i, "textures")) for i in range(len(scene.emitters))]
+    behind = emitters.backgrounds(scene.emitters)
+    lights = tuple(() if i in behind else (*each[0], *each[1]) for i, each in enumerate(of_lights))
+    backgrounds = [
+        (i, row, column) for i in behind for column in sum(of_lights[i], []) for row in range(scene.emitters[i].count)
+    ]
+    return Slots(bsdfs, lights, tuple(backgrounds), colors)
 
 
 def nudged(scene: Scene, slots: Slots, nudges: Float[Array, " slots"]) -> Scene:
     """The scene where each slot's number is larger by its nudge, of bsdfs first, in all channels."""
 
     def of(table, columns, nudges):
-        shape = [table.columns[place].values.shape[1:] for place in columns]
-        return table.nudged({place: jnp.broadcast_to(nudges[s], shape[s]) for s, place in enumerate(columns)})
+        return table.nudged({column: nudges[s] for s, column in enumerate(columns) if column is not None})
 
-    bsdfs = tuple(map(of, scene.materials.tables, slots.materials, [nudges] * len(slots.materials)))
+    bsdfs = tuple(map(of, scene.materials.tables, slots.bsdfs, [nudges] * len(slots.bsdfs)))
     beyond = nudges[slots.of_bsdfs :]
-    lights = tuple(
-        replace(lights, table=of(lights.table, columns, beyond))
-        for lights, columns in zip(scene.emitters, slots.lights, strict=True)
-    )
+    tables = [of(each.table, columns, beyond) for each, columns in zip(scene.emitters, slots.lights, strict=True)]
+    for s, (i, row, column) in enumerate(slots.backgrounds):
+        nudge = tables[i].columns[column].nudge
+        nudge = jnp.zeros((scene.emitters[i].count,), beyond.dtype) if nudge is None else nudge
+        tables[i] = tables[i].nudged({column: nudge.at[row].set(beyond[s])})
+    lights = tuple(replace(each, table=table) for each, table in zip(scene.emitters, tables, strict=True))
     return replace(scene, materials=replace(scene.materials, tables=bsdfs), emitters=lights)
+
+
+# ---- the list -------------------------------------------------------------------------------------------------------
 
 
 def firsts(scene: Scene, paths: Paths) -> tuple[dict[tuple, int], int]:
     """Where each array begins in the list, and the length of the list."""
-    ends = np.cumsum([0, *(len(named.get(scene, path)) for path in paths)]).tolist()
+    ends = np.cumsum([0, *(count(scene, path) for path in paths)]).tolist()
     return dict(zip(paths, ends[:-1], strict=True)), ends[-1]
 
 
-class LightPlaces(NamedTuple):
-    """Of the numbers of lights, by slot."""
-
-    on_surfaces: list[Int[Array, " R"]]  # by the number that `Geometry.light` has
-    sampled: list[Int[Array, " R"]]  # by the number that is chosen
-    background: list[int]
+def count(scene: Scene, path: tuple) -> int:
+    """Entries of an array: its colours, or its numbers."""
+    array = named.get(scene, path)
+    return array.size // 3 if of_colors(scene, path) else array.size
 
 
-def of_lights(scene: Scene, choice: Choice | None, paths: Paths, slots: Slots) -> LightPlaces:
-    first, _ = firsts(scene, paths)
-
-    def rows(number, lights, slot):
-        columns = slots.lights[number]
-        begins = first["emitters", number, "table", "columns", columns[slot], "values"] if slot < len(columns) else 0
-        return begins + (jnp.arange(lights.count, dtype=jnp.int32) if lights.row is None else lights.row)
-
-    def listed(slot, wanted):
-        found = [rows(number, lights, slot) for number, lights in enumerate(scene.emitters) if wanted(number, lights)]
-        return jnp.concatenate(found) if found else jnp.zeros((1,), jnp.int32)
-
-    def backgrounds(slot):
-        found = [rows(number, scene.emitters[number], slot)[0] for number in emitters.backgrounds(scene.emitters)]
-        return found[0] if found else jnp.int32(0)
-
-    each = range(slots.of_lights)
-    return LightPlaces(
-        [listed(slot, lambda number, lights: lights.lamps is not None) for slot in each],
-        [listed(slot, lambda number, lights: choice and choice.first[number] is not None) for slot in each],
-        [backgrounds(slot) for slot in each],
-    )
+def of_colors(scene: Scene, path: tuple) -> bool:
+    """Whether an array holds colours; else it holds numbers."""
+    declared = _declared(scene, path)
+    return named.get(scene, path).ndim > 1 or (declared.shared and declared.colors)
 
 
-def of_hit(scene: Scene, places: LightPlaces, slot: int, hit: Hit) -> Int[Array, ""]:
-    """Of the light that a ray meets; of any, where it meets none."""
-    if not scene.geometry.tables:
-        return places.background[slot]
-    number = jnp.maximum(at(scene.geometry.light, jnp.maximum(hit.primitive, 0)), 0)
-    return jnp.where(hit.primitive >= 0, at(places.on_surfaces[slot], number), places.background[slot])
+def _declared(scene: Scene, path: tuple) -> Declared:
+    """What the parameter is declared as whose column is at a path."""
+    *table, _, column, _ = path
+    return list(named.get(scene, table).kind.declared.values())[column]
 
 
-def of_light_sample(
-    choice: Choice, places: LightPlaces, slot: int, ref: Float[Array, "3"], u: Bounce
-) -> Int[Array, ""]:
-    number, _, _ = emitters.choose(choice, ref, u.light)
-    return at(places.sampled[slot], number)
+# ---- where the numbers of a vertex stand ----------------------------------------------------------------------------
 
 
 def of_bsdf(scene: Scene, paths: Paths, slots: Slots, slot: int, here: Vertex) -> Entries:
     """Of the number that the bsdf of a vertex looks up for a slot; of any, where it looks up none."""
     first, _ = firsts(scene, paths)
-    materials = scene.materials
-    textures = {
-        (table, column): first[path]
-        for table, columns in enumerate(columns_of_textures(scene))
-        for path, column in columns.items()
-        if path in first
+    found = [
+        partial(_of_row, scene, first, (*BSDFS, number), columns[slot], here.row, TEXTURES, here.surface)
+        for number, columns in enumerate(slots.bsdfs)
+    ]
+    calls = alike(found, here.wi.dtype)
+    pairs = calls[0]() if len(calls) == 1 else lax.switch(jnp.maximum(here.kind, 0), calls)
+    return _entries(pairs, whole=not any(path[:2] == TEXTURES for path in paths))
+
+
+def of_hit(scene: Scene, paths: Paths, slots: Slots, slot: int, ray: Ray, hit: Hit, here: Vertex | None) -> Entries:
+    """Of the number that the light looks up that a ray meets; of any, where it meets none."""
+    first, _ = firsts(scene, paths)
+    found, starts, number = [partial(_of_background, scene, first, slots, slot, ray.d)], [], jnp.int32(0)
+    if here is not None:
+        number, start = jnp.maximum(at(scene.geometry.light, jnp.maximum(hit.primitive, 0)), 0), 0
+        for i, lights in enumerate(scene.emitters):
+            if lights.lamps is not None:
+                starts.append(start)
+                found.append(partial(_of_light, scene, first, slots, slot, i, number - start, here.surface))
+                start += lights.count
+    sky, *calls = alike(found, ray.d.dtype)
+    if not calls:
+        pairs = sky()
+    else:
+        pairs = lax.cond(hit.primitive < 0, sky, lambda: geometry.switch_by_range(number, starts, calls))
+    return _entries(pairs, _whole(scene, paths))
+
+
+def of_light_sample(
+    scene: Scene, choice: Choice, paths: Paths, slots: Slots, slot: int, here: Vertex, u: Bounce
+) -> Entries:
+    """Of the number that a sampled light looks up; of any, where it looks up none."""
+    first, _ = firsts(scene, paths)
+    number, _, _ = emitters.choose(choice, here.surface.p, u.light)
+    whole, behind = _whole(scene, paths), emitters.backgrounds(scene.emitters)
+    drawn = None
+    if not whole:
+        drawn = emitters.sample(scene.emitters, scene.geometry, choice, here.surface.p, u.light, u.triangle)
+    starts, found = [], []
+    for i, (lights, start) in enumerate(zip(scene.emitters, choice.first, strict=True)):
+        if start is None:
+            continue
+        starts.append(start)
+        if i in behind:
+            found.append(partial(_of_background, scene, first, slots, slot, drawn and drawn.d))
+        else:
+            there = None if drawn is None or lights.textures is None else _lit(scene, i, number - start, here, drawn)
+            found.append(partial(_of_light, scene, first, slots, slot, i, number - start, there))
+    pairs = geometry.switch_by_range(number, starts, alike(found, here.wi.dtype))
+    return _entries(pairs, whole)
+
+
+def _whole(scene: Scene, paths: Paths) -> bool:
+    """Whether each number that a light looks up is one entry, and not the sum of some."""
+    return all(path[2] == "table" and not _declared(scene, path).shared for path in paths if path[0] == "emitters")
+
+
+def _lit(scene: Scene, number: int, light: Int[Array, ""], here: Vertex, drawn: EmitterSample):
+    """Where a sampled light looks up its textures."""
+    lights = scene.emitters[number]
+    if not lights.kind.on_surfaces:
+        return SimpleNamespace(uv=lights.kind.uv(lights.parameters(light), drawn.d))
+    ray = Ray(here.surface.p, drawn.d, drawn.distance, jnp.int32(-1))
+    return geometry.surface(scene.geometry, ray, Hit(drawn.distance, drawn.primitive, jnp.int32(0)))
+
+
+def _of_light(scene: Scene, first: dict, slots: Slots, slot: int, number: int, light, surface) -> Pairs:
+    lights, columns, path = scene.emitters[number], slots.lights[number], ("emitters", number)
+    row = light if lights.row is None else at(lights.row, light)
+    column = columns[slot] if slot < len(columns) else None
+    return _of_row(scene, first, (*path, "table"), column, row, (*path, "textures"), surface)
+
+
+def _of_background(scene: Scene, first: dict, slots: Slots, slot: int, d) -> Pairs:
+    if slot >= len(slots.backgrounds):
+        return ()
+    number, row, column = slots.backgrounds[slot]
+    path, lights = ("emitters", number, "table"), scene.emitters[number]
+    name = list(lights.kind.declared)[column]
+    if not lights.kind.declared[name].shared:
+        return _of_row(scene, first, path, column, row, None, None)
+    begins = first[(*path, "columns", column, "values")]
+    parts = lights.kind.entries(lights.parameters(row), d)
+    return tuple((begins + entry, share) for each, entry, share in parts if each == name)
+
+
+def _of_row(scene: Scene, first: dict, path: tuple, column: int | None, row, of_textures, surface) -> Pairs:
+    """Of a column of the table at a path, and of the textures at another one, which are looked up on a surface."""
+    if column is None:
+        return ()
+    values, codes = (getattr(named.get(scene, path).columns[column], each) for each in ("values", "texture"))
+    begins = first.get((*path, "columns", column, "values"))
+    constant = () if begins is None else ((jnp.int32(begins + row), jnp.ones((), values.dtype)),)
+    wanted = {
+        (number, place): first[of_texture]
+        for number, table in enumerate(tables_of_textures(scene, of_textures) if of_textures else ())
+        for of_texture, place in _columns(scene, table).items()
+        if of_texture in first
     }
-    zero = jnp.zeros_like(here.wi[0])
-    most = max((table.kind.parts for table in materials.textures.tables), default=1) if textures else 1
+    if codes is None or not wanted:
+        return constant
+    code = at(codes, row)
+    textured = partial(named.get(scene, of_textures).entries, code, surface, wanted)
+    return lax.cond(code[0] >= 0, *alike([textured, lambda: constant], values.dtype))
 
-    def of(number, table):
-        def constant(column):
-            begins = first.get(("materials", "tables", number, "columns", column, "values"))
-            place = jnp.int32(0) if begins is None else begins + here.row
-            none = (jnp.int32(0),) * (most - 1), (zero,) * (most - 1)
-            return (place, *none[0]), (zero if begins is None else zero + 1, *none[1])
 
-        def entries():
-            if slot >= len(slots.materials[number]):
-                return (jnp.int32(0),) * most, (zero,) * most
-            column = slots.materials[number][slot]
-            codes = table.columns[column].texture
-            if not textures or codes is None:
-                return constant(column)
-            code = at(codes, here.row)
-
-            def textured():
-                return materials.textures.entries(code, here.surface, textures)
-
-            return lax.cond(code[0] >= 0, textured, lambda: constant(column))
-
-        return entries
-
-    calls = [of(*each) for each in enumerate(materials.tables)]
-    places, shares = calls[0]() if len(calls) == 1 else lax.switch(jnp.maximum(here.kind, 0), calls)
-    return places, shares if most > 1 else None
+def _entries(pairs: Pairs, whole: bool) -> Entries:
+    """whole: each number is one entry."""
+    places, shares = zip(*pairs, strict=True)
+    return places, None if whole else shares

@@ -17,6 +17,7 @@ end of a path that they have recorded to the first vertex of a path that was swe
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from functools import partial
 from typing import NamedTuple
 
@@ -29,7 +30,7 @@ from pathjax import emitters
 from pathjax.compile import native_fold, persistent_loop, together
 from pathjax.compile.lanes import flags
 from pathjax.core import sampler
-from pathjax.core.math import at
+from pathjax.core.math import LUMINANCE, at
 from pathjax.derivatives import places
 from pathjax.emitters import Choice
 from pathjax.integrators import path, pixel
@@ -48,13 +49,17 @@ FEW = 8
 BEGINS, ENDS, HOLDS = 1, 2, 4
 
 
-class Slot(NamedTuple):
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Slot:
     """What a vertex adds to the derivatives in one number that it looked up, times the adjoint and the throughput."""
 
     places: tuple[Int[Array, ""], ...]  # of the number, in the list of derivatives
-    shares: tuple[Float[Array, ""], ...] | None  # of each place in the number; None: there is one place
+    # Of each place in the number, or in each of its channels; None: there is one place.
+    shares: tuple[Float[Array, "..."], ...] | None
     now: Float[Array, "3"]  # d(Le + n)
     later: Float[Array, "3"] | None  # dw, to be multiplied by R
+    is_number: bool = field(default=False, metadata={"static": True})  # the luminance of what is looked up
 
 
 class Record(NamedTuple):
@@ -78,7 +83,6 @@ def extend(
     options: Options,
     slots: places.Slots,
     paths: places.Paths,
-    lights: places.LightPlaces,
     scale: Float[Array, "3"],
 ) -> tuple[path.Path, Record]:
     """`path.extend` and the Record of the vertex, whose `begins` is not known here.
@@ -102,13 +106,14 @@ def extend(
     for s in range(slots.of_bsdfs):
         if here is not None:
             entries = places.of_bsdf(scene, paths, slots, s, here)
-            found.append(Slot(*entries, scale * n[1 + s], scale * w[1 + s]))
+            found.append(Slot(*entries, scale * n[1 + s], scale * w[1 + s], s >= slots.colors))
     for s in range(slots.of_lights):
         k = 1 + slots.of_bsdfs + s
-        found.append(Slot((places.of_hit(scene, lights, s, hit),), None, scale * Le[k], None))
-        if choice is not None:
-            sampled = places.of_light_sample(choice, lights, s, here.surface.p, u)
-            found.append(Slot((sampled,), None, scale * n[k], None))
+        entries = places.of_hit(scene, paths, slots, s, now.ray, hit, here)
+        found.append(Slot(*entries, scale * Le[k], None))
+        if choice is not None and here is not None:
+            entries = places.of_light_sample(scene, choice, paths, slots, s, here, u)
+            found.append(Slot(*entries, scale * n[k], None))
     return on, Record(jnp.bool_(False), ~on.alive, Le[0] + n[0], w[0], found)
 
 
@@ -183,7 +188,11 @@ def sweep(structure: Record, memory: Memory, due: Bool[Array, ""]) -> Memory:
         R = [jnp.where(ends, 0, x) for x in state.R]
         total = state.total
         for slot in record.slots:
-            change = slot.now if slot.later is None else [a + b * x for a, b, x in zip(*slot[2:], R, strict=True)]
+            change = slot.now
+            if slot.later is not None:
+                change = [a + b * x for a, b, x in zip(slot.now, slot.later, R, strict=True)]
+            if slot.is_number:
+                change = [sum(change) * share for share in LUMINANCE]
             total = add(total, slot, [jnp.where(here, x, 0) for x in change])
         R = [n + w * x for n, w, x in zip(record.gathered, record.weight, R, strict=True)]
         back = state.back + 1
@@ -211,23 +220,28 @@ def unflattened(structure: Record, numbers: list) -> Record:
 
 def add(total, slot: Slot, change: list[Float[Array, " W"]]):
     """The total to which each lane's change (3) is added."""
-    shares = slot.shares or (None,)
     if isinstance(total, list):
-        for place, share in zip(slot.places, shares, strict=True):
-            part = change if share is None else [share * x for x in change]
-            total = [t + jnp.where(place == k // 3, part[k % 3], 0) for k, t in enumerate(total)]
+        for place, share in zip(slot.places, slot.shares or [None], strict=True):
+            total = [t + jnp.where(place == k // 3, _part(change, share)[k % 3], 0) for k, t in enumerate(total)]
         return total
 
     # XLA's own scatter would break the native kernel; a lane that adds nothing adds 0.
     def one(lane, total):
-        x = jnp.stack([at(column, lane) for column in change])
-        for place, share in zip(slot.places, shares, strict=True):
-            k = at(place, lane)
-            new = at(total, k) + (x if share is None else at(share, lane) * x)
-            total = lax.dynamic_update_slice(total, new[None], (k, jnp.int32(0)), allow_negative_indices=False)
+        of_lane = partial(jax.tree.map, lambda column: at(column, lane))
+        x = of_lane(change)
+        for place, share in of_lane(list(zip(slot.places, slot.shares or [None], strict=True))):
+            new = at(total, place) + jnp.stack(_part(x, share))
+            total = lax.dynamic_update_slice(total, new[None], (place, jnp.int32(0)), allow_negative_indices=False)
         return total
 
     return lax.fori_loop(0, len(change[0]), one, total)
+
+
+def _part(change, share):
+    """Of three numbers the share, which is one, or one of each; None: all."""
+    if share is None:
+        return change
+    return [s * x for s, x in zip(share if isinstance(share, list) else [share] * 3, change, strict=True)]
 
 
 def all_set(of_lanes: Bool[Array, " W"]) -> Bool[Array, ""]:
@@ -237,7 +251,7 @@ def all_set(of_lanes: Bool[Array, " W"]) -> Bool[Array, ""]:
 # ---- pixels ---------------------------------------------------------------------------------------------------------
 
 
-def pixel_sweep(work, scene: Scene, choice, lights, memory: Memory, *, options, slots, paths, structure) -> Memory:
+def pixel_sweep(work, scene: Scene, choice, memory: Memory, *, options, slots, paths, structure) -> Memory:
     """Add what the samples of a pixel give. work: the adjoint (3,) of its mean, and `pixel.Work`."""
     adjoint, (pixel_number, first_sample, spp, seed) = work
     stream = sampler.pixel_stream(seed, pixel_number)
@@ -248,7 +262,7 @@ def pixel_sweep(work, scene: Scene, choice, lights, memory: Memory, *, options, 
         begins = ~now.alive
         now, weight = pixel.begun(scene, pixel_number, stream, number, now, weight, options)
         u = bounce_numbers(scene, stream, number, path.vertices(now), options.sampler)
-        now, record = extend(scene, choice, now, u, options, slots, paths, lights, weight * adjoint)
+        now, record = extend(scene, choice, now, u, options, slots, paths, weight * adjoint)
         record = record._replace(begins=begins)
         memory = together(partial(remember, structure))(memory, columns_of(record))
         return number + jnp.where(now.alive, 0, 1).astype(number.dtype), now, weight, memory
@@ -278,23 +292,22 @@ def pullback(scene: Scene, adjoint, pixels, first_sample, spp, seed, *, paths, o
     scene = options.applied(scene)
     choice = emitters.choice(scene.emitters, options.strategy)
     slots = places.slots(scene, paths)
-    lights = places.of_lights(scene, choice, paths, slots)
     first, entries = places.firsts(scene, paths)
 
-    def record(scene, choice, lights, x):
+    def record(scene, choice, x):
         now, _ = pixel.camera_path(scene, jnp.int32(0), x, x, options)
         u = bounce_numbers(scene, x, x, path.vertices(now), options.sampler)
-        return extend(scene, choice, now, u, options, slots, paths, lights, now.throughput)[1]
+        return extend(scene, choice, now, u, options, slots, paths, now.throughput)[1]
 
-    structure = jax.eval_shape(record, scene, choice, lights, jnp.uint32(0))
+    structure = jax.eval_shape(record, scene, choice, jnp.uint32(0))
     f = partial(pixel_sweep, options=options, slots=slots, paths=paths, structure=structure)
     begin, end = partial(start, scene, structure, entries), partial(finish, structure)
     work = adjoint, (pixels, first_sample, spp, seed)
-    total = native_fold(f, work, scene, choice, lights, start=begin, finish=end, devices=devices)
-    return [_of_array(total, first[path], named.get(scene, path)) for path in paths]
+    total = native_fold(f, work, scene, choice, start=begin, finish=end, devices=devices)
 
+    def of_array(path):
+        rows = total[first[path] : first[path] + places.count(scene, path)]
+        rows = rows if places.of_colors(scene, path) else rows.sum(1)
+        return rows.reshape(named.get(scene, path).shape)
 
-def _of_array(total, begins, array):
-    """Of the list, what belongs to an array of colours (R, 3) or of numbers (R,)."""
-    rows = total[begins : begins + len(array)]
-    return rows if array.ndim == 2 else rows.sum(1)
+    return [of_array(path) for path in paths]

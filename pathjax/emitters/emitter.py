@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from pathjax.kinds import Declared, Kind, Row
 
@@ -76,6 +76,14 @@ class Background(Emitter):
     @abstractmethod
     def emitted(p: Row, d: Float[Array, "3"]) -> Float[Array, "3"]:
         """Radiance that comes from the direction d."""
+
+    @staticmethod
+    def entries(p: Row, d: Float[Array, "3"]) -> list[tuple[str, Int[Array, ""], Float[Array, ""]]]:
+        """Of which colours of `Shared` arrays `emitted` takes a sum, for derivatives: the parameter, entry and share.
+
+        `emitted` adds `p.nudge(parameter)` to the sum.
+        """
+        return []
 
     @staticmethod
     @abstractmethod

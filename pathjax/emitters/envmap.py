@@ -19,16 +19,18 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from pathjax.compile import compute_once
+from pathjax.compile import compute_once, is_traced
 from pathjax.core.math import at, cos_sin_turns, luminance, safe_atan2, safe_sqrt, turns
 from pathjax.emitters.emitter import Background
 from pathjax.images import read_rgb
-from pathjax.kinds import Number, PerRow, Rotation, Row, Shared, Unused
+from pathjax.kinds import Number, Parameter, PerRow, Rotation, Row, Shared, Unused
 from pathjax.textures.bitmap import texels_of
 
 # Tabled probabilities are multiples of this, and random numbers odd multiples of half of it: so what is tabled is what
 # is drawn, exactly.
 _STEP = 2.0**-23
+# What is made of the texels.
+TABLED = "rows", "columns", "from_pole", "per_solid_angle", "brightness"
 # Rows of patches whose probabilities are made at once, so that little memory is used beside what is kept.
 _ROWS = 64
 
@@ -37,7 +39,7 @@ class Envmap(Background):
     """An `Instance` holds `texels` (H, W, 3), `scale` and `to_world`."""
 
     # Large tables are flat, since lanes would copy others each time.
-    texels = Shared()  # (H W 3,) linear radiance
+    texels = Shared(colors=True)  # (H W 3,) linear radiance
     rows = Shared()  # (H,) probability of the patches above each row of texels, from 0 to 1
     columns = Shared()  # ((H - 1) (W + 1),) of those left of each texel in a row of patches, from 0 to 1
     from_pole = Shared()  # (H,) 1 - |cos| of the polar angles of rows of texels
@@ -70,15 +72,37 @@ class Envmap(Background):
     @classmethod
     def build(cls, instances, dtype, path, parameters, code):
         (instance,) = instances
-        table = super().build(instances, dtype, path, parameters, code)
-        name = f"{instance.name}.radiance"
-        why = "a picture, whose texels are too many for one derivative each; its `scale` is a parameter"
-        parameters.refused[name] = f"{name} is {why}"
         texels = np.asarray(instance.values["texels"], dtype)
         if len(texels) == 1:  # zenith, nadir and what is between
             texels = np.concatenate([texels, texels])
+        where = (*path, "columns", cls.place("texels"), "values")
+        radiance = Parameter(where, (0,), texels.shape, (0, math.inf), "texels", rows=texels.size)
+        parameters.known[f"{instance.name}.radiance"] = radiance
+        table = super().build(instances, dtype, path, parameters, code)
         for key, values in {"texels": texels.reshape(-1), **_probabilities(texels)}.items():
             table = table.with_column(key, np.asarray(values, dtype))
+        return table
+
+    @classmethod
+    def derived(cls, table, changed=()):
+        """The probabilities are those of the texels, detached."""
+        if "texels" not in changed:
+            return table
+        texels = lax.stop_gradient(table.column("texels").values)
+        size = _size(Row(table, 0))
+
+        def on_host(texels):
+            made = _probabilities(np.reshape(texels, (*size, 3)))
+            return {key: np.asarray(values, texels.dtype) for key, values in made.items()}
+
+        if is_traced(texels):
+            old = {key: table.column(key).values for key in TABLED}
+            shapes = {key: jax.ShapeDtypeStruct(values.shape, texels.dtype) for key, values in old.items()}
+            made = jax.pure_callback(on_host, shapes, texels, vmap_method="sequential")
+        else:
+            made = jax.device_put(on_host(np.asarray(texels)))
+        for key in TABLED:
+            table = table.with_column(key, made[key])
         return table
 
     @staticmethod
@@ -112,7 +136,18 @@ class Envmap(Background):
         following = jnp.where(x + 1 < width, x + 1, 0)
         upper = texel(y, x) * (1 - beside) + texel(y, following) * beside
         lower = texel(y + 1, x) * (1 - beside) + texel(y + 1, following) * beside
-        return (upper * (1 - below) + lower * below) * p.scale
+        radiance = upper * (1 - below) + lower * below
+        if (nudge := p.nudge("texels")) is not None:
+            radiance = radiance + nudge
+        return radiance * p.scale
+
+    @staticmethod
+    def entries(p: Row, d: Float[Array, "3"]) -> list[tuple[str, Int[Array, ""], Float[Array, ""]]]:
+        (y, x), (below, beside) = _patch(p, d)
+        width = _size(p)[1]
+        following = jnp.where(x + 1 < width, x + 1, 0)
+        rows, columns = ((y, 1 - below), (y + 1, below)), ((x, 1 - beside), (following, beside))
+        return [("texels", y * width + x, a * b) for y, a in rows for x, b in columns]
 
     @staticmethod
     def density(p: Row, d: Float[Array, "3"]) -> Float[Array, ""]:

@@ -183,6 +183,7 @@ class Shared(Declared):
     """An array that belongs to all rows together, filled by the kind's own builder."""
 
     by_number: bool = False  # read at numbers that rows of the table tell, never as a whole: it may be longer
+    colors: bool = False  # one after another, in an array of one axis
     shared = True
 
 

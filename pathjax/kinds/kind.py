@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -90,8 +90,11 @@ class Kind:
         return cls.derived(Table(tuple(columns), cls, settings))
 
     @classmethod
-    def derived(cls, table: Table) -> Table:
-        """The table with columns that follow from others; whoever changes parameters of a scene calls it."""
+    def derived(cls, table: Table, changed: Collection[str] = ()) -> Table:
+        """The table with columns that follow from others; whoever changes parameters of a scene calls it.
+
+        changed: names of the columns that differ from before; none of a table that is built.
+        """
         return table
 
 

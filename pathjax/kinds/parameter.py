@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
+import jax
+import jax.numpy as jnp
 from jaxtyping import Array, Shaped
 
 
@@ -36,6 +38,12 @@ class Parameter:
             return values.at[self.index].set(value)
         first = self.index[0]
         return values.at[first : first + self.rows].set(value.reshape(self.rows, *values.shape[1:]))
+
+    def transposed(self, values: Shaped[Array, "R ..."]) -> Shaped[Array, "..."]:
+        """The transpose of `put` into zeros: of derivatives in the array, those in the parameter."""
+        zero = jnp.zeros(self.shape, values.dtype)
+        (found,) = jax.linear_transpose(lambda x: self.put(jnp.zeros_like(values), x), zero)(values)
+        return found
 
     @property
     def table(self) -> tuple[str | int, ...]:

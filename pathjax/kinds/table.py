@@ -20,7 +20,8 @@ from pathjax.core.types import Number, Surface
 class Column:
     values: Shaped[Array, "R ..."]  # of a row with a texture: not read
     texture: Int[Array, "R 2"] | None = None  # kind, -1 for none, and row of the texture; None: no row has one
-    nudge: Shaped[Array, "..."] | None = None  # added to what is looked up, for derivatives in it; None: nothing
+    # Added to what is looked up, in all channels, for derivatives in it; of each row, or of all. None: nothing.
+    nudge: Float[Array, ""] | Float[Array, " R"] | None = None
 
 
 @jax.tree_util.register_dataclass
@@ -90,7 +91,14 @@ class Row:
                 return color if constant.shape else luminance(color)
 
             value = lax.cond(at(column.texture, self._row, 0) >= 0, look_up, lambda: constant)
-        return value if column.nudge is None else value + column.nudge
+        nudge = self.nudge(name)
+        return value if nudge is None else value + nudge
+
+    def nudge(self, name: str) -> Float[Array, ""] | None:
+        """What is added to a parameter, or to what a kind finds in a `Shared` array; None: nothing."""
+        column = self._table.column(name)
+        nudge = None if column is None else column.nudge
+        return nudge if nudge is None or not nudge.ndim else at(nudge, self._row)
 
     def _color(self, name, column):
         if self._colors is not None:

@@ -56,9 +56,12 @@ def with_values(scene: Scene, values: Mapping[str, jax.Array], parameters: Mappi
     for name, value in values.items():
         parameter = parameters[name]
         scene = put(scene, parameter.path, parameter.put(get(scene, parameter.path), value))
-    for path in dict.fromkeys(parameters[name].table for name in values):
+    changed: dict[tuple, list[str]] = {}
+    for parameter in (parameters[name] for name in values):
+        changed.setdefault(parameter.table, []).append(parameter.field)
+    for path, fields in changed.items():
         table = get(scene, path)
-        scene = put(scene, path, table.kind.derived(table))
+        scene = put(scene, path, table.kind.derived(table, fields))
     return scene
 
 

@@ -6,11 +6,12 @@ scene file may put a texture; of kinds that the scene does not hold nothing is c
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
@@ -31,6 +32,7 @@ __all__ = [
     "Texture",
     "Textures",
     "Uniform",
+    "alike",
     "build",
     "register",
 ]
@@ -68,7 +70,7 @@ class Textures:
 
     def entries(
         self, code: Int[Array, "2"], surface: Surface, first: Mapping[tuple[int, int], int]
-    ) -> tuple[tuple[Int[Array, ""], ...], tuple[Float[Array, ""], ...]]:
+    ) -> tuple[tuple[Int[Array, ""], Float[Array, "..."]], ...]:
         """Where the numbers that a colour is the sum of stand in a list of derivatives, and their shares.
 
         first: by table and column, where its entries begin. Of columns that are not named there the share is 0.
@@ -77,24 +79,39 @@ class Textures:
         def of(number, table):
             def entries():
                 row = jnp.maximum(code[1], 0)
-                p, columns = Row(table, row), [column for each, column in first if each == number]
-                parts = table.kind.entries(p, _uv(p, surface), surface) if columns else []
-                found = [
-                    (first[number, table.kind.place(name)] + (row if entry is None else entry), share)
+                p, known = Row(table, row), {table.kind.place(name): name for name in table.kind.declared}
+                wanted = {known[column]: begins for (each, column), begins in first.items() if each == number}
+                parts = table.kind.entries(p, _uv(p, surface), surface) if wanted else ()
+                return tuple(
+                    (wanted[name] + (row if entry is None else entry), share)
                     for name, entry, share in parts
-                    if table.kind.place(name) in columns
-                ]
-                found += [(jnp.int32(0), jnp.zeros_like(surface.uv[0]))] * (most - len(found))
-                return tuple(zip(*found, strict=True))
+                    if name in wanted
+                )
 
             return entries
 
-        most = max(table.kind.parts for table in self.tables)
-        return self._switch(code, [of(*each) for each in enumerate(self.tables)])
+        calls = [of(*each) for each in enumerate(self.tables)]
+        return self._switch(code, alike(calls, surface.uv.dtype))
 
     def _switch(self, code, calls):
         """What the call of the texture's kind gives."""
         return calls[0]() if len(calls) == 1 else lax.switch(jnp.maximum(code[0], 0), calls)
+
+
+def alike(calls: Sequence[Callable], dtype) -> list[Callable]:
+    """Calls that give places and shares; now all give as many, of which those that they lack have the share 0."""
+    found = [jax.eval_shape(lambda call=call: tuple(call())) for call in calls]
+    most = max(1, *map(len, found))
+    shape = np.broadcast_shapes(*(share.shape for pairs in found for _, share in pairs))
+
+    def padded(call):
+        def pairs():
+            known = tuple((place, jnp.broadcast_to(share, shape)) for place, share in call())
+            return known + ((jnp.int32(0), jnp.zeros(shape, dtype)),) * (most - len(known))
+
+        return pairs
+
+    return [padded(call) for call in calls]
 
 
 def _uv(p: Row, surface: Surface) -> Float[Array, "2"]:

@@ -32,7 +32,6 @@ class Bitmap(Texture):
     size = PerRow()  # (2,) int32 height, width
     nearest = PerRow()  # () bool, no interpolation
     wrap = PerRow()  # () int32 into WRAPS
-    parts = 4
     unused: ClassVar[Mapping[str, Unused]] = {
         "accel": Unused("boolean"),
         "format": Unused("string", "texels have the precision of the scene", choices=("variant", "fp16", "auto")),

@@ -15,7 +15,6 @@ class Checkerboard(Texture):
 
     color0 = Color(0.4, textured=False)
     color1 = Color(0.2, textured=False)
-    parts = 2
 
     @staticmethod
     def look_up(p: Row, uv: Float[Array, "2"], surface: Surface) -> Float[Array, "3"]:

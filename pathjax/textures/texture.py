@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from typing import ClassVar
 
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -20,7 +19,6 @@ class Texture(Kind):
     """
 
     to_uv = Transform2()
-    parts: ClassVar[int] = 0  # number of its `entries`; 0: it says none, and is differentiated forwards alone
 
     @staticmethod
     @abstractmethod
@@ -31,7 +29,8 @@ class Texture(Kind):
     def entries(p: Row, uv: Float[Array, "2"], surface: Surface) -> list[tuple[str, Int[Array, ""] | None, Array]]:
         """Of which numbers `look_up` is the sum, for derivatives in them: a parameter, the entry, and its share ().
 
-        The entry is that in a `Shared` array; None: the row of the texture. There are as many as the kind has `parts`.
+        The entry is that in a `Shared` array; None: the row of the texture. A kind that says none is differentiated
+        forwards alone.
         """
         return []
 

@@ -17,7 +17,6 @@ class Uniform(Texture):
     """One number, of all channels."""
 
     value = Number(bounds=(0, math.inf))
-    parts = 1
 
     @classmethod
     def read(cls, loader, fields, name):

@@ -232,12 +232,33 @@ def test_a_bright_texel_lights_a_floor(make_scene, sky, estimate, agree, strateg
 def test_images_are_linear_in_the_scale(make_scene, sky):
     scene = make_scene(FLOOR + sky(picture(16, 32), SCALE), res=8, depth=2, **VIEW)
     assert "sky.scale" in pj.parameters(scene)
-    with pytest.raises(pj.InputError, match="sky.radiance is a picture, whose texels are too many"):
-        pj.with_parameters(scene, {"sky.radiance": 1.0})
     image, J = pj.jacobian(scene, ["sky.scale"], 16)
     np.testing.assert_allclose(np.asarray(J["sky.scale"]) * 0.5, image, rtol=1e-5)
     doubled = pj.with_parameters(scene, {"sky.scale": 1.0})
     np.testing.assert_allclose(pj.render(doubled, 16), 2 * np.asarray(pj.render(scene, 16)), rtol=1e-5)
+
+
+def test_texels_are_a_parameter(make_scene, sky):
+    """Set anew, traced or not, they are drawn as those of a file are; the image is linear in them."""
+    old, new = picture(3, 4), picture(3, 4, seed=5, hot=[(1, 2)])
+    scene = make_scene(FLOOR + sky(old, name="texels"), **VIEW, res=4)
+    read = make_scene(FLOOR + sky(new, name="texels"), **VIEW, res=4)
+    for key in Envmap.declared:
+        both = pj.with_parameters(scene, {"texels.radiance": new}), read
+        mine, theirs = (each.emitters[0].table.column(key) for each in both)
+        assert mine is theirs is None or np.array_equal(mine.values, theirs.values)
+
+    def image(texels):
+        return pj.render(pj.with_parameters(scene, {"texels.radiance": texels}), 4)
+
+    seen, pull = jax.jit(lambda texels: (lambda image, pull: (image, pull(image)[0]))(*jax.vjp(image, texels)))(new)
+    np.testing.assert_allclose(seen, pj.render(read, 4), rtol=1e-6)
+    assert pull.shape == new.shape and (pull >= 0).all()
+    np.testing.assert_allclose((pull * new).sum(), (np.asarray(seen, float) ** 2).sum(), rtol=1e-5)
+    with pytest.raises(pj.InputError, match=r"\(3, 4, 3\), and cannot be set to 4 x 3 x 3"):
+        pj.with_parameters(scene, {"texels.radiance": np.ones((4, 3, 3))})
+    with pytest.raises(pj.InputError, match=r"outside its bounds \[0, inf\]"):
+        pj.with_parameters(scene, {"texels.radiance": -new})
 
 
 def test_terms_first_hits_and_hidden_emitters(make_scene, sky):
@@ -319,7 +340,7 @@ def test_arrays_are_pictures_too():
     for key in ("data", "bitmap"):
         scene = pj.load_dict({"type": "scene", "view": camera, "sky": {"type": "envmap", key: texels}})
         np.testing.assert_array_equal(scene.emitters[0].table.column("texels").values, texels.ravel())
-        assert list(pj.parameters(scene)) == ["sky.scale"]
+        assert list(pj.parameters(scene)) == ["sky.radiance", "sky.scale"]
     with pytest.raises(pj.InputError, match=r"must have the shape \(H, W\)"):
         pj.load_dict({"type": "scene", "view": camera, "sky": {"type": "envmap", "data": np.ones((2, 2, 5))}})
 

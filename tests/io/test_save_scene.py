@@ -87,7 +87,7 @@ def dictionary():
             "radius": 0.4,
             "emitter": {"type": "area", "radiance": {"type": "rgb", "value": [8, 9, 10]}},
         },
-        "sky": {"type": "constant", "radiance": 0.3},
+        "sky": {"type": "envmap", "data": random.random((3, 4, 3)), "scale": 0.3},
     }
 
 
@@ -101,7 +101,7 @@ def test_files_come_back_as_they_were(path, again):
 def test_arrays_come_back_from_files_beside(again, tmp_path):
     scene = pj.load_dict(dictionary())
     same(scene, again(scene))
-    files = {"bytes_reflectance.png", "floor_reflectance.exr", "floor.ply", "ball.ply"}
+    files = {"bytes_reflectance.png", "floor_reflectance.exr", "sky.exr", "floor.ply", "ball.ply"}
     assert {file.name for file in tmp_path.iterdir()} == {"saved.xml", *(f"saved_{name}" for name in files)}
     same(scene, again(again(scene), "second.xml"))
 

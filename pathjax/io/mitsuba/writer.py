@@ -204,14 +204,16 @@ class _Writer:
 
 
 def _changed_images(made: Iterable[object], values: Mapping[str, np.ndarray]) -> dict[Instance, tuple[str, np.ndarray]]:
-    """Of textures that are parameters and have changed, by instance, the parameter's name and the texels."""
+    """Of images that are parameters and have changed, by instance, the parameter's name and the texels."""
+    owners = [owner for owner in made if isinstance(owner, Instance)]
+    images = [(x, f"{owner.name}.{key}") for owner in owners for key, x in owner.values.items()]
+    images += [(owner, f"{owner.name}.radiance") for owner in owners]  # of environment maps
     found = {}
-    for owner in made:
-        for key, texture in owner.values.items() if isinstance(owner, Instance) else ():
-            name = f"{owner.name}.{key}"
-            if isinstance(texture, Instance) and name in values:
-                if not np.array_equal(np.asarray(texture.values["texels"], values[name].dtype), values[name]):
-                    found[texture] = name, values[name]
+    for image, name in images:
+        if isinstance(image, Instance) and "texels" in image.values and name in values:
+            value = values[name]
+            if not np.array_equal(np.broadcast_to(image.values["texels"], value.shape).astype(value.dtype), value):
+                found[image] = name, value
     return found
 
 
