@@ -1,10 +1,15 @@
-"""Is a derivative right? The Jacobian against differences of rendered images."""
+"""Is a derivative right? What is claimed to be one, against differences of rendered images."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import overload
 
+import jax
 import numpy as np
+from jax.typing import ArrayLike
 from scipy import stats
 
 from pathjax.compile import usual_promotion
@@ -16,22 +21,33 @@ from pathjax.scene import parameters as named
 from pathjax.scene.parameters import with_parameters
 from pathjax.scene.scene import Scene
 
+# (theta, seed) -> image (H, W, channels), and (theta, v, seed) -> its derivative along v, of the same shape.
+Render = Callable[[np.ndarray, int], ArrayLike]
+Derivative = Callable[[np.ndarray, np.ndarray, int], ArrayLike]
+
 # Chance that a right derivative is called wrong.
 FALSE_ALARM = 1e-3
-# Reach of the differences in colours, relative to the value or range.
+# Reach of the differences, relative to the value, or to the range between two bounds ...
 _REACH = 0.1
+# ... but no further than half the value, since what a roughness does changes with its logarithm, and no less than this
+# part of the range, which float32 resolves.
+_OF_VALUE, _LEAST = 0.5, 1e-3
 
 
 @dataclass
 class GradientCheck:
-    """Jacobian minus differences, over blocks of pixels, in standard errors."""
+    """Derivative minus differences, over blocks of pixels, in standard errors."""
 
-    z: np.ndarray  # (h, w, 3), a block each; Student's t of `freedom` degrees of freedom where the derivative is right
+    z: np.ndarray  # (h, w, channels), by block; where the derivative is right, Student's t of this freedom:
     freedom: int
-    p_value: float  # of the largest |z|, over all blocks (Sidak)
-    passed: bool  # p_value is above the false alarm rate of 1e-3
-    jacobian: np.ndarray  # (H, W, 3) mean over the seeds; of a colour: each channel in its own
-    difference: np.ndarray  # (H, W, 3)
+    p_value: float  # of the largest |z|, over all blocks (Sidak); 0 where anything is not finite
+    passed: bool  # p_value is above the false alarm rate
+    # Relative error of the derivative, the same everywhere, that is found in half of all checks; inf: nothing would be,
+    # since no image changes.
+    resolution: float
+    direction: np.ndarray  # v, of theta's shape: what the derivative is along
+    derivative: np.ndarray  # (H, W, channels) as it is claimed, mean over the seeds
+    difference: np.ndarray  # (H, W, channels)
 
     @property
     def mean_square(self) -> float:
@@ -39,58 +55,148 @@ class GradientCheck:
         return float((self.z**2).mean())
 
 
+@overload
+def check_gradient(
+    of: Scene,
+    at: str,
+    spp: int = 64,
+    seed: int = 0,
+    *,
+    seeds: int = 16,
+    block: int = 8,
+    false_alarm: float = FALSE_ALARM,
+) -> GradientCheck: ...
+
+
+@overload
+def check_gradient(
+    of: Render,
+    at: ArrayLike,
+    *,
+    derivative: Derivative,
+    bounds: tuple[float, float] = (-math.inf, math.inf),
+    reach: float | None = None,
+    seed: int = 0,
+    seeds: int = 16,
+    block: int = 8,
+    false_alarm: float = FALSE_ALARM,
+) -> GradientCheck: ...
+
+
 @usual_promotion
 def check_gradient(
-    scene: Scene, name: str, spp: int = 64, seed: int = 0, *, seeds: int = 16, block: int = 8
+    of: Scene | Render,
+    at: str | ArrayLike,
+    spp: int = 64,
+    seed: int = 0,
+    *,
+    derivative: Derivative | None = None,
+    bounds: tuple[float, float] = (-math.inf, math.inf),
+    reach: float | None = None,
+    seeds: int = 16,
+    block: int = 8,
+    false_alarm: float = FALSE_ALARM,
 ) -> GradientCheck:
-    """Compare `jacobian` with differences of `render` at other values of one parameter, with common random numbers.
+    """Test the derivative of an image in one parameter, of this renderer or of any other.
 
-    The values lie around the present one, within the bounds: five of them for what images depend on smoothly. For the
-    IOR of smooth glass they are two, at the step that `jacobian` chose, so that both have the same bias.
+    It is compared with differences of images at other values of the parameter, which share its random numbers, block by
+    block of pixels: over independent seeds, the mean of derivative minus difference must be 0 within its standard
+    error. Of a colour, a texture, or any array of numbers, all move at once, along a random direction v whose entries
+    are between 1/2 and 1, or their negatives where the bounds leave no room.
+
+    Differences are those of polynomials through five values around the present one; for the IOR of smooth glass of two,
+    at the step that `jacobian` chose, so that both have the same bias.
 
     Args:
-        name: of a parameter, as `parameters` lists them.
-        spp: samples per pixel of each image.
+        of: a scene; or a function (theta, seed) -> image (H, W, channels).
+        at: the name of a parameter of the scene, as `parameters` lists them; or theta, a number or an array.
+        spp: samples per pixel of each image, of a scene.
         seed: of the first comparison.
+        derivative: of such a function, what is to be tested: (theta, v, seed) -> derivative of the image along v, that
+            of a number being along v = 1. It need not share random numbers with the image, but finds more if it does.
+        bounds: of each entry of theta.
+        reach: how far the five values lie apart in all; None: a tenth of the value, or of the range, if that is finite.
         seeds: number of independent comparisons, at least 3.
         block: side of the blocks of pixels over which derivatives are averaged.
+        false_alarm: chance that a right derivative does not pass, in (0, 1). Means over blocks are taken to be normally
+            distributed.
     Returns:
         GradientCheck.
+    Raises:
+        InputError: an unknown name; a number out of its range; an image of another shape; bounds that leave no room.
     """
     if seeds < 3:
         raise InputError(f"seeds = {seeds}; at least 3 are needed to estimate their scatter")
-    parameter = named.find(scene, name)
-    present = np.asarray(named.parameters(scene)[name])
+    if not 0 < false_alarm < 1:
+        raise InputError(f"false_alarm = {false_alarm}; it is a probability, between 0 and 1")
+    nodes = None
+    if isinstance(of, Scene):
+        of, derivative, at, bounds, nodes = _of_scene(of, at, spp)
+    if derivative is None:
+        raise InputError("derivative is missing: of a function it is what is tested, (theta, v, seed) -> derivative")
+    theta = np.asarray(at, float)
+    direction, nodes = _direction(theta, bounds, reach) if nodes is None else (np.ones(theta.shape), nodes)
     derivatives, differences = [], []
     for k in range(seed, seed + seeds):
-        _, J = jacobian(scene, [name], spp, k)
-        d = np.asarray(J[name], float)
-        derivatives.append(np.einsum("...cc->...c", d) if parameter.shape else d)
-        if parameter.moves_paths:
-            nodes = np.array([-1.0, 1.0]) * float(J.step[name]) / abs(float(ior.ratio_by(scene, parameter)))
-        else:
-            nodes = _nodes(parameter, present)
-        images = [np.asarray(render(with_parameters(scene, {name: present + x}), spp, k), float) for x in nodes]
+        images = [_image(of(np.clip(theta + x * direction, *bounds), k)) for x in nodes]
         differences.append(np.tensordot(_weights(nodes), images, 1))
-    derivatives, differences = np.array(derivatives), np.array(differences)
-    gap = _blocks(derivatives - differences, block)
-    size = _blocks(np.abs(derivatives) + np.abs(differences), block).mean(0)
-    # What rounding leaves where both agree to the last bits.
-    floor = np.finfo(np.float32).eps * (size + np.abs(images[0]).max() / np.abs(nodes).max())
-    z = gap.mean(0) / np.sqrt(gap.var(0, ddof=1) / seeds + floor**2)
-    p = 2 * stats.t.sf(np.abs(z).max(), seeds - 1)
-    p_value = float(-np.expm1(z.size * np.log1p(-min(p, 1 - 1e-16))))
-    return GradientCheck(z, seeds - 1, p_value, p_value > FALSE_ALARM, derivatives.mean(0), differences.mean(0))
+        derivatives.append(_image(derivative(theta, direction, k)))
+        if derivatives[-1].shape != images[0].shape:
+            raise InputError(f"the derivative has the shape {derivatives[-1].shape}, the image {images[0].shape}")
+    largest = np.abs(images[0]).max() / np.abs(nodes).max()
+    return _compared(direction, np.array(derivatives), np.array(differences), largest, block, false_alarm)
 
 
-def _nodes(parameter, present):
-    """(5,) offsets that keep all channels within the bounds."""
-    low, high = parameter.bounds
-    reach = _REACH * (high - low if np.isfinite(high) else max(np.max(present), 1))
-    room_below, room_above = np.min(present) - low, high - np.max(present)
-    reach = min(reach, room_below + room_above)
-    first = -min(max(reach / 2, reach - room_above), room_below)
-    return first + reach * np.linspace(0, 1, 5)
+def _of_scene(scene, name, spp):
+    """Render, derivative, value and bounds of a parameter; and nodes, or None for those that fit the value."""
+    parameter = named.find(scene, name)
+    value = named.parameters(scene)[name]
+
+    def image(theta, seed=0):
+        return render(with_parameters(scene, {name: theta}), spp, seed)
+
+    def along(theta, v, seed):
+        if parameter.is_texture:
+            return jax.jvp(lambda x: image(x, seed), (value,), (np.asarray(v, value.dtype),))[1]
+        _, J = jacobian(scene, [name], spp, seed)
+        return np.tensordot(J[name], v, v.ndim)
+
+    nodes = None
+    if parameter.moves_paths:
+        step = float(jacobian(scene, [name], 1)[1].step[name])
+        nodes = np.array([-1.0, 1.0]) * step / abs(float(ior.ratio_by(scene, parameter)))
+    return image, along, value, parameter.bounds, nodes
+
+
+def _image(x):
+    x = np.asarray(x, float)
+    if x.ndim != 3:
+        raise InputError(f"an image has the shape {x.shape}; it must have three axes, height, width and channels")
+    return x
+
+
+def _direction(theta, bounds, reach):
+    """v, of the shape of theta, and (5,) nodes x, so that all theta + x v lie within the bounds."""
+    low, high = bounds
+    if not (np.isfinite(theta).all() and (theta >= low).all() and (theta <= high).all()):
+        raise InputError(f"theta is not finite, or lies outside the bounds [{low:g}, {high:g}]")
+    if reach is None:
+        size = np.abs(theta).max()
+        if np.isfinite(high - low):
+            width = high - low
+            reach = np.clip(_OF_VALUE * size, _LEAST * width, _REACH * width)
+        else:
+            reach = _REACH * (size or 1)
+    direction = np.ones(theta.shape)
+    if theta.ndim:
+        direction = np.random.default_rng(0).uniform(0.5, 1, theta.shape) * np.where(high - theta < reach / 2, -1, 1)
+    ahead = np.where(direction > 0, high - theta, theta - low).min()
+    behind = np.where(direction > 0, theta - low, high - theta).min()
+    reach = min(reach, ahead + behind)
+    if not reach > 0:
+        raise InputError(f"the bounds [{low:g}, {high:g}] leave theta no room")
+    first = -min(max(reach / 2, reach - ahead), behind)
+    return direction, first + reach * np.linspace(0, 1, 5)
 
 
 def _weights(nodes):
@@ -99,9 +205,30 @@ def _weights(nodes):
     return np.linalg.solve(nodes[None] ** powers[:, None], (powers == 1).astype(float))
 
 
+def _compared(direction, derivatives, differences, largest, block, false_alarm):
+    """derivatives, differences: (seeds, H, W, channels); largest: quotient of a difference, whose rounding is known."""
+    seeds = len(derivatives)
+    derivatives = np.where(np.isfinite(derivatives), derivatives, np.nan)  # without differences of infinities
+    gap, slope = _blocks(derivatives - differences, block), _blocks(differences, block).mean(0)
+    size = _blocks(np.abs(derivatives) + np.abs(differences), block).mean(0)
+    # What rounding leaves where both agree to the last bits.
+    floor = np.finfo(np.float32).eps * (size + largest)
+    error = np.sqrt(gap.var(0, ddof=1) / seeds + floor**2 + np.finfo(float).tiny)
+    z = gap.mean(0) / error
+    largest = np.abs(z).max()
+    p_value = 0.0
+    if np.isfinite(largest):
+        p_value = -math.expm1(z.size * math.log1p(-min(2 * stats.t.sf(largest, seeds - 1), 1 - 1e-16)))
+    limit = stats.t.isf(-math.expm1(math.log1p(-false_alarm) / z.size) / 2, seeds - 1)
+    found = np.abs(slope) > 0
+    resolution = float((limit * error[found] / np.abs(slope[found])).min()) if found.any() else math.inf
+    means = derivatives.mean(0), differences.mean(0)
+    return GradientCheck(z, seeds - 1, p_value, p_value > false_alarm, resolution, direction, *means)
+
+
 def _blocks(images, side):
-    """(K, H, W, 3) to means over blocks (K, h, w, 3); what is left over at the borders is not looked at."""
-    count, height, width, _ = images.shape
+    """(K, H, W, C) to means over blocks (K, h, w, C); what is left over at the borders is not looked at."""
+    count, height, width, channels = images.shape
     side = min(side, height, width)
     h, w = height // side, width // side
-    return images[:, : h * side, : w * side].reshape(count, h, side, w, side, 3).mean((2, 4))
+    return images[:, : h * side, : w * side].reshape(count, h, side, w, side, channels).mean((2, 4))
