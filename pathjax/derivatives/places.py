@@ -214,7 +214,8 @@ def of_light_sample(
 
 def _whole(scene: Scene, paths: Paths) -> bool:
     """Whether each number that a light looks up is one entry, and not the sum of some."""
-    return all(path[2] == "table" and not _declared(scene, path).shared for path in paths if path[0] == "emitters")
+    own = {("emitters", i, "table") for i in range(len(scene.emitters))}  # else a texture's
+    return all(path[:3] in own and not _declared(scene, path).shared for path in paths if path[0] == "emitters")
 
 
 def _lit(scene: Scene, number: int, light: Int[Array, ""], here: Vertex, drawn: EmitterSample):
