@@ -21,6 +21,7 @@ ROOMS = (
     "textures",
     "shapes",
     "bsdfs",
+    "media",
     "emitters",
     "sensors",
     "scene",
@@ -103,7 +104,7 @@ def test_no_module_imports_itself_by_way_of_others():
 
 # ---- kinds --------------------------------------------------------------------------------------------------------
 
-ROOMS_OF_KINDS = ("textures", "shapes", "bsdfs", "emitters", "sensors")
+ROOMS_OF_KINDS = ("textures", "shapes", "bsdfs", "media", "emitters", "sensors")
 
 
 def classes_of(*rooms: str) -> set[str]:

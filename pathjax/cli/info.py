@@ -35,7 +35,7 @@ def scene_facts(scene: Scene) -> dict:
     max_depth = int(scene.max_depth)
     parts = [part for table in scene.geometry.tables for part in table.searched()]
     height, width = film.image_shape(scene.film)
-    dark = emitters.darkness(scene.emitters, bsdfs.occurs(scene.materials, "smooth"))
+    dark = emitters.darkness(scene.emitters, scene.samples_lights)
     return {
         "file": description.file,
         "image": {"width": width, "height": height, "filter": _type(scene.film.filter), "spp": description.spp},
@@ -51,7 +51,7 @@ def scene_facts(scene: Scene) -> dict:
         "compiled": {
             "shapes": [f"{part.kind}s ({'tree' if part.tree else 'flat'})" for part in parts],
             "bsdfs": [bsdfs.name(scene.materials, kind) for kind in range(len(scene.materials.tables))],
-            "light sampling": bsdfs.occurs(scene.materials, "smooth") and emitters.sampled(scene.emitters),
+            "light sampling": scene.samples_lights and emitters.sampled(scene.emitters),
             "emitters": [emitters.name(lights) for lights in scene.emitters],
             "dtype": str(scene.camera.origin.dtype),
         },

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 
-from pathjax import bsdfs, emitters
+from pathjax import emitters
 from pathjax.cli import DONE, FAILED
 from pathjax.cli.inputs import load
 from pathjax.errors import InputError
@@ -31,7 +31,7 @@ def run(options, output: Output) -> int:
     _check(path, options)
     started = time.perf_counter()
     scene = load(options)
-    if dark := emitters.darkness(scene.emitters, bsdfs.occurs(scene.materials, "smooth")):
+    if dark := emitters.darkness(scene.emitters, scene.samples_lights):
         say(f"{options.scene}: {dark}, so the image will be black")
     if "bounces" in options.aov:
         _check_depth(scene, options)

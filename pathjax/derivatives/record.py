@@ -89,7 +89,7 @@ def extend(
 
     options: by vertex. scale: what derivatives are multiplied by.
     """
-    hit, here, u = path.meet(scene, now.ray, u, options)
+    hit, here, u = path.meet(scene, now, u, options)
 
     def varied(changes):
         changed = places.nudged(scene, slots, changes[1:])

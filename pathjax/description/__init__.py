@@ -20,6 +20,8 @@ class Shape:
     bsdf: Instance
     emitter: Instance | None  # that shines from it
     flip_normals: bool
+    interior: Instance | None = None  # medium on the side that the normals point away from
+    exterior: Instance | None = None
 
 
 @dataclass(frozen=True)
@@ -28,6 +30,7 @@ class Integrator:
     rr_depth: int = 5
     hide_emitters: bool = False
     free_passes: bool = False  # straight through a surface is no bounce that counts for max_depth
+    media: bool = False  # participating media are rendered; else they are left out
 
 
 @dataclass(frozen=True)
@@ -40,6 +43,7 @@ class Description:
     sampler: str  # the type that the file names; pathjax uses its own
     shapes: tuple[Shape, ...]
     emitters: tuple[Instance, ...] = ()  # those that stand outside of shapes
+    medium: Instance | None = None  # in which the camera is
     notes: tuple[str, ...] = field(default=())  # what `info` should tell: dropped triangles, replaced samplers
     # What was read, to be written again, and what each of its elements became: an `Instance`, a `Shape`, ...
     document: Document | None = None

@@ -16,9 +16,9 @@ from pathjax.errors import InputError
 from pathjax.kinds import Unused
 
 VALUES = ("float", "integer", "boolean", "string", "rgb", "spectrum", "point", "vector", "transform")
-OBJECTS = ("integrator", "sensor", "sampler", "film", "rfilter", "shape", "bsdf", "texture", "emitter")
-# Objects that Mitsuba's participating media are made of.
-NOT_MODELLED = ("medium", "phase", "volume")
+# Objects that are the value of a parameter, and others.
+NAMED = ("texture", "volume")
+OBJECTS = ("integrator", "sensor", "sampler", "film", "rfilter", "shape", "bsdf", "emitter", "medium", "phase", *NAMED)
 
 # Spectra that are plugins of their own.
 TYPED = ("uniform", "d65", "srgb")
@@ -41,13 +41,11 @@ class Fields:
         self.notes: list[str] = []  # what `info` should tell
         for child in element.children:
             target = document.resolve(child)
-            if target.tag in NOT_MODELLED:
-                raise child.error(f"{child}: participating media are not supported yet; take it out of {element}")
             if child.tag not in (*VALUES, *OBJECTS, "ref") and child.data is None:
                 raise child.error(f"{child} is not supported inside {element}; use one of: {', '.join(VALUES)}, ref")
             if target is not child and target.tag not in OBJECTS:
                 raise child.error(f"{child} refers to {target}, which is not an object")
-            if target.tag in OBJECTS and target.tag != "texture":
+            if target.tag in OBJECTS and target.tag not in NAMED:
                 self._objects.append(child)
                 continue
             name = child.attributes.get("name")
@@ -198,11 +196,12 @@ class Fields:
         element = self._take(name, default, ("array",))
         return default if element is None else element.data
 
-    def texture(self, name: str) -> Element | None:
-        """The <texture> that sets `name`, or None where it is something else, to be read by `color`."""
-        if not self.has(name) or self.document.resolve(self._values[name]).tag != "texture":
+    def texture(self, name: str, tag: str = "texture") -> Element | None:
+        """The <texture>, or other object of NAMED, that sets `name`; None where it is something else, to be read by
+        `color`."""
+        if not self.has(name) or self.document.resolve(self._values[name]).tag != tag:
             return None
-        self._take(name, None, ("texture", "ref"))
+        self._take(name, None, (tag, "ref"))
         return self.document.resolve(self._values[name])
 
     def only_texture(self) -> Element:
@@ -225,6 +224,14 @@ class Fields:
         if len(found) > limit:
             raise found[limit].error(f"{self.element} takes at most {limit} <{tag}>")
         return [self.document.resolve(child) for child in found]
+
+    def object(self, tag: str, name: str) -> Element | None:
+        """The nested or referenced object of this kind that has this name, if there is one."""
+        for child in self._objects:
+            if child.attributes.get("name") == name and self.document.resolve(child).tag == tag:
+                self._objects = [each for each in self._objects if each is not child]
+                return self.document.resolve(child)
+        return None
 
     def without_effect(self, parameters: Mapping[str, Unused]) -> list[str]:
         """Check those of the parameters that the file gives. Returns a note for each."""
@@ -271,9 +278,9 @@ class Fields:
             return None
         element = self._values[name]
         if element.tag not in tags:
-            kind = element.tag if element.tag != "ref" else "texture"
+            kind = self.document.resolve(element).tag
             raise self.error(name, f"cannot be a <{kind}>; give it as {' or '.join(f'<{tag}>' for tag in tags)}")
-        if element.children and element.tag not in ("transform", "texture") and "type" not in element.attributes:
+        if element.children and element.tag not in ("transform", *NAMED) and "type" not in element.attributes:
             raise element.children[0].error(f"{element.children[0]} has no place inside {element}")
         return element
 

@@ -6,21 +6,21 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Real
 
-from pathjax import bsdfs, emitters
+from pathjax import bsdfs, emitters, media
 from pathjax.core.math import spawn_ray
 from pathjax.core.types import EmitterSample
 from pathjax.emitters import Choice
 from pathjax.integrators.options import Options
 from pathjax.integrators.random_numbers import Bounce
 from pathjax.integrators.shadow import transmitted
-from pathjax.integrators.vertex import Vertex, evaluate
+from pathjax.integrators.vertex import Vertex, evaluate, is_smooth
 from pathjax.scene.scene import Scene
 from pathjax.shapes import geometry
 
 
 def occurs(scene: Scene, choice: Choice | None, options: Options) -> bool:
     """Whether any light is sampled: not where all bsdfs are Dirac's, whose directions no light sample has."""
-    return options.strategy != "bsdf" and choice is not None and bsdfs.occurs(scene.materials, "smooth")
+    return options.strategy != "bsdf" and choice is not None and scene.samples_lights
 
 
 def light_sample(
@@ -31,6 +31,7 @@ def light_sample(
     goes_on: Bool[Array, ""],
     depth: Int[Array, ""],
     options: Options,
+    medium: Int[Array, ""] | None = None,
 ) -> tuple[Float[Array, "3"], Int[Array, ""] | None]:
     """One sample of what a vertex reflects of direct light: the integral over all lights of f Le |cos theta| V.
 
@@ -38,11 +39,12 @@ def light_sample(
         choice: how lights are chosen, of `emitters.choice`.
         goes_on: else the sample is of no use, and its shadow ray not traced.
         depth: vertices so far.
+        medium: in which the path came; None in scenes without media.
     Returns:
         The sample, and how many vertices its light passed straight; None where there are no such.
     """
     materials = scene.materials
-    smooth = bsdfs.has(materials, vertex.kind, "smooth")
+    smooth = is_smooth(scene, vertex)
     passes = bsdfs.occurs(materials, "passes")
 
     def sample():
@@ -55,10 +57,12 @@ def light_sample(
         useful = goes_on & smooth & possible & (options.derivative | jnp.any(contribution > 0))
         reach = jnp.where(useful, drawn.distance, -1)
         shadow_ray = spawn_ray(vertex.surface, drawn.d, vertex.hit.primitive)._replace(t_max=reach)
-        if passes:
-            most = scene.max_depth - 1 - depth
-            share, passed = transmitted(scene, shadow_ray, drawn.primitive, most, options.derivative)
-            return jnp.where(useful, contribution * share, 0), passed
+        if passes or medium is not None:
+            most, start = scene.max_depth - 1 - depth, medium
+            if medium is not None:
+                start = media.beyond(scene.media, medium, vertex.hit.shape, vertex.surface.n, drawn.d)
+            share, passed = transmitted(scene, shadow_ray, drawn.primitive, most, options.derivative, start)
+            return jnp.where(useful, contribution * share, 0), passed if passes else None
         visible = useful & ~geometry.occluded(scene.geometry, shadow_ray, drawn.primitive)
         return jnp.where(visible, contribution, 0), None
 

@@ -21,15 +21,15 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from pathjax import bsdfs, emitters
+from pathjax import bsdfs, emitters, media
 from pathjax.compile import compute_once
-from pathjax.core.math import dot, spawn_ray
+from pathjax.core.math import dot, smaller, spawn_ray
 from pathjax.core.types import Hit, Ray
 from pathjax.emitters import Choice
 from pathjax.integrators import next_event, roulette, splitting
 from pathjax.integrators.options import Options
 from pathjax.integrators.random_numbers import Bounce
-from pathjax.integrators.vertex import Vertex, sample, vertex
+from pathjax.integrators.vertex import Vertex, sample, vertex, within
 from pathjax.scene.scene import Scene
 from pathjax.shapes import geometry
 
@@ -59,6 +59,7 @@ class Path(NamedTuple):
     moving: Int[Array, ""] | None = None  # bit r % 31 is set once it met row r of the bsdfs that move paths
     expected: Float[Array, ""] | None = None  # what a control expects of it, all channels
     splits: Int[Array, ""] | None = None  # how many dielectrics may still split it
+    medium: Int[Array, ""] | None = None  # through which the ray goes, a row or media.NONE
     pending: Path | None = None  # (split_depth, ...) branches that wait, those alive; see `splitting`
 
 
@@ -84,6 +85,7 @@ def start(scene: Scene, ray: Ray, options: Options) -> Path:
         one if transmits else None,
         jnp.int32(0) if options.watch_moving else None,
         jnp.zeros_like(one) if options.controlled else None,
+        medium=None if scene.media is None else scene.media.camera,
     )
     return splitting.start(path, options.split_depth) if splits else path
 
@@ -100,12 +102,20 @@ def extend(scene: Scene, choice: Choice | None, path: Path, u: Bounce, options: 
     Gradient: what is drawn is detached from albedos and radiances, so weights carry the derivative, unbiased. Where the
     IOR of glass moves the path, the derivative is that of the moving points (attached), and edges are missing from it.
     """
-    hit, here, u = meet(scene, path.ray, u, options)
+    hit, here, u = meet(scene, path, u, options)
     return onward(scene, choice, path, hit, here, u, options, control)
 
 
-def meet(scene: Scene, ray: Ray, u: Bounce, options: Options) -> tuple[Hit, Vertex | None, Bounce]:
-    """What a ray meets, None in a scene without shapes; and u as it was."""
+def meet(scene: Scene, path: Path, u: Bounce, options: Options) -> tuple[Hit, Vertex | None, Bounce]:
+    """What the ray of a path meets, None in a scene without shapes; and u as it was."""
+    ray = path.ray
+    if scene.scatters:
+        distance = media.distance(scene.media, path.medium, path.throughput, u.flight)
+        distance, u = compute_once((distance, u))
+        hit = geometry.closest_hit(scene.geometry, ray._replace(t_max=smaller(distance, ray.t_max)))
+        here = within(vertex(scene, ray, hit, u.leaf, options.derivative), ray, path.medium, distance)
+        u, here = compute_once((u, here))
+        return here.hit, here, u
     hit = geometry.closest_hit(scene.geometry, ray)
     here = vertex(scene, ray, hit, u.leaf, options.derivative) if scene.geometry.tables else None
     # What many results share is computed once.
@@ -125,16 +135,20 @@ def onward(
 ) -> Path:
     """`extend` of a path whose ray is known to meet `here`."""
     ray, first = path.ray, path.depth == 0
+    if scene.media is not None:
+        flown, scattered = smaller(hit.t, ray.t_max), here.scattered if scene.scatters else None
+        weight = media.flight_weight(scene.media, path.medium, path.throughput, flown, scattered)
+        path = path._replace(throughput=path.throughput * weight)
     path = path._replace(L=_with_emission(path.L, emission(scene, choice, path, hit, here, options)))
     if scene.free_passes:
         free = bsdfs.has(scene.materials, here.kind, "passes")
         path = path._replace(depth=path.depth + jnp.where(free, 0, 1), passed=path.passed + jnp.where(free, 1, 0))
-        goes_on = (hit.primitive >= 0) & (free | (path.depth < scene.max_depth))
+        goes_on = _met(scene, hit, here) & (free | (path.depth < scene.max_depth))
     else:
         path = path._replace(depth=path.depth + 1)
         if here is None:
             return _ended(path)
-        goes_on = (hit.primitive >= 0) & (path.depth < scene.max_depth)
+        goes_on = _met(scene, hit, here) & (path.depth < scene.max_depth)
     if control is not None:
         path, goes_on = lax.cond(
             goes_on,
@@ -146,7 +160,7 @@ def onward(
     if scene.hide_emitters:
         # What emits lets camera rays through, as in Mitsuba.
         beyond = spawn_ray(here.surface, ray.d, hit.primitive)._replace(t_max=ray.t_max - hit.t)
-        through = path._replace(ray=beyond, depth=jnp.int32(0))
+        through = path._replace(ray=beyond, depth=jnp.int32(0), medium=_beyond(scene, path, here, ray.d))
         hidden = first & geometry.emits(scene.geometry, hit)
         path = lax.cond(hidden, lambda path: through, lambda path: lax.cond(goes_on, go_on, _ended, path), path)
     else:
@@ -182,6 +196,8 @@ def emission(
 
     # Most surfaces are dark.
     bright = True if here is None else ~found | geometry.emits(shapes, hit)
+    if scene.scatters:
+        bright = bright & ~here.scattered
     return lax.cond(bright, received, lambda: jnp.zeros_like(path.throughput))
 
 
@@ -193,7 +209,7 @@ def scatter(
         path = path._replace(throughput=path.throughput * here.weight)
     L = path.L
     if next_event.occurs(scene, choice, options):
-        light, passed = next_event.light_sample(scene, choice, here, u, goes_on, path.depth, options)
+        light, passed = next_event.light_sample(scene, choice, here, u, goes_on, path.depth, options, path.medium)
         L = _with_light(L, path.throughput * light, passed)
     drawn, d = compute_once(sample(scene, here, u.bsdf))
     if path.pending is not None:
@@ -206,7 +222,8 @@ def scatter(
     else:
         survival = roulette.survival(scene, path.depth, throughput, passive)
     # A direction of density 0 (in the surface, by rounding; a branch of glass that cannot be) carries nothing.
-    carries = (here.kind >= 0) & (drawn.pdf > 0) & (options.derivative | (roulette.largest(throughput) > 0))
+    some = (here.kind >= 0) | here.scattered if scene.scatters else here.kind >= 0
+    carries = some & (drawn.pdf > 0) & (options.derivative | (roulette.largest(throughput) > 0))
     on = path._replace(
         ray=spawn_ray(here.surface, d, here.hit.primitive),
         L=L,
@@ -214,6 +231,7 @@ def scatter(
         pdf=jnp.where(drawn.delta, jnp.inf, drawn.pdf),
         alive=carries & (u.roulette < survival),
         passive=passive,
+        medium=_beyond(scene, path, here, d),
     )
     if path.origin is not None:
         passes = bsdfs.has(scene.materials, here.kind, "passes")
@@ -223,6 +241,19 @@ def scatter(
     if path.moving is not None:
         on = on._replace(moving=path.moving | bsdfs.moving_bit(scene.materials, here.kind, here.row))
     return on if path.pending is None else splitting.split(scene, here, u.bsdf, splits, path, on)
+
+
+def _met(scene, hit, here):
+    """Whether the path has a vertex."""
+    found = hit.primitive >= 0
+    return found | here.scattered if scene.scatters else found
+
+
+def _beyond(scene, path, here, d):
+    """The medium in which a path goes on that leaves the vertex in the direction d."""
+    if path.medium is None:
+        return None
+    return media.beyond(scene.media, path.medium, here.hit.shape, here.surface.n, d)
 
 
 def _ended(path: Path) -> Path:

@@ -27,6 +27,7 @@ class Bounce(NamedTuple):
     triangle: Float[Array, ""]  # chooses within a mesh that emits
     roulette: Float[Array, ""]
     leaf: Float[Array, ""] | None = None  # chooses among bsdfs that hold others; None: there are none
+    flight: Float[Array, "2"] | None = None  # how far light goes; None: it meets nothing on the way
 
 
 def camera_numbers(
@@ -52,7 +53,10 @@ def bounce_numbers(
     leaf = None
     if scene.materials.wrappers:
         leaf = sampler.hashed(key, jnp.uint32(_LEAVES) + depth.astype(jnp.uint32), 1)[0].astype(dtype)
-    return Bounce(u[:2], bsdf, rest[0], rest[1], leaf)
+    flight = None
+    if scene.scatters:
+        flight = sampler.hashed(sampler.hash_u32(key), 2 * depth, 2).astype(dtype)
+    return Bounce(u[:2], bsdf, rest[0], rest[1], leaf, flight)
 
 
 def bsdf_dimensions(materials: bsdfs.Materials) -> int:

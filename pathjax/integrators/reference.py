@@ -19,18 +19,18 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
-from pathjax import bsdfs, emitters
+from pathjax import bsdfs, emitters, media
 from pathjax.compile import native_map
 from pathjax.core import sampler
 from pathjax.core.math import dot, spawn_ray
 from pathjax.core.types import Number, Ray
 from pathjax.emitters import Choice
 from pathjax.integrators.pixel import camera_ray
-from pathjax.integrators.random_numbers import bounce_numbers
+from pathjax.integrators.random_numbers import Bounce, bounce_numbers
 from pathjax.integrators.shadow import transmitted
-from pathjax.integrators.vertex import evaluate, sample, vertex
+from pathjax.integrators.vertex import Vertex, evaluate, is_smooth, sample, vertex, within
 from pathjax.scene.scene import Scene
 from pathjax.sensors import film
 from pathjax.shapes import geometry
@@ -46,33 +46,34 @@ def radiance(scene: Scene, choice: Choice | None, ray: Ray, numbers: Callable) -
     shapes, materials = scene.geometry, scene.materials
 
     def bounce(state):
-        ray, L, throughput, pdf, origin, passive, depth, passed, _ = state
+        ray, L, throughput, pdf, origin, passive, medium, depth, passed, _ = state
         u = numbers(depth + passed)
-        hit = geometry.closest_hit(shapes, ray)
+        here, flight = meet(scene, ray, medium, throughput, u)
+        hit, throughput = here.hit, throughput * flight
         found = hit.primitive >= 0
-        here = vertex(scene, ray, hit, u.leaf)
         passes = bsdfs.has(materials, here.kind, "passes")
         free = passes & scene.free_passes
         depth, passed = jnp.where(free, depth, depth + 1), jnp.where(free, passed + 1, passed)
-        goes_on = found & (here.kind >= 0) & (free | (depth < scene.max_depth))
+        goes_on = (here.scattered | (here.kind >= 0) & found) & (free | (depth < scene.max_depth))
 
         # Emission, of the surface or of the background.
         from_origin, arrival = ray._replace(o=origin), hit._replace(t=dot(here.surface.p - origin, ray.d))
         lamp, pdf_lamp = emitters.hit(scene.emitters, shapes, choice, from_origin, arrival, here.surface)
         sky, pdf_sky = emitters.background(scene.emitters, choice, ray.d)
         Le, pdf_light = jnp.where(found, lamp, sky), jnp.where(found, pdf_lamp, pdf_sky)
-        L = L + throughput * Le * share(pdf, pdf_light)
+        L = L + jnp.where(here.scattered, 0, throughput * Le * share(pdf, pdf_light))
 
         if here.weight is not None:
             throughput = throughput * here.weight
 
         # Light sample. A Dirac lobe reflects none of it.
-        if choice is not None and bsdfs.occurs(materials, "smooth"):
+        if choice is not None and scene.samples_lights:
             light = emitters.sample(scene.emitters, shapes, choice, here.surface.p, u.light, u.triangle)
             f, pdf_bsdf = evaluate(scene, here, light.d)
             shadow_ray = spawn_ray(here.surface, light.d, hit.primitive)._replace(t_max=light.distance)
-            lit = goes_on & bsdfs.has(materials, here.kind, "smooth") & (light.pdf > 0) & (pdf_bsdf > 0)
-            arrives, _ = transmitted(scene, shadow_ray, light.primitive, scene.max_depth - 1 - depth, False)
+            lit = goes_on & is_smooth(scene, here) & (light.pdf > 0) & (pdf_bsdf > 0)
+            start, most = beyond(scene, medium, here, light.d), scene.max_depth - 1 - depth
+            arrives, _ = transmitted(scene, shadow_ray, light.primitive, most, False, start)
             direct = f * light.Le / jnp.where(lit, light.pdf, 1) * share(jnp.where(lit, light.density, 1), pdf_bsdf)
             L = L + jnp.where(lit, throughput * arrives * direct, 0)
 
@@ -86,12 +87,37 @@ def radiance(scene: Scene, choice: Choice | None, ray: Ray, numbers: Callable) -
         # What goes straight on comes from where it came from.
         pdf = jnp.where(passes, pdf, jnp.where(drawn.delta, jnp.inf, drawn.pdf))
         origin = jnp.where(passes, origin, here.surface.p)
-        ray = spawn_ray(here.surface, d, hit.primitive)
-        return ray, L, throughput / survival, pdf, origin, passive, depth, passed, alive
+        ray, medium = spawn_ray(here.surface, d, hit.primitive), beyond(scene, medium, here, d)
+        return ray, L, throughput / survival, pdf, origin, passive, medium, depth, passed, alive
 
-    zero, one = jnp.zeros_like(ray.o), jnp.ones_like(ray.t_max)
-    state = ray, zero, zero + 1, one * jnp.inf, ray.o, one, jnp.int32(0), jnp.int32(0), scene.max_depth > 0
+    zero, one, none = jnp.zeros_like(ray.o), jnp.ones_like(ray.t_max), jnp.int32(0)
+    around = None if scene.media is None else scene.media.camera
+    state = ray, zero, zero + 1, one * jnp.inf, ray.o, one, around, none, none, scene.max_depth > 0
     return lax.while_loop(lambda state: state[-1], bounce, state)[1]
+
+
+def meet(
+    scene: Scene, ray: Ray, medium: Int[Array, ""] | None, throughput: Float[Array, "3"], u: Bounce
+) -> tuple[Vertex, Float[Array, "3"]]:
+    """The particle or the surface that comes first, and the weight of the way there."""
+    distance = jnp.full_like(ray.t_max, jnp.inf)
+    if scene.scatters:
+        distance = media.distance(scene.media, medium, throughput, u.flight)
+    hit = geometry.closest_hit(scene.geometry, ray._replace(t_max=jnp.minimum(distance, ray.t_max)))
+    here = vertex(scene, ray, hit, u.leaf)
+    if scene.scatters:
+        here = within(here, ray, medium, distance)
+    if medium is None:
+        return here, jnp.ones_like(throughput)
+    way, scattered = jnp.minimum(here.hit.t, ray.t_max), here.scattered if scene.scatters else None
+    return here, media.flight_weight(scene.media, medium, throughput, way, scattered)
+
+
+def beyond(scene: Scene, medium: Int[Array, ""] | None, here: Vertex, d: Float[Array, "3"]) -> Int[Array, ""] | None:
+    """The medium in which a ray leaves a vertex in the direction d; None in scenes without media."""
+    if medium is None:
+        return None
+    return media.beyond(scene.media, medium, here.hit.shape, here.surface.n, d)
 
 
 def share(pdf: Float[Array, ""], other_pdf: Float[Array, ""]) -> Float[Array, ""]:

@@ -1,15 +1,16 @@
-"""Where a path meets a surface, and what scatters it there."""
+"""Where a path meets a surface, or a particle of a medium, and what scatters it there."""
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
 
-from pathjax import bsdfs
+from pathjax import bsdfs, media
 from pathjax.bsdfs import tree
-from pathjax.core.math import shading_frame, to_local, to_world
+from pathjax.core.math import frame_from_normal, shading_frame, to_local, to_world
 from pathjax.core.types import BSDFSample, Frame, Hit, Ray, Surface
 from pathjax.scene.scene import Scene
 from pathjax.shapes import geometry
@@ -26,6 +27,12 @@ class Vertex(NamedTuple):
     weight: Float[Array, ""] | None = None
     turns: tuple[tree.Turn, ...] = ()
     colors: bsdfs.Colors | None = None  # of the textures of the bsdf; None: there are none
+    medium: Int[Array, ""] | None = None  # that scatters here, or media.NONE: a surface does. None: no medium scatters
+
+    @property
+    def scattered(self) -> Bool[Array, ""]:
+        """Whether it lies within a medium."""
+        return jnp.bool_(False) if self.medium is None else self.medium != media.NONE
 
 
 def vertex(
@@ -51,9 +58,52 @@ def vertex(
     return Vertex(hit, surface, frame, wi, kind, row, weight, turns, colors)
 
 
+def within(here: Vertex, ray: Ray, medium: Int[Array, ""], distance: Float[Array, ""]) -> Vertex:
+    """The vertex in a medium, of which no bsdf knows, if the ray meets a particle before its hit and its end.
+
+    Args:
+        here: `vertex` of what it hits up to there.
+        distance: to the particle, of `media.distance`.
+    """
+    scattered = (here.hit.primitive < 0) & (distance < ray.t_max)
+    distance = jnp.where(scattered, distance, 0)
+
+    def chosen(inside, there):
+        return jnp.where(scattered, inside, there)
+
+    surface = here.surface._replace(
+        p=chosen(ray.o + distance * ray.d, here.surface.p), margin=chosen(0, here.surface.margin)
+    )
+    return here._replace(
+        hit=here.hit._replace(t=chosen(distance, here.hit.t)),
+        surface=surface,
+        frame=Frame(*map(chosen, frame_from_normal(-ray.d), here.frame)),
+        kind=chosen(-1, here.kind),
+        row=chosen(0, here.row),
+        weight=None if here.weight is None else chosen(1, here.weight),
+        medium=chosen(medium, media.NONE),
+    )
+
+
+def is_smooth(scene: Scene, here: Vertex) -> Bool[Array, ""]:
+    """Whether what scatters at a vertex has a density."""
+    smooth = bsdfs.has(scene.materials, here.kind, "smooth")
+    return smooth if here.medium is None else smooth | here.scattered
+
+
 def evaluate(scene: Scene, here: Vertex, d: Float[Array, "3"]) -> tuple[Float[Array, "3"], Float[Array, ""]]:
-    """f |cos theta| and pdf of the bsdf for light from the unit direction d, in world space."""
+    """f |cos theta| and pdf of the bsdf, or the phase function and its density, for light from the unit direction d."""
     wo = to_local(here.frame, d)
+
+    def of_surface():
+        return _evaluate_bsdf(scene, here, wo, d)
+
+    if here.medium is None:
+        return of_surface()
+    return lax.cond(here.scattered, lambda: media.evaluate(scene.media, here.medium, wo), of_surface)
+
+
+def _evaluate_bsdf(scene, here, wo, d):
     f, pdf = bsdfs.evaluate(scene.materials, here.kind, here.row, here.surface, here.wi, wo, here.colors)
     if here.turns:
         share = tree.seen_by_turned(here.turns, here.frame.n, d)
@@ -66,15 +116,24 @@ def sample(
 ) -> tuple[BSDFSample, Float[Array, "3"]]:
     """A sample of the bsdf, whose weight estimates the integral of f |cos theta|, and its direction in world space.
 
+    In a medium it is one of the phase function.
+
     u: of `random_numbers.Bounce.bsdf`; other: of `bsdfs.sample_other`.
     """
+
+    def of_surface():
+        return bsdfs.sample(scene.materials, here.kind, here.row, here.surface, here.wi, u, here.colors)
+
     if other:
         drawn = bsdfs.sample_other(scene.materials, here.row, here.surface, here.wi, u)
+    elif here.medium is None:
+        drawn = of_surface()
     else:
-        drawn = bsdfs.sample(scene.materials, here.kind, here.row, here.surface, here.wi, u, here.colors)
+        drawn = lax.cond(here.scattered, lambda: media.sample(scene.media, here.medium, u[:2]), of_surface)
     d = to_world(here.frame, drawn.wo)
     if here.turns:
         share = tree.seen_by_turned(here.turns, here.frame.n, d)
-        share = jnp.where(bsdfs.has(scene.materials, here.kind, "passes"), 1, share)
+        straight = bsdfs.has(scene.materials, here.kind, "passes")
+        share = jnp.where(straight if here.medium is None else straight | here.scattered, 1, share)
         drawn = drawn._replace(weight=drawn.weight * share, pdf=jnp.where(share > 0, drawn.pdf, 0))
     return drawn, d

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import DTypeLike
 
-from pathjax import bsdfs, emitters
+from pathjax import emitters
 from pathjax.compile import is_traced
 from pathjax.errors import InputError, InputWarning
 from pathjax.io.mitsuba import loader, writer
@@ -107,6 +107,6 @@ def _equal(one: object, other: object) -> bool:
 
 def _lit(scene: Scene, file: str | os.PathLike) -> Scene:
     """The scene; a warning where it is dark."""
-    if dark := emitters.darkness(scene.emitters, bsdfs.occurs(scene.materials, "smooth")):
+    if dark := emitters.darkness(scene.emitters, scene.samples_lights):
         warnings.warn(f"{file}: {dark}, so images of it are black", InputWarning, stacklevel=3)
     return scene

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pathjax import bsdfs, emitters, shapes
+from pathjax import bsdfs, emitters, media, shapes
 from pathjax import description as desc
 from pathjax.compile import usual_promotion
 from pathjax.errors import InputError
@@ -37,11 +37,15 @@ def build(description: desc.Description, dtype=jnp.float32, split_rule: str = "s
     geometry, lamps, trees = shapes.build(description.shapes, dtype, split_rule, **asked)
     given = [*(shape.emitter for shape in description.shapes), *description.emitters]
     lights, geometry = emitters.build(given, lamps, geometry, dtype, ("emitters",), parameters)
+    within = None
+    if description.integrator.media:
+        sides = [(shape.interior, shape.exterior) for shape in description.shapes]
+        within = media.build(sides, description.medium, dtype, ("media",), parameters)
     about = About(description, parameters.known, parameters.refused, trees)
     view = seen(description, dtype)
     # NumPy up to here: `jnp.asarray` compiles a program for every shape that it meets.
     free_passes = description.integrator.free_passes and bsdfs.occurs(materials, "passes")
-    parts = {"geometry": geometry, "materials": materials, "emitters": lights, "about": about}
+    parts = {"geometry": geometry, "materials": materials, "emitters": lights, "about": about, "media": within}
     return jax.device_put(Scene(**parts, **view, free_passes=free_passes))
 
 

@@ -97,7 +97,7 @@ class Cube(PlanarShape):
 
     unused = PlanarShape.unused | {"face_normals": Unused("boolean")}  # Mitsuba makes a mesh of it
     table = Rectangles
-    comes_last = True
+    comes_last = closed = True
     local = _CUBE
     made = CubeFaces
 

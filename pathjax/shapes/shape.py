@@ -40,6 +40,7 @@ class Shape(ABC):
     # For derivatives at the edges of shapes that move, which are not taken here.
     unused: ClassVar[Mapping[str, Unused]] = {"silhouette_sampling_weight": Unused("float", at_least=0)}
     triangles: ClassVar[bool] = False  # it has `vertices`, `faces`, `normals` and `uv`
+    closed: ClassVar[bool] = False  # it has an inside
     comes_last: ClassVar[bool] = False  # in its table, after what other kinds put there
     attributes: Mapping[str, np.ndarray] = MappingProxyType({})  # (N, 3) by name, of vertices or faces, for textures
 

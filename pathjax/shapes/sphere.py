@@ -186,6 +186,7 @@ class Sphere(Shape):
     radius: float
     to_world: np.ndarray  # (4, 4) carries the unit sphere at the origin; only its rotation matters further (uv)
     table = Spheres
+    closed = True
 
     @classmethod
     def read(cls, loader, fields: Fields):

@@ -261,6 +261,15 @@ class Mesh(Shape):
         return self.normals is not None
 
     @property
+    def closed(self):
+        """Whether each edge has a triangle on either side, with vertices that lie in one place taken for one."""
+        _, place = np.unique(self.vertices, axis=0, return_inverse=True)
+        corners = place.reshape(-1)[self.faces]
+        edges = np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]])
+        one_way, other_way = (np.unique(each, axis=0, return_counts=True) for each in (edges, edges[:, ::-1]))
+        return all(map(np.array_equal, one_way, other_way))
+
+    @property
     def empty(self):
         return not len(self.faces)
 

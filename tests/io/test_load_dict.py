@@ -229,7 +229,7 @@ def itself():
         ),
         (scene(a={"type": "sphere", "id": 7}), "scene.a: must be a string of one line, is 7"),
         (itself(), "scene.again.*inside itself"),
-        (scene(fog={"type": "sphere", "inside": {"type": "homogeneous"}}), "scene.fog.*media are not supported"),
+        (scene(fog={"type": "sphere", "inside": {"type": "homogeneous"}}), "scene.fog.inside: .*takes one <medium"),
         (scene(folder={"type": "resources", "path": "/none"}), 'scene.folder.*no folder "/none"'),
         (with_reflectance([0.1, 0.2, 0.3]), "scene.ball.bsdf.reflectance: .*cannot be a <point>"),
         (with_reflectance({"type": "rgb"}), 'scene.ball.bsdf.reflectance: .*lacks "value"'),

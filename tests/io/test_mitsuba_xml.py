@@ -643,7 +643,6 @@ FILM = '<film type="hdrfilm">{}</film>'
         (FILM.format('<integer name="crop_offset_x" value="10"/>'), "beyond the film"),
         (FILM.format('<string name="pixel_format" value="rbg"/>'), 'did you mean "rgb"'),
         (FILM.format('<string name="banner" value="no"/>'), "cannot be a <string>; give it as <boolean>"),
-        ('<medium type="homogeneous"/>', "participating media are not supported yet"),
         ('<string name="shutter_open" value="0"/>', "cannot be a <string>; give it as <float>"),
         (FILM.format('<rfilter type="gaussian"><float name="radius" value="2"/></rfilter>'), "it has: stddev"),
         ('<film type="specfilm"/>', "use one of hdrfilm"),
@@ -806,7 +805,8 @@ def test_mitsuba_takes_what_has_no_effect(mitsuba, picture, tmp_path, place, nam
 def test_integrators_that_estimate_the_same_are_path_and_noted(read, integrator, words):
     limits = '<integer name="max_depth" value="3"/><integer name="rr_depth" value="2"/>'
     scene = read(integrator.format(limits))
-    assert scene.integrator == d.Integrator(max_depth=3, rr_depth=2, free_passes="volpath" in integrator)
+    volume = "volpath" in integrator
+    assert scene.integrator == d.Integrator(max_depth=3, rr_depth=2, free_passes=volume, media=volume)
     assert any(words in note for note in scene.notes)
 
 
@@ -853,12 +853,6 @@ def test_a_light_that_no_shape_refers_to_is_noted(read):
     scene = read('<emitter type="area" id="glow"/>' + shape())
     assert scene.emitters == () and scene.shapes[0].emitter is None
     assert any('<emitter type="area"> is used by nothing' in note for note in scene.notes)
-
-
-@pytest.mark.parametrize("medium", ['<medium name="interior" type="homogeneous"/>', '<ref name="interior" id="fog"/>'])
-def test_media_are_refused_by_name_where_they_are_used(refused, medium):
-    fog = '<medium type="homogeneous" id="fog"><phase type="isotropic"/></medium>\n'
-    assert "participating media are not supported yet" in refused(fog + shape(medium), line=3)
 
 
 def test_a_medium_that_nothing_uses_is_noted(read):

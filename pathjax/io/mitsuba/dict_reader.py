@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pathjax import bsdfs, emitters, sensors, shapes, textures
+from pathjax import bsdfs, emitters, media, sensors, shapes, textures
 from pathjax.compile import is_traced
 from pathjax.description.elements import Document, Element, find_file, nearest
 from pathjax.description.fields import TYPED
@@ -52,6 +52,9 @@ def rooms() -> dict[str, Mapping[str, object]]:
         "bsdf": bsdfs.KINDS,
         "texture": textures.KINDS,
         "emitter": emitters.KINDS,
+        "medium": media.KINDS,
+        "phase": media.PHASES,
+        "volume": media.VOLUMES,
     }
 
 

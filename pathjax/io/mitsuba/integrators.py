@@ -32,13 +32,11 @@ class Path:
 
 
 class VolPath(Path):
-    """Without media, which are refused, Mitsuba's `volpath` estimates what `path` does, but for depths."""
+    """Participating media too. Straight through a surface is no bounce."""
 
     @classmethod
     def read(cls, loader, fields):
-        same = "without media is the same as path, which is used"
-        loader.note(fields.element, f"{same}; what goes straight on through a surface takes no depth")
-        return replace(super().read(loader, fields), free_passes=True)
+        return replace(super().read(loader, fields), free_passes=True, media=True)
 
 
 class VolPathMIS(VolPath):

@@ -11,10 +11,10 @@ from collections.abc import Callable, Iterator, Mapping
 from itertools import count
 from pathlib import Path
 
-from pathjax import bsdfs, emitters, sensors, textures
 from pathjax import description as d
+from pathjax import emitters, sensors
 from pathjax.description.elements import Document, Element, nearest
-from pathjax.description.fields import NOT_MODELLED, VALUES, Fields
+from pathjax.description.fields import VALUES, Fields
 from pathjax.errors import InputError
 from pathjax.io import bare, mesh
 from pathjax.io.mitsuba import dict_reader, instances, integrators, samplers
@@ -78,7 +78,7 @@ class _Loader:
         self.on_shapes: dict[Element, Element] = {}  # a light by reference, and the shape that it shines from
 
     def description(self, file: str, sensor: int | str = 0) -> d.Description:
-        scene: dict[str, list[Element]] = {tag: [] for tag in (*TOP_LEVEL, *NOT_MODELLED)}
+        scene: dict[str, list[Element]] = {tag: [] for tag in TOP_LEVEL}
         settings = []
         for element in self.document.root.children:
             if element.tag in VALUES and element.attributes.get("name") in _Settings.unused:
@@ -101,7 +101,7 @@ class _Loader:
             if element is not seen:
                 self.note(element, f"is left out, as the sensor at {seen.place} is used; `sensor` chooses another")
 
-        camera, film, spp, sampler = self.make(seen, sensors.KINDS, read=_sensor)
+        camera, film, spp, sampler, medium = self.make(seen, sensors.KINDS, read=_sensor)
         if scene["integrator"]:
             integrator = self.make(scene["integrator"][0], integrators.KINDS)
         else:
@@ -123,15 +123,43 @@ class _Loader:
             if _kind_of_light(element).on_surfaces and element not in self.on_shapes:
                 self.note(element, "is used by nothing; put it, or a <ref> to it, inside the <shape> that shines")
                 self.emitter(element, element.id, inside=True)
-        for element in scene["bsdf"] + scene["texture"]:
+        for element in scene["bsdf"] + scene["texture"] + scene["medium"] + scene["phase"]:
             if element not in self.made:
                 self.note(element, "is used by nothing")
                 self.shared(element, element.id or element.tag)
-        for tag in NOT_MODELLED:  # what refers to them is refused
-            for element in scene[tag]:
-                self.note(element, "is used by nothing")
-        read = self.document, self.made
-        return d.Description(file, camera, film, integrator, spp, sampler, shapes, lights, tuple(self.notes), *read)
+        self.check_media(scene["integrator"], integrator, shapes, medium)
+        return d.Description(
+            file,
+            camera,
+            film,
+            integrator,
+            spp,
+            sampler,
+            shapes,
+            lights,
+            medium,
+            tuple(self.notes),
+            self.document,
+            self.made,
+        )
+
+    def check_media(
+        self,
+        elements: list[Element],
+        integrator: d.Integrator,
+        shapes: tuple[d.Shape, ...],
+        medium: Instance | None,
+    ) -> None:
+        """Tell whether media are rendered; elements: the integrator, if there is one."""
+        root = elements[0] if elements else self.document.root
+        some = medium is not None or any(shape.interior or shape.exterior for shape in shapes)
+        if integrator.media and not some:
+            same = "without media is the same as path, which is used"
+            self.note(root, f"{same}; what goes straight on through a surface takes no depth")
+        elif some and not integrator.media:
+            self.note(root, 'takes no notice of media, as in Mitsuba; <integrator type="volpath"> renders them')
+        elif some and not shapes:
+            raise root.error(f"{root}: a medium without a shape around it never ends; add a <shape>")
 
     def note(self, element: Element, text: str) -> None:
         """What `info` should tell of an element."""
@@ -161,12 +189,12 @@ class _Loader:
         return made
 
     def shared(self, element: Element, name: str) -> Instance:
-        """A bsdf or texture; the same object each time, also by reference.
+        """A bsdf, texture, medium or phase function; the same object each time, also by reference.
 
         name: for one without an id, with a number if it is that of another one of its type, as in masks inside masks.
         """
         if element not in self.made:
-            kinds = bsdfs.KINDS if element.tag == "bsdf" else textures.KINDS
+            kinds = dict_reader.rooms()[element.tag]
             kind, name = element.attributes.get("type"), element.id or name
             if (kind, name) in self.named:
                 name = self.numbered(name)
@@ -182,7 +210,7 @@ class _Loader:
         if kind is not None and inside and not kind.on_surfaces:
             raise element.error(f"{element} shines from no surface; it stands directly in <scene>")
         kinds = {key: kind for key, kind in emitters.KINDS.items() if kind.on_surfaces == inside}
-        return self.make(element, kinds, name)
+        return self.make(element, kinds, name, read=_emitter)
 
     def shapes(self, element: Element) -> list[d.Shape]:
         """What an element of a scene or a group stands for: nothing, one, or those that an instance shows."""
@@ -259,13 +287,39 @@ def _shape(loader: _Loader, fields: Fields, name: str) -> d.Shape | None:
     inherited = fields.element.id or None
     (nested,) = fields.objects("bsdf") or [_usual_bsdf(fields.element, lit=emitter is not None)]
     bsdf = loader.bsdf(nested, nested.id or inherited or loader.numbered("bsdf"))
+    interior, exterior = (_side(loader, fields, name, side) for side in ("interior", "exterior"))
+    for medium in fields.objects("medium", limit=1):
+        sides = '<medium name="interior"> and one <medium name="exterior">'
+        raise medium.error(f"{fields.element} takes one {sides}, themselves or by <ref>, and no other <medium>")
+    if interior or exterior:
+        _note_boundary(loader, fields.element, geometry, bsdf)
     if why := mesh_attribute.fault(bsdf, geometry.attributes):
         raise fields.element.error(f"{fields.element} {why}")
     if geometry.empty:
         light = "" if emitter is None else ", and its light too"
         loader.note(fields.element, f"is left out, as no triangle has an area{light}")
         return None
-    return d.Shape(name, geometry, bsdf, emitter, flip_normals)
+    return d.Shape(name, geometry, bsdf, emitter, flip_normals, interior, exterior)
+
+
+def _side(loader: _Loader, fields: Fields, name: str, side: str) -> Instance | None:
+    """The medium on one side of a shape."""
+    element = fields.object("medium", side)
+    return None if element is None else loader.shared(element, element.id or f"{name}_{side}")
+
+
+def _note_boundary(loader: _Loader, shape: Element, geometry: object, bsdf: Instance) -> None:
+    """Tell what looks like an oversight where a medium begins."""
+    if not geometry.closed:
+        loader.note(shape, "bounds a medium and is open: paths that go around it stay in the medium that they were in")
+    if not any(leaf.kind.passes or leaf.kind.sided for leaf in bsdf.kind.leaves(bsdf)):
+        loader.note(shape, 'bounds a medium and lets no light in; <bsdf type="null"/> inside lets it pass')
+
+
+def _emitter(loader: _Loader, fields: Fields, name: str) -> Instance:
+    for medium in fields.objects("medium"):
+        loader.note(medium, f"has no effect inside {fields.element}: paths come from the camera")
+    return emitters.KINDS[fields.type].read(loader, fields, name)
 
 
 def _chosen(elements: list[Element], which: int | str) -> Element:
@@ -286,13 +340,16 @@ def _usual_bsdf(shape: Element, lit: bool) -> Element:
     return shape.children[-1]
 
 
-def _sensor(loader: _Loader, fields: Fields) -> tuple[sensors.Sensor, film.HDRFilm, int, str]:
-    """Camera, film, samples per pixel, sampler."""
+def _sensor(loader: _Loader, fields: Fields) -> tuple[sensors.Sensor, film.HDRFilm, int, str, Instance | None]:
+    """Camera, film, samples per pixel, sampler, the medium around."""
     camera = sensors.KINDS[fields.type].read(loader, fields)
     films, drawn = fields.objects("film"), fields.objects("sampler")
     made = loader.make(films[0], film.KINDS) if films else film.HDRFilm()
     spp = loader.make(drawn[0], samplers.KINDS) if drawn else samplers.DEFAULT_COUNT
-    return camera, made, spp, drawn[0].attributes["type"] if drawn else "independent"
+    sampler = drawn[0].attributes["type"] if drawn else "independent"
+    around = fields.objects("medium")
+    medium = loader.shared(around[0], around[0].id or "sensor_medium") if around else None
+    return camera, made, spp, sampler, medium
 
 
 def _kind_of_light(element: Element) -> type[emitters.Emitter]:
@@ -317,4 +374,4 @@ class _Settings:
         pass
 
 
-TOP_LEVEL = ("integrator", "sensor", "emitter", "bsdf", "texture", "shape")
+TOP_LEVEL = ("integrator", "sensor", "emitter", "bsdf", "texture", "shape", "medium", "phase", "volume")

@@ -1,0 +1,46 @@
+"""More forwards or backwards the longer the wave is against the particles (Henyey and Greenstein 1941, ApJ 93)."""
+
+from __future__ import annotations
+
+import math
+
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float
+
+from pathjax.core.math import cos_sin_turns, larger, safe_sqrt
+from pathjax.kinds import Number, Row
+from pathjax.media.phase import Phase
+
+# The number of float32 before 1: at 1 all light goes straight on, and there is no density.
+_MOST = float(np.nextafter(np.float32(1), np.float32(0)))
+
+
+class HG(Phase):
+    """Mean cosine g: above 0 light goes rather on than back."""
+
+    g = Number(0.8, bounds=(-_MOST, _MOST))
+
+    @staticmethod
+    def evaluate(p: Row, wo: Float[Array, "3"]) -> Float[Array, ""]:
+        """(1 - g^2) / (4 pi (1 + g^2 - 2 g cos)^(3/2)), cos = -wo.z; what is raised is never below (1 - |g|)^2."""
+        g = p.g
+        squared = (1 - g) * (1 - g) + 2 * g * (1 + wo[2])
+        least = 1 - jnp.abs(g)
+        squared = larger(squared, least * least)
+        return (1 - g) * (1 + g) / ((4 * math.pi) * squared * jnp.sqrt(squared))
+
+    @staticmethod
+    def sample(p: Row, u: Float[Array, "2"]) -> Float[Array, "3"]:
+        """Invert the distribution of 1 - cos, in a form in which nothing cancels, at g = 0 neither.
+
+        With s = 1 - g + 2 g u the cosine is (1 + g^2 - ((1 - g^2) / s)^2) / 2g, so
+        1 - cos = (1 - g)^2 (1 - u) (1 + (1 + g) / s) / s.
+        """
+        g = lax.stop_gradient(p.g)
+        s = 1 - g + 2 * g * u[1]
+        one_minus_cos = (1 - g) * (1 - g) * (1 - u[1]) * (1 + (1 + g) / s) / s
+        cos, sin = cos_sin_turns(u[0])
+        r = safe_sqrt(one_minus_cos * (2 - one_minus_cos))
+        return jnp.stack([r * cos, r * sin, one_minus_cos - 1])
