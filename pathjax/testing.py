@@ -4,6 +4,7 @@
     testing.check_bsdf(OrenNayar, sigma=0.3)
     testing.check_texture(Stripes, color0=0.1)
     testing.check_emitter(Sunset, radiance=3.0)
+    testing.check_phase(Rayleigh)
 
 A check that fails raises AssertionError, which says what was found and what should have been. Those that are
 statistical fail for a right bsdf with the probability `false_alarm` each; seeds are fixed.
@@ -24,6 +25,7 @@ from pathjax.bsdfs import BSDF, Materials
 from pathjax.emitters import Emitter
 from pathjax.emitters.selection import AllRows
 from pathjax.kinds import Parameters, Row, Table
+from pathjax.media import Phase
 from pathjax.textures import Texture, Textures
 
 # Directions that see grazing and steep light, and an azimuth that no symmetry favours.
@@ -313,6 +315,45 @@ def check_emitter(kind: type[Emitter], samples: int = 200_000, false_alarm: floa
 def _check_light(light, density):
     for what, x in (("emitted", light), ("density", density)):
         assert np.isfinite(x).all() and (np.asarray(x) >= 0).all(), f"`{what}` is {np.min(x)} somewhere"
+
+
+# ---- phase functions ------------------------------------------------------------------------------------------------
+
+
+def check_phase(kind: type[Phase], samples: int = 200_000, false_alarm: float = 1e-4, **values):
+    """A kind of phase function draws directions by its density, of which all derivatives integrate to 0.
+
+    Args:
+        samples: of the chi-square test.
+        values: of its parameters, the others have their defaults.
+    Raises:
+        AssertionError: a check failed.
+    """
+    table = jax.device_put(kind.build([kind.instance("it", **values)], np.float32, (), Parameters(), None))
+    u = jnp.asarray(np.random.default_rng(1).integers(0, 1 << 24, (samples, 2)) * 2.0**-24, jnp.float32)
+    ends = jnp.asarray([[a, b] for a in (0, 1 - 2**-24) for b in (0, 1 - 2**-24)], jnp.float32)
+    u = jnp.concatenate([u, ends])
+
+    @jax.jit
+    def drawn(table):
+        return jax.vmap(lambda u: kind.sample(Row(table, 0), u))(u)
+
+    @jax.jit
+    def density(table, wo):
+        return jax.vmap(lambda wo: kind.evaluate(Row(table, 0), wo))(wo)
+
+    wo, (middles, share) = drawn(table), _midpoints()
+    assert np.allclose(np.linalg.norm(wo, axis=1), 1, atol=1e-5), "a direction is not of unit length"
+    for what in (wo, middles):
+        pdf = np.asarray(density(table, what), np.float64)
+        assert np.isfinite(pdf).all() and (pdf >= 0).all(), f"`evaluate` is {np.min(pdf)} somewhere"
+    _chi_square(wo[:samples], samples, pdf * share, false_alarm, kind.__name__)
+    for name, tangent in _tangents(table).items():
+        _, moved = jax.jvp(drawn, (table,), (tangent,))
+        assert not np.asarray(moved).any(), f"directions carry a derivative in {name}; put lax.stop_gradient around it"
+        _, moved = jax.jvp(lambda table: density(table, middles), (table,), (tangent,))
+        total, size = (np.sum(x * share) for x in (np.asarray(moved, np.float64), np.abs(moved)))
+        assert abs(total) <= 1e-3 * size, f"the derivative of the density in {name} integrates to {total}, not to 0"
 
 
 # ---- what they share ------------------------------------------------------------------------------------------------

@@ -36,7 +36,7 @@ PHASES: dict[str, type[Phase]] = {"isotropic": Isotropic, "hg": HG}
 # In the place of a row: no medium; and of shapes that say nothing, which leave paths in the medium that they are in.
 NONE, SAME = -1, -2
 # Least probability of each colour: what the path carries nothing of may have a derivative.
-_LEAST = 1 / 30
+LEAST = 1 / 30
 
 
 def register(name: str):
@@ -165,7 +165,7 @@ def _chances(throughput):
     carried = lax.stop_gradient(throughput)
     total = carried[0] + carried[1] + carried[2]
     share = jnp.where(total > 0, carried / jnp.where(total > 0, total, 1), 1 / 3)
-    return _LEAST + (1 - 3 * _LEAST) * share
+    return LEAST + (1 - 3 * LEAST) * share
 
 
 def evaluate(

@@ -17,19 +17,25 @@ from pathjax.media.phase import Phase
 _MOST = float(np.nextafter(np.float32(1), np.float32(0)))
 
 
+class _Between(Number):
+    """A number that is -1 or 1 in no file."""
+
+    def read(self, loader, fields, name, owner):
+        return fields.float(name, self.default, above=-1, below=1)
+
+
 class HG(Phase):
     """Mean cosine g: above 0 light goes rather on than back."""
 
-    g = Number(0.8, bounds=(-_MOST, _MOST))
+    g = _Between(0.8, bounds=(-_MOST, _MOST))
 
     @staticmethod
     def evaluate(p: Row, wo: Float[Array, "3"]) -> Float[Array, ""]:
-        """(1 - g^2) / (4 pi (1 + g^2 - 2 g cos)^(3/2)), cos = -wo.z; what is raised is never below (1 - |g|)^2."""
-        g = p.g
-        squared = (1 - g) * (1 - g) + 2 * g * (1 + wo[2])
-        least = 1 - jnp.abs(g)
-        squared = larger(squared, least * least)
-        return (1 - g) * (1 + g) / ((4 * math.pi) * squared * jnp.sqrt(squared))
+        """(1 - g^2) / (4 pi (1 + g^2 - 2 g cos)^(3/2)), cos = -wo.z; of what is raised nothing cancels."""
+        side = jnp.where(p.g < 0, -1, 1).astype(wo.dtype)
+        size = side * p.g
+        squared = (1 - size) * (1 - size) + 2 * size * larger(1 + side * wo[2], 0)
+        return (1 - size) * (1 + size) / ((4 * math.pi) * squared * jnp.sqrt(squared))
 
     @staticmethod
     def sample(p: Row, u: Float[Array, "2"]) -> Float[Array, "3"]:

@@ -85,7 +85,7 @@ def _check_control(control, scene: Scene) -> None:
             f"control = {control!r}; give a transport.Control: op = transport.operator(scene); "
             "control = op.control(op.solve().L)"
         )
-    control.check(scene.geometry)
+    control.check(scene)
 
 
 @usual_promotion

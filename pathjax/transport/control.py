@@ -23,7 +23,9 @@ from pathjax.compile import compute_once
 from pathjax.core.math import dot, safe_divide
 from pathjax.errors import InputError
 from pathjax.integrators import roulette
+from pathjax.scene.scene import Scene
 from pathjax.shapes.geometry import Geometry
+from pathjax.transport.patches import refuse_media
 from pathjax.transport.view import Radiosity, radiance
 
 # Pixels would show the patches if paths ended at what the camera sees.
@@ -38,9 +40,10 @@ class Control:
     reflected: Radiosity  # S0
     effort: jax.Array  # () survival where all of a path's light is still to be found
 
-    def check(self, shapes: Geometry) -> None:
-        """Refuse, with an InputError, the patches of other shapes."""
-        cut, held = self.reflected.patches.first.shape[0], shapes.shape.shape[0]
+    def check(self, scene: Scene) -> None:
+        """Refuse, with an InputError, a scene of other shapes, or with media."""
+        refuse_media(scene)
+        cut, held = self.reflected.patches.first.shape[0], scene.geometry.shape.shape[0]
         if cut != held:
             raise InputError(
                 f"control was made of a scene of {cut} primitives, and this one has {held}; make it of this scene: "

@@ -53,6 +53,7 @@ def cut(scene: Scene, count: int, faceted: bool = False) -> Patches:
     shapes = scene.geometry
     if not shapes.tables:
         raise InputError("a scene without shapes has no patches")
+    refuse_media(scene)
     rows = _diffuse_rows(scene, faceted)
     shape, light = np.asarray(shapes.shape), np.asarray(shapes.light)
 
@@ -86,6 +87,15 @@ def cut(scene: Scene, count: int, faceted: bool = False) -> Patches:
     integers = (np.asarray(x, np.int32) for x in (first, grid, primitive, place, patch, cell))
     rest = (area / cells)[primitive][cell].astype(dtype), row[back, cell], emitter[back, cell]
     return jax.device_put(Patches(*integers, back.astype(bool), rest[0], *(x.astype(np.int32) for x in rest[1:])))
+
+
+def refuse_media(scene: Scene) -> None:
+    """Raises InputError: light does not go from patch to patch undimmed."""
+    if scene.media is not None:
+        raise InputError(
+            "the scene has participating media, and light between patches goes through nothing. Use pathjax.render, or "
+            'load it with <integrator type="path">, which takes no notice of media'
+        )
 
 
 def _name(scene, shape) -> str:

@@ -21,7 +21,7 @@ from pathjax.scene.scene import Scene
 from pathjax.sensors import film
 from pathjax.shapes import geometry
 from pathjax.shapes.geometry import Geometry
-from pathjax.transport.patches import Patches, patch_at
+from pathjax.transport.patches import Patches, patch_at, refuse_media
 
 
 @jax.tree_util.register_dataclass
@@ -58,9 +58,10 @@ def image(scene: Scene, light: Radiosity, spp: int = 16, seed: int = 0) -> jax.A
     nothing else is random. Linear in `light.L`, and differentiable in it.
 
     Raises:
-        InputError: spp or seed out of range; a scene that hides its emitters.
+        InputError: spp or seed out of range; a scene that hides its emitters, or has media.
     """
     check_counts(spp, seed)
+    refuse_media(scene)
     if scene.hide_emitters:
         raise InputError(
             "this scene hides its emitters from the camera, and patches show them; load it with hide_emitters false"

@@ -81,6 +81,9 @@ PLACES = {
     "bsdf": '<sensor type="perspective"/><shape type="cube">{}</shape>',
     "texture": '<sensor type="perspective"/><shape type="cube"><bsdf type="diffuse">{}</bsdf></shape>',
     "emitter": '<sensor type="perspective"/>{}',
+    "medium": '<sensor type="perspective">{}</sensor>',
+    "phase": '<sensor type="perspective"><medium type="homogeneous">{}</medium></sensor>',
+    "volume": '<sensor type="perspective"><medium type="homogeneous">{}</medium></sensor>',
     "area light": '<sensor type="perspective"/><shape type="cube">{}</shape>',
 }
 MESHES = ("obj", "ply", "stl", "glb", "gltf", "serialized")
@@ -89,7 +92,7 @@ NEEDS = {
     **dict.fromkeys(("perspective", "projector"), ["", '<float name="fov" value="40"/>']),
     "thinlens": [f'<float name="aperture_radius" value="1"/>{fov}' for fov in ("", '<float name="fov" value="40"/>')],
     "instance": ['<shape type="shapegroup"/>'],
-    "uniform": ['<float name="value" value="1"/>'],
+    **dict.fromkeys(("uniform", "constvolume"), ['<float name="value" value="1"/>']),
     "mesh_attribute": ['<string name="name" value="vertex_color"/>'],
     **dict.fromkeys(("bitmap", "envmap"), ['<string name="filename" value="marks.png"/>']),
     **dict.fromkeys(("twosided", "mask"), ['<bsdf type="diffuse"/>']),
@@ -128,7 +131,7 @@ def refusal(root, tmp_path_factory):
                 pj.load_dict({"type": "scene", "sensor": {"type": "perspective"}, "shape": shape})
             return str(error.value)
         tag = "emitter" if place == "area light" else place
-        name = ' name="reflectance"' if tag == "texture" else ""
+        name = {"texture": ' name="reflectance"', "volume": ' name="albedo"'}.get(tag, "")
         element = f'<{tag} type="{kind}"{name}>{inside}</{tag}>'
         file = folder / "scene.xml"
         file.write_text(f'<scene version="3.0.0">{PLACES[place].format(element)}</scene>')

@@ -1,0 +1,216 @@
+"""Radiance in media, and its derivatives, against closed forms and quadrature; and what is hard on numbers."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import pathjax as pj
+from pathjax import media
+
+NULL = {"type": "null"}
+slow = pytest.mark.slow
+
+
+def rgb(*values):
+    return {"type": "rgb", "value": list(values)}
+
+
+def medium(phase=None, **colours):
+    made = {name: rgb(*x) if isinstance(x, tuple) else x for name, x in colours.items()}
+    return {"type": "homogeneous", **made, **({} if phase is None else {"phase": phase})}
+
+
+def slab(inside, thickness=1.0):
+    """Between the planes z = 0 and z = thickness, far wider than what is seen of it."""
+    to_world = pj.Transform().scale([2, 2, thickness / 2]).translate([0, 0, thickness / 2])
+    return {"type": "cube", "id": "slab", "to_world": to_world.matrix, "bsdf": NULL, "interior": inside}
+
+
+def scene(depth=-1, res=2, width=1e-3, integrator="volpath", sensor=(), **things):
+    """Seen from z = -3 along z by parallel rays that are `width` apart from the axis at most."""
+    to_world = pj.Transform().scale([width, width, 1]).translate([0, 0, -3])
+    film = {"type": "hdrfilm", "width": res, "height": res, "filter": {"type": "box"}}
+    camera = {"type": "orthographic", "to_world": to_world.matrix, "film": film, **dict(sensor)}
+    return pj.load_dict(
+        {"type": "scene", "integrator": {"type": integrator, "max_depth": depth}, "sensor": camera, **things}
+    )
+
+
+SKY = {"type": "constant", "radiance": rgb(1.0, 2.0, 3.0)}
+
+
+# ---- absorption -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("thickness", [1.0, pytest.param(1e-3, marks=slow), pytest.param(1e-6, marks=slow)])
+def test_a_slab_absorbs_as_beer_and_lambert_say(thickness):
+    sigma = np.array([0.3, 1.0, 4.0])
+    made = scene(sky=SKY, slab=slab(medium(albedo=0.0, sigma_t=tuple(sigma / thickness)), thickness))
+    image, J = pj.jacobian(made, ["slab_interior.sigma_t", "slab_interior.scale"], spp=1)
+    # Faces are left clear of rounding, some 1e-6 of the distances in the scene.
+    rtol = 1e-5 + 3e-6 / thickness
+    expected = np.array([1, 2, 3]) * np.exp(-sigma)
+    np.testing.assert_allclose(image, np.broadcast_to(expected, image.shape), rtol=rtol)
+    by_sigma = np.diagonal(J["slab_interior.sigma_t"], axis1=-2, axis2=-1)
+    np.testing.assert_allclose(by_sigma, np.broadcast_to(-thickness * expected, image.shape), rtol=rtol)
+    np.testing.assert_allclose(J["slab_interior.scale"], np.broadcast_to(-sigma * expected, image.shape), rtol=rtol)
+
+
+def test_of_media_that_only_absorb_no_scattering_is_compiled():
+    made = scene(sky=SKY, slab=slab(medium(albedo=0.0)))
+    assert not made.media.scatters and made.media.phases == ()
+    with pytest.raises(pj.InputError, match="slab_interior.albedo is 0, as that of all media"):
+        pj.with_parameters(made, {"slab_interior.albedo": 0.5})
+
+
+def test_one_that_scatters_draws_what_another_absorbs_too(estimate, agree):
+    """A slab of no albedo beside one that scatters, elsewhere: the same light by chance."""
+    other = {"type": "sphere", "center": [9, 0, 0], "bsdf": NULL, "interior": medium()}
+    made = scene(sky=SKY, slab=slab(medium(albedo=0.0, sigma_t=(0.3, 1.0, 4.0), scale=0.5)), other=other)
+    assert made.media.scatters
+    agree(estimate(made, spp=256, count=8), np.array([1, 2, 3]) * np.exp([-0.15, -0.5, -2.0]), pixelwise=False)
+
+
+# ---- scattering -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "inside",
+    [
+        medium(albedo=1.0, sigma_t=(0.5, 2.0, 8.0)),
+        pytest.param(medium(albedo=1.0, sigma_t=3.0, phase={"type": "hg", "g": 0.8}), marks=slow),
+        pytest.param(medium(albedo=1.0, sigma_t=(0.5, 2.0, 8.0), phase={"type": "hg", "g": -0.8}), marks=slow),
+    ],
+)
+def test_a_white_medium_cannot_be_told_from_the_sky(inside, estimate, agree):
+    made = scene(sky=SKY, ball={"type": "sphere", "bsdf": NULL, "interior": inside})
+    agree(estimate(made, spp=256, count=8), [1, 2, 3], pixelwise=False)
+
+
+LIGHT, INTENSITY = np.array([1.5, 0.5, 0.2]), np.array([3.0, 2.0, 1.0])
+SIGMA, ALBEDO, G = np.array([0.4, 1.0, 2.5]), np.array([0.9, 0.5, 0.2]), 0.6
+
+
+def single_scattering(sigma, albedo, g, count=4000):
+    """Along the axis of a cube [-1, 1]^3 around LIGHT or beside it, by the midpoint rule."""
+    z = -1 + (np.arange(count) + 0.5) * 2 / count
+    p = np.stack([np.zeros_like(z), np.zeros_like(z), z], -1)
+    to_light = LIGHT - p
+    distance = np.linalg.norm(to_light, axis=1)
+    d = to_light / distance[:, None]
+    leaves = ((np.sign(d) - p) / d).min(1)  # where the way to the light goes out of the cube
+    cos = d[:, 2]
+    phase = (1 - g * g) / (4 * np.pi * (1 + g * g - 2 * g * cos) ** 1.5)
+    way = (z + 1 + np.minimum(leaves, distance))[:, None]
+    return (albedo * sigma * np.exp(-sigma * way) * (phase / distance**2)[:, None]).sum(0) * (2 / count) * INTENSITY
+
+
+@pytest.fixture(scope="module")
+def lit_cube():
+    inside = medium(albedo=tuple(ALBEDO), sigma_t=tuple(SIGMA), phase={"type": "hg", "g": G})
+    cube = {"type": "cube", "id": "cube", "bsdf": NULL, "interior": inside}
+    light = {"type": "point", "position": list(LIGHT), "intensity": rgb(*INTENSITY)}
+    return scene(depth=2, cube=cube, light=light)
+
+
+def test_single_scattering_is_that_of_quadrature(lit_cube, estimate, agree):
+    agree(estimate(lit_cube, spp=1024, count=8), single_scattering(SIGMA, ALBEDO, G), pixelwise=False)
+
+
+@slow
+def test_derivatives_of_single_scattering_are_those_of_quadrature(lit_cube, derivatives, agree):
+    """In albedo and extinction, by channel, and in g."""
+    at = {"cube_interior.sigma_t": 0, "cube_interior.albedo": 1, "cube_interior.g": 2}
+    _, found = derivatives(lit_cube, list(at), spp=1024, count=8)
+    for name, place in at.items():
+        values, moved = [SIGMA, ALBEDO, G], []
+        for step in (1e-5, -1e-5):
+            changed = list(values)
+            changed[place] = values[place] + step
+            moved.append(single_scattering(*changed))
+        agree(found[name], (moved[0] - moved[1]) / 2e-5, pixelwise=False)
+
+
+# ---- where media begin and end --------------------------------------------------------------------------------------
+
+
+def test_the_camera_may_lie_in_a_medium():
+    """From z = -3 to the far face of a cube that reaches from -4 to 4."""
+    fog = {**medium(albedo=0.0, sigma_t=0.25), "id": "fog"}
+    around = {"type": "ref", "id": "fog"}
+    cube = {"type": "cube", "to_world": pj.Transform().scale(4).matrix, "bsdf": NULL, "interior": around}
+    image = pj.render(scene(sky=SKY, fog=fog, cube=cube, sensor={"medium": around, "near_clip": 1e-6}), spp=1)
+    np.testing.assert_allclose(image, np.broadcast_to(np.exp(-7 / 4) * np.array([1, 2, 3]), (2, 2, 3)), rtol=1e-5)
+
+
+def test_nested_media_follow_each_other():
+    """A sphere of radius 1/2 in one of radius 1, whose medium is outside of the inner one."""
+    outer, inner = medium(albedo=0.0, sigma_t=0.5), {**medium(albedo=0.0, sigma_t=2.0), "id": "inner"}
+    ball = {"type": "sphere", "bsdf": NULL, "interior": {**outer, "id": "outer"}}
+    small = {
+        "type": "sphere",
+        "radius": 0.5,
+        "bsdf": NULL,
+        "interior": inner,
+        "exterior": {"type": "ref", "id": "outer"},
+    }
+    image = pj.render(scene(sky=SKY, ball=ball, small=small), spp=1)
+    np.testing.assert_allclose(image[..., 0], np.full((2, 2), np.exp(-0.5 - 2.0)), rtol=1e-5)
+
+
+def test_what_has_no_medium_outside_leaves_paths_in_none():
+    """As in Mitsuba: the inner sphere says nothing of the medium around it, so behind it there is none."""
+    ball = {"type": "sphere", "bsdf": NULL, "interior": medium(albedo=0.0, sigma_t=0.5)}
+    small = {"type": "sphere", "radius": 0.5, "bsdf": NULL, "interior": medium(albedo=0.0, sigma_t=2.0)}
+    image = pj.render(scene(sky=SKY, ball=ball, small=small), spp=1)
+    np.testing.assert_allclose(image[..., 0], np.full((2, 2), np.exp(-0.25 - 2.0)), rtol=1e-5)
+
+
+def test_path_takes_no_notice_of_media():
+    made = scene(sky=SKY, slab=slab(medium()), integrator="path")
+    assert made.media is None
+    assert any("takes no notice of media" in note for note in made.about.description.notes)
+    np.testing.assert_array_equal(pj.render(made, spp=1), np.broadcast_to([1, 2, 3], (2, 2, 3)))
+
+
+# ---- hard cases -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("sigma", [0.0, pytest.param(1e-30, marks=slow), pytest.param(1e6, marks=slow), 1e30])
+def test_no_number_is_nan_whatever_the_extinction(sigma):
+    inside = medium(albedo=(1.0, 0.5, 0.0), sigma_t=(sigma, 1.0, 0.0), phase={"type": "hg", "g": 0.9})
+    made = scene(depth=8, sky=SKY, ball={"type": "sphere", "id": "ball", "bsdf": NULL, "interior": inside})
+    names = [f"ball_interior.{each}" for each in ("sigma_t", "albedo", "scale", "g")]
+    image, J = pj.jacobian(made, names, spp=64)
+    assert np.isfinite(image).all() and (np.asarray(image) >= 0).all() and np.asarray(image).mean() <= 3
+    assert all(np.isfinite(J[name]).all() for name in names)
+    np.testing.assert_array_equal(np.asarray(image)[..., 2] > 0, True)
+
+
+def test_weights_of_a_flight_average_to_1():
+    """Of all colours, also of one that the path carries nothing of, at the end of any distance."""
+    made = media.build(
+        [],
+        media.Homogeneous.scattering(
+            media.Homogeneous.instance("it", sigma_t=np.array([0.1, 1.0, 10.0]), albedo=np.ones(3)),
+            media.Isotropic.instance(),
+        ),
+        np.float32,
+        (),
+        pj.kinds.Parameters(),
+    )
+    import jax
+
+    throughput, surface = jnp.array([0.0, 0.2, 3.0]), 0.7
+    u = jnp.asarray(np.random.default_rng(1).random((200_000, 2)), jnp.float32)
+
+    def weight(u):
+        t = media.distance(made, jnp.int32(0), throughput, u)
+        return media.flight_weight(made, jnp.int32(0), throughput, jnp.minimum(t, surface), t < surface)
+
+    weights = np.asarray(jax.jit(jax.vmap(weight))(u), float)
+    error = weights.std(0) / np.sqrt(len(u))
+    assert (np.abs(weights.mean(0) - 1) < 4 * error + 1e-6).all()
+    assert weights.max() <= 1 / media.LEAST

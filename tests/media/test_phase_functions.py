@@ -1,0 +1,86 @@
+"""Phase functions: densities, samples and mean cosines, and those that a user's script registers."""
+
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import pathjax as pj
+from pathjax import media, testing
+from pathjax.core.math import safe_sqrt
+from pathjax.core.warp import cos_sin_turns
+from pathjax.kinds import Parameters, Row
+
+SAMPLES = 100_000
+
+
+def test_isotropic_is_drawn_evenly():
+    testing.check_phase(media.Isotropic)
+
+
+@pytest.mark.parametrize(
+    "g", [0.0, 0.5, -0.8, pytest.param(0.9, marks=pytest.mark.slow), pytest.param(1e-6, marks=pytest.mark.slow)]
+)
+def test_henyey_and_greenstein_is_drawn_by_its_density(g):
+    testing.check_phase(media.HG, g=g)
+
+
+@pytest.mark.parametrize("g", [0.8, -0.3, 0.999, -0.999, 1 - 2**-24])
+def test_the_mean_cosine_is_g(g):
+    table = media.HG.build([media.HG.instance(g=g)], np.float32, (), Parameters(), None)
+    u = jnp.asarray(np.random.default_rng(1).random((SAMPLES, 2)), jnp.float32)
+    wo = np.asarray(jax.vmap(lambda u: media.HG.sample(Row(table, 0), u))(u), float)
+    cos = -wo[:, 2]
+    # 4 standard errors, a false alarm in 16,000; and rounding of what was near -1 or 1.
+    assert abs(cos.mean() - g) < 4 * cos.std() / math.sqrt(SAMPLES) + 1e-6
+
+
+def test_a_density_that_is_not_drawn_is_noticed():
+    class Wrong(media.HG):
+        @staticmethod
+        def evaluate(p, wo):
+            return media.HG.evaluate(p, -wo)
+
+    with pytest.raises(AssertionError, match="do not follow"):
+        testing.check_phase(Wrong, g=0.3)
+
+
+class Rayleigh(media.Phase):
+    """3/4 (1 + cos^2) over 4 pi."""
+
+    @staticmethod
+    def evaluate(p, wo):
+        return 3 / (16 * math.pi) * (1 + wo[2] * wo[2])
+
+    @staticmethod
+    def sample(p, u):
+        # The cubic z^3 + 3 z = 8 u - 4 has one real root (Cardano).
+        b = 4 * u[1] - 2
+        a = jnp.cbrt(b + jnp.sqrt(b * b + 1))
+        z = a - 1 / a
+        cos, sin = cos_sin_turns(u[0])
+        r = safe_sqrt(1 - z * z)
+        return jnp.stack([r * cos, r * sin, z])
+
+
+@pytest.fixture
+def rayleigh():
+    media.register("rayleigh")(Rayleigh)
+    yield
+    del media.PHASES["rayleigh"]
+
+
+def test_a_registered_phase_function_is_read_from_scenes(rayleigh):
+    testing.check_phase(Rayleigh, samples=50_000)
+    fog = {"type": "homogeneous", "phase": {"type": "rayleigh"}}
+    ball = {"type": "sphere", "bsdf": {"type": "null"}, "interior": fog}
+    sensor = {"type": "perspective", "film": {"type": "hdrfilm", "width": 2, "height": 2}}
+    scene = pj.load_dict({"type": "scene", "integrator": {"type": "volpath"}, "sensor": sensor, "ball": ball})
+    assert [table.kind for table in scene.media.phases] == [Rayleigh]
+
+
+def test_another_class_is_no_phase_function():
+    with pytest.raises(pj.InputError, match="must be a class derived from media.Phase"):
+        media.register("wrong")(pj.Scene)
