@@ -90,6 +90,11 @@ class Background(Emitter):
     def density(p: Row, d: Float[Array, "3"]) -> Float[Array, ""]:
         """1/sr, with which `sample` draws d."""
 
+    @classmethod
+    def met(cls, p: Row, d: Float[Array, "3"]) -> tuple[Float[Array, "3"], Float[Array, ""]]:
+        """`emitted` and `density`, for kinds whose two have something in common."""
+        return cls.emitted(p, d), cls.density(p, d)
+
 
 class DiracEmitter(Emitter):
     """What shines from one direction at each point: no ray hits it, and no bsdf finds it."""

@@ -126,20 +126,7 @@ class Envmap(Background):
 
     @staticmethod
     def emitted(p: Row, d: Float[Array, "3"]) -> Float[Array, "3"]:
-        (y, x), (below, beside) = _patch(p, d)
-        width = _size(p)[1]
-
-        def texel(y, x):
-            first = 3 * (y * width + x)
-            return jnp.stack([at(p.texels, first + channel) for channel in range(3)])
-
-        following = jnp.where(x + 1 < width, x + 1, 0)
-        upper = texel(y, x) * (1 - beside) + texel(y, following) * beside
-        lower = texel(y + 1, x) * (1 - beside) + texel(y + 1, following) * beside
-        radiance = upper * (1 - below) + lower * below
-        if (nudge := p.nudge("texels")) is not None:
-            radiance = radiance + nudge
-        return radiance * p.scale
+        return _radiance(p, *_patch(p, d))
 
     @staticmethod
     def entries(p: Row, d: Float[Array, "3"]) -> list[tuple[str, Int[Array, ""], Float[Array, ""]]]:
@@ -151,9 +138,35 @@ class Envmap(Background):
 
     @staticmethod
     def density(p: Row, d: Float[Array, "3"]) -> Float[Array, ""]:
-        (y, x), _ = _patch(p, d)
-        place = y * (_size(p)[1] + 1) + x
-        return at(p.per_solid_angle, y) * (at(p.columns, place + 1) - at(p.columns, place))
+        return _density(p, _patch(p, d)[0])
+
+    @classmethod
+    def met(cls, p: Row, d: Float[Array, "3"]) -> tuple[Float[Array, "3"], Float[Array, ""]]:
+        patch, inside = _patch(p, d)
+        return _radiance(p, patch, inside), _density(p, patch)
+
+
+def _radiance(p: Row, patch: Int[Array, "2"], inside: Float[Array, "2"]) -> Float[Array, "3"]:
+    (y, x), (below, beside) = patch, inside
+    width = _size(p)[1]
+
+    def texel(y, x):
+        first = 3 * (y * width + x)
+        return jnp.stack([at(p.texels, first + channel) for channel in range(3)])
+
+    following = jnp.where(x + 1 < width, x + 1, 0)
+    upper = texel(y, x) * (1 - beside) + texel(y, following) * beside
+    lower = texel(y + 1, x) * (1 - beside) + texel(y + 1, following) * beside
+    radiance = upper * (1 - below) + lower * below
+    if (nudge := p.nudge("texels")) is not None:
+        radiance = radiance + nudge
+    return radiance * p.scale
+
+
+def _density(p: Row, patch: Int[Array, "2"]) -> Float[Array, ""]:
+    y, x = patch
+    place = y * (_size(p)[1] + 1) + x
+    return at(p.per_solid_angle, y) * (at(p.columns, place + 1) - at(p.columns, place))
 
 
 def _size(p: Row) -> tuple[int, int]:
