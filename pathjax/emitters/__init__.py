@@ -316,9 +316,11 @@ def background(
     for place, lights in enumerate(emitters):
         for row in range(lights.count) if issubclass(lights.kind, Background) else ():
             p = lights.parameters(row)
+            if chosen is None or chosen.first[place] is None:
+                radiances.append(lights.kind.emitted(p, d))
+                continue
             radiance, density = lights.kind.met(p, d)
             radiances.append(radiance)
-            if chosen is not None and chosen.first[place] is not None:
-                densities.append(chosen.pdf[chosen.first[place] + row] * density)
+            densities.append(chosen.pdf[chosen.first[place] + row] * density)
     radiance = reduce(jnp.add, radiances) if radiances else jnp.zeros_like(d)
     return radiance, reduce(jnp.add, densities) if densities else jnp.zeros_like(d[0])

@@ -9,13 +9,13 @@ import pytest
 from jax import lax
 
 from pathjax.compile import compute_once, one_by_one, persistent_loop
-from pathjax.compile.lanes import lanes
+from pathjax.compile.lanes import lanes, runs
 
 WIDTH = 5
 TABLE = np.arange(24, dtype=np.float32).reshape(4, 2, 3) ** 1.5
 
 
-def agrees(f, *xs, shared=(TABLE,)):
+def agrees(f, *xs, shared=(TABLE,), width=WIDTH):
     xs = tuple(map(jnp.asarray, xs))
 
     def of(x, *shared):
@@ -23,7 +23,7 @@ def agrees(f, *xs, shared=(TABLE,)):
 
     shared = tuple(map(jnp.asarray, shared))
     expected = jax.vmap(of, in_axes=(0, *(None for _ in shared)))(xs, *shared)
-    found = jax.jit(lanes(of, WIDTH))(xs, *shared)
+    found = jax.jit(lanes(of, width))(xs, *shared)
     assert jax.tree.structure(found) == jax.tree.structure(expected)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6), found, expected)
     jax.tree.map(lambda a, b: np.testing.assert_equal(a.dtype, b.dtype), found, expected)
@@ -91,6 +91,31 @@ def test_branches(vectors, rows):
         return two, many, beyond, shared
 
     agrees(f, vectors[0], rows)
+
+
+def test_branches_of_much_work_are_run_for_the_lanes_that_take_them():
+    """In runs of `runs.WIDTH` lanes: one branch is taken by most of them, one by few and one by none."""
+
+    def much(scale, n):
+        def work(x, k, table):
+            for _ in range(70):
+                x = x * scale + table[0, 0]
+            return lax.fori_loop(0, k if n else 2, lambda _, y: y * 0.9 + 1, x), k + n, x[0] > 0
+
+        return work
+
+    def f(x, k, table):
+        branches = [much(0.5, 0), much(0.3, 1), lambda x, k, table: (much(0.7, 2)(x, k, table)[0], k, k > 2)]
+        made = jax.make_jaxpr(lambda: lax.switch(k, branches, x, k, table))()
+        used.append(runs.pays(width, next(e for e in made.eqns if e.primitive.name == "cond").params["branches"]))
+        both = lax.cond(x[0] > 0.3, lambda: lax.switch(k, branches, x, k, table), lambda: (x, k, x[1] > 0))
+        return lax.switch(k, branches, x, k, table), both
+
+    width, count, used = 3 * runs.WIDTH + 5, 450, []
+    rng = np.random.default_rng(0)
+    x, k = rng.normal(size=(count, 3)).astype(np.float32), rng.choice(3, count, p=[0.95, 0, 0.05])
+    agrees(f, x, k.astype(np.int32), width=width)
+    assert all(used)
 
 
 def test_loops_run_until_their_last_lane_is_done(rows):

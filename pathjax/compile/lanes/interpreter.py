@@ -11,7 +11,7 @@ import numpy as np
 from jax import lax
 
 from pathjax.compile.jax_compat import ClosedJaxpr, Literal, called_program, jaxpr_as_fun, scan_parts, while_parts
-from pathjax.compile.lanes import flags
+from pathjax.compile.lanes import flags, runs
 from pathjax.compile.lanes.columns import (
     as_components,
     components,
@@ -263,6 +263,9 @@ class Interpreter:
         branches = eqn.params["branches"]
         if differs(which):
             which = self.materialize([which])[0].item()
+            if runs.pays(self.width, branches):
+                number = jnp.clip(which.astype(jnp.int32), 0, len(branches) - 1)
+                return runs.in_runs(self, number, branches, operands)
             which = which != 0 if len(branches) == 2 else jnp.clip(which, 0, len(branches) - 1)
             results = [self.run_for(which == k, branch, operands) for k, branch in enumerate(branches)]
             return [self.select(which, *cases) for cases in zip(*results, strict=True)]
