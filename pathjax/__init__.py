@@ -24,6 +24,7 @@ __all__ = [
     "InputError",
     "InputWarning",
     "Jacobian",
+    "NormalEquations",
     "RenderResult",
     "Scene",
     "Target",
@@ -36,6 +37,7 @@ __all__ = [
     "jacobian",
     "load_dict",
     "load_scene",
+    "normal_equations",
     "parameters",
     "read_target",
     "render",
@@ -49,13 +51,13 @@ __all__ = [
 
 
 if TYPE_CHECKING:
-    from pathjax.inverse import Fit, Target, fit, read_target
+    from pathjax.inverse import Fit, NormalEquations, Target, fit, normal_equations, read_target
     from pathjax.rendering.check import GradientCheck, check_gradient
 else:
 
     def __getattr__(name):
         # What needs optimistix or scipy.stats, half a second of imports, is loaded when it is asked for.
-        if name in ("Fit", "Target", "fit", "read_target"):
+        if name in ("Fit", "NormalEquations", "Target", "fit", "normal_equations", "read_target"):
             from pathjax import inverse
 
             return getattr(inverse, name)

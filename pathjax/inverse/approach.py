@@ -20,7 +20,7 @@ def approach(state: State) -> None:
     x = jnp.asarray(vector.unbounded(state.values), state.dtype)
     # In units of the noise at this level; but a start far off is no more than 1 on average, since the first steps of
     # solvers suppose numbers of that size.
-    squares = state.weights * state.evidence.residuals[0] ** 2
+    squares = state.weights * state.normal.residuals[0] ** 2
     shrink = 1 / max(1, float(squares.mean()))
     weights = jnp.asarray(state.weights * shrink)
     arguments = state.groups, weights, jnp.uint32(spp), state.seed, state.next_draw()

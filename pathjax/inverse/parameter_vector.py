@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -46,13 +47,54 @@ class ParameterVector:
             first += size
         return values
 
-    def columns(self, jacobian: Mapping, image_shape: tuple[int, ...]) -> jax.Array:
-        """A Jacobian by name as (*image_shape, n), 0 for names that it lacks."""
+    @property
+    def runs(self) -> list[tuple[bool, int]]:
+        """Of columns one after another, whether they are colours, and how many. A column is a number or a colour."""
+        kinds = itertools.groupby(self.parameters, lambda item: _is_color(item[1]))
+        return [(color, sum(map(_count, (p for _, p in group)))) for color, group in kinds]
+
+    @property
+    def entries(self) -> tuple[np.ndarray, np.ndarray]:
+        """Of n components: the column (n,) that holds them, and the channels (3, n) in which they show, 1 or 0."""
+        columns, seen, first = [], [], 0
+        for color, count in self.runs:
+            here = np.arange(first, first + count)
+            columns.append(np.repeat(here, 3) if color else here)
+            seen.append(np.tile(np.eye(3), count) if color else np.ones((3, count)))
+            first += count
+        return np.concatenate(columns), np.concatenate(seen, 1)
+
+    def columns(self, jacobian: Mapping, image: jax.Array) -> jax.Array:
+        """A Jacobian by name of an image (..., 3) as (..., Q, 3); 0 for names that it lacks.
+
+        Light keeps its channel, so what a channel knows of a colour is one number.
+        """
         parts = []
         for name, p in self.parameters:
-            shape = *image_shape, math.prod(p.shape)
-            parts.append(jacobian[name].reshape(shape) if name in jacobian else jnp.zeros(shape))
-        return jnp.concatenate(parts, axis=-1)
+            by_channel = [jnp.zeros((*image.shape[:-1], _count(p)), image.dtype)] * 3
+            if name in jacobian:
+                J = jacobian[name].reshape(*image.shape, _count(p), *([3] if _is_color(p) else []))
+                by_channel = [J[..., c, :, c] if _is_color(p) else J[..., c, :] for c in range(3)]
+            parts.append(jnp.stack(by_channel, -1))
+        return jnp.concatenate(parts, -2)
+
+    def by_column(self, values: jax.Array) -> jax.Array:
+        """(n,) as (Q, 3): a number is the same in all channels."""
+        parts, first = [], 0
+        for color, count in self.runs:
+            part = values[first : first + count * (3 if color else 1)]
+            parts.append(part.reshape(count, 3) if color else jnp.broadcast_to(part[:, None], (count, 3)))
+            first += len(part)
+        return jnp.concatenate(parts)
+
+    def by_component(self, columns: jax.Array) -> jax.Array:
+        """(..., Q, 3) as (..., n): of a number, the sum over channels."""
+        parts, first = [], 0
+        for color, count in self.runs:
+            part = columns[..., first : first + count, :]
+            parts.append(part.reshape(*part.shape[:-2], -1) if color else part.sum(-1))
+            first += count
+        return jnp.concatenate(parts, -1)
 
     def bounded(self, x):
         """Unbounded (n,) to values: logistic between two bounds; above one, exponential where small, else linear."""
@@ -73,6 +115,15 @@ class ParameterVector:
         """(n,) what counts as a large change: the range between two bounds, else the value itself."""
         low, high = self.bounds.T
         return np.where(np.isfinite(high), high - low, np.maximum(np.abs(values - np.maximum(low, 0)), _EDGE))
+
+
+def _is_color(parameter: Parameter) -> bool:
+    return parameter.shape[-1:] == (3,)
+
+
+def _count(parameter: Parameter) -> int:
+    """Of the colours or numbers of a parameter."""
+    return math.prod(parameter.shape[:-1] if _is_color(parameter) else parameter.shape)
 
 
 def _suffixes(shape: tuple[int, ...]) -> list[str]:

@@ -10,7 +10,6 @@ import numpy as np
 
 from pathjax.errors import InputError
 from pathjax.images.metrics import ROUNDING
-from pathjax.inverse import uncertainty
 from pathjax.inverse.parameter_vector import ParameterVector
 from pathjax.inverse.target import Target
 from pathjax.scene import parameters as named
@@ -69,18 +68,14 @@ class Problem:
         return max(each.film.reach if each.film.shared else 0 for each in self.scenes)
 
     @property
+    def side(self) -> int:
+        """Of squares of pixels whose noise is taken to be independent of each other's."""
+        return 2 * self.reach + 1 if self.reach else 1
+
+    @property
     def alike(self) -> float:
         """Sum of squared correlations of a pixel's noise with that around it."""
         return max(float((film.correlation(each.film) ** 2).sum()) for each in self.scenes)
-
-    def scatter(self, scores: np.ndarray) -> np.ndarray:
-        """(k, k) covariance of the sum of scores (N, k), which are those of `flat` and have the mean 0."""
-        if not self.reach:
-            return scores.T @ scores
-        shapes = [views.targets.shape[:3] for views in self.groups]
-        parts = np.split(scores, np.cumsum([np.prod(shape) for shape in shapes])[:-1])
-        images = [image for part, shape in zip(parts, shapes, strict=True) for image in part.reshape(*shape, -1)]
-        return uncertainty.scatter_of_blocks(images, 2 * self.reach + 1)
 
     @staticmethod
     def with_values(scene: Scene, values) -> Scene:

@@ -49,22 +49,16 @@ def refine(state: State) -> tuple[bool, str]:
 
 def _newton(state: State, spp: int, small: float) -> bool:
     """Steps until one is below `small` standard errors; whether one was."""
-    state.scale = state.vector.scale(state.values)
-    state.solve(state.free)
-    draw, base, z = state.next_draw(), state.values, np.zeros(len(state.values))
+    state.scale, draw = state.vector.scale(state.values), state.next_draw()
     for _ in range(MAX_STEPS):
-        projector = state.solution.projector
-        moved = state.newton_step(z, base, projector, spp, draw)
-        step = np.clip(moved - z, -LARGE_STEP, LARGE_STEP)
-        z = z + step
-        state.values = base + state.scale * z
+        state.evaluate(spp, draw)
         state.solve(state.free)
-        sigma = np.sqrt(np.diag(state.solution.covariance))
+        step = np.clip(state.solution.step, -LARGE_STEP, LARGE_STEP)
+        state.values = state.values + state.scale * step
         # The weighted product of the two renders' residuals: the misfit without their noise.
-        a, b = state.evidence.residuals
-        state.record("refine", spp, float((state.weights * a * b).sum() / 2))
-        same_rank = round(np.trace(projector)) == round(np.trace(state.solution.projector))
-        if same_rank and np.all(np.abs(step) <= small * sigma + np.finfo(state.dtype).eps):
+        state.record("refine", spp, float(state.normal.loss))
+        sigma = np.sqrt(np.diag(state.solution.covariance))
+        if np.all(np.abs(step) <= small * sigma + np.finfo(state.dtype).eps):
             return True
     return False
 
@@ -74,6 +68,7 @@ def _rounding_covariance(state: State) -> np.ndarray:
     problem = state.problem
     if not any(target.step.any() for target in problem.targets):
         return np.zeros_like(state.solution.covariance)
-    jacobian = state.evidence.jacobians.mean(0) * state.weights[..., None] * state.scale
     parts = zip(*weights.target_rounding(state.halves(), problem, state.noise), strict=True)
-    return uncertainty.rounding_covariance(jacobian @ state.solution.inverse, *map(problem.flat, parts))
+    state.evaluate(state.spp, state.next_draw(), uncertainty.rounding_images(*map(problem.flat, parts)))
+    moved = state.solution.inverse @ state.normal.pulled.astype(np.float64)
+    return np.einsum("cik,cjk->ij", moved, moved)

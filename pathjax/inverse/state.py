@@ -9,16 +9,13 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
 
-from pathjax.inverse import losses, uncertainty, weights
+from pathjax.inverse import normal, uncertainty, weights
 from pathjax.inverse.compiled_cache import Stepper, compiled, identity
+from pathjax.inverse.normal import NormalEquations
 from pathjax.inverse.problem import Problem
-from pathjax.inverse.uncertainty import Evidence, Solution
+from pathjax.inverse.uncertainty import Solution
 from pathjax.system.interrupts import Interrupts
-
-# Only its steps are taken; when to end, `refine` decides.
-_NEWTON = optx.Newton(rtol=1e-6, atol=1e-6)
 
 
 class State:
@@ -31,10 +28,11 @@ class State:
         self.spp, self.seed, self.solver = spp, jnp.uint32(seed), solver
         self.progress, self.interrupts = progress, interrupts
         self.dtype = self.groups[0].targets.dtype
+        normal.check_memory(self.vector, self.dtype)
         self.values = problem.start.astype(float)  # (n,)
         self.scale = self.vector.scale(self.values)  # (n,) units of `solution`
         self.free = np.ones(len(self.values), bool)  # (n,) the others are held at a bound
-        self.evidence: Evidence | None = None
+        self.normal: NormalEquations | None = None  # of the last two renders, in units of `scale`
         self.noise: weights.Noise | None = None
         count = sum(views.targets.size for views in self.groups) // 3
         self.weights = np.ones((count, 3), self.dtype)  # (N, 3) 1/variance; 0: left out
@@ -48,23 +46,24 @@ class State:
         self.draws += 1
         return jnp.uint32(self.draws)
 
-    def program(self, loss: Callable, *arguments, solver=None):
-        """A function of `losses` compiled for these arguments; if a solver is given, as `Stepper` of it."""
-        function = partial(loss, vector=self.vector)
+    def program(self, function: Callable, *arguments, solver=None, **static):
+        """A function of the vector compiled for these arguments; if a solver is given, as `Stepper` of it."""
+        key = function, identity(solver), self.vector, *static.items()
+        function = partial(function, vector=self.vector, **static)
         make = partial(Stepper, solver, function) if solver else lambda *a: jax.jit(function).lower(*a).compile()
-        program, seconds = compiled((loss, identity(solver), self.vector), make, *arguments)
+        program, seconds = compiled(key, make, *arguments)
         self.compile_seconds += seconds
         return program
 
-    def newton_step(self, z, base, projector, spp: int, draw) -> np.ndarray:
-        """Where Newton's method goes from z (n,), in units of the scale from `base`; leaves the evidence at z."""
-        arrays = (jnp.asarray(a, self.dtype) for a in (z, base, self.scale, projector, self.weights))
-        z, base, scale, projector, w = arrays
-        arguments = base, scale, projector, self.groups, w, jnp.uint32(spp), self.seed, draw
-        program = self.program(losses.score, z, arguments, solver=_NEWTON)
-        moved, _, evidence, _ = program.step(z, program.begin(z, arguments), arguments)
-        self.evidence = jax.tree.map(np.asarray, evidence)
-        return np.asarray(moved, float)
+    def evaluate(self, spp: int, draw, images: np.ndarray | None = None) -> None:
+        """Find the normal equations of two renders at the values. images: (N, 3, K) of `normal.sums`."""
+        if images is None and any(target.step.any() for target in self.problem.targets):
+            images = np.zeros((*self.weights.shape, uncertainty.ROUNDING_IMAGES))  # so that there is one program
+        arrays = (jnp.asarray(a, self.dtype) for a in (self.values, self.scale, self.weights))
+        images = None if images is None else jnp.asarray(images, self.dtype)
+        arguments = self.groups, *arrays, jnp.uint32(spp), self.seed, draw, images
+        program = self.program(normal.sums, *arguments, side=self.problem.side)
+        self.normal = jax.tree.map(np.asarray, program(*arguments))
 
     def weigh(self, spp: int, refining: bool = False) -> None:
         """Weights from the noise of renders of `spp` samples at the current values, and of the target's rounding.
@@ -73,8 +72,7 @@ class State:
         noise may have clipped.
         """
         self.scale = self.vector.scale(self.values)
-        nowhere = np.zeros((len(self.values),) * 2)
-        self.newton_step(np.zeros(len(self.values)), self.values, nowhere, weights.NOISE_SPP, self.next_draw())
+        self.evaluate(weights.NOISE_SPP, self.next_draw())
         halves, problem = self.halves(), self.problem
         self.noise = weights.noise(halves, problem, spp)
         usable = [target.usable for target in problem.targets]
@@ -85,11 +83,11 @@ class State:
         self.weights = problem.flat(by_view).astype(self.dtype)
 
     def solve(self, free: np.ndarray) -> None:
-        self.solution = uncertainty.solve(self.evidence, self.weights, self.scale, free, self.problem.scatter)
+        self.solution = uncertainty.solve(self.normal, free)
 
     def halves(self) -> weights.Halves:
         """Residuals of the two renders, (H, W, 3) each, of each view."""
-        return list(zip(*map(self.problem.by_view, self.evidence.residuals), strict=True))
+        return list(zip(*map(self.problem.by_view, self.normal.residuals), strict=True))
 
     def structure(self) -> tuple[float, bool]:
         """How well neighbouring residuals agree, and whether that is more than chance."""

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from scipy import ndimage
+
+from pathjax.inverse.normal import NormalEquations
 
 # A direction counts as determined if its curvature stands this many standard errors above 0 ...
 MIN_SIGNIFICANCE = 4
@@ -21,26 +21,8 @@ NAMED_SHARE, TOUCHED_SHARE = 0.2, 0.03
 STRUCTURE_SIGNIFICANCE, STRUCTURE_CLIP, STRUCTURE_WINDOW = 5, 5, 7
 # Neighbours are all within two pixels: a misfit is smooth, and most pairs tell most. Each pair once.
 STRUCTURE_PAIRS = [(down, right) for down in range(3) for right in range(-2, 3) if (down, right) > (0, 0)]
-# Terms of the series of a rounding error; what is left out is 7 % of its variance.
-ROUNDING_TERMS = 8
-
-
-class Evidence(NamedTuple):
-    """Two independent renders A, B of N pixels; of JAX or NumPy arrays."""
-
-    residuals: jax.Array  # (2, N, 3) image - target
-    jacobians: jax.Array  # (2, N, 3, n)
-
-    def scores(self, weights, xp=jnp):
-        """(N, n) of each pixel; their mean is 0 at the truth, whatever the noise. weights: (N, 3) 1/variance."""
-        (a, b), (ja, jb) = self.residuals, self.jacobians
-        return (xp.einsum("pci,pc->pi", ja, weights * b) + xp.einsum("pci,pc->pi", jb, weights * a)) / 2
-
-    def matrix(self, weights, xp=jnp):
-        """(n, n) Gauss-Newton matrix, unbiased, symmetric; may be indefinite."""
-        a, b = self.jacobians
-        product = xp.einsum("pci,pcj->ij", a, b * weights[..., None])
-        return (product + product.T) / 2
+# Sines and cosines of the series of a rounding error; what is left out is 7 % of its variance.
+ROUNDING_IMAGES = 16
 
 
 class Solution(NamedTuple):
@@ -53,71 +35,57 @@ class Solution(NamedTuple):
     inverse: np.ndarray  # (n, n) of the curvature, within what is determined
 
 
-def solve(evidence: Evidence, weights, scale, free, scatter=None) -> Solution:
+def solve(normal: NormalEquations, free: np.ndarray) -> Solution:
     """Eigenvectors of the curvature, those kept that noise cannot have made, and the sandwich covariance on them.
 
     Args:
-        weights: (N, 3); scale: (n,) units of the components; free: (n,) bool, the others stay where they are.
-        scatter: (N, k) deviations of the scores -> (k, k) covariance of their sum; None: pixels are independent.
+        normal: in units of the scale. free: (n,) bool, the others stay where they are.
     """
-    weights = np.asarray(weights, np.float64)
-    jacobians = np.asarray(evidence.jacobians, np.float64)[..., free] * scale[free]
-    evidence = Evidence(np.asarray(evidence.residuals, np.float64), jacobians)
-    curvature, vectors = np.linalg.eigh(evidence.matrix(weights, np))
-    a, b = jacobians @ vectors
-    by_pixel = np.einsum("pci,pci,pc->pi", a, b, weights)
-    noise = by_pixel.std(0) * np.sqrt(len(by_pixel))
-    # Columns that are the same up to the rounding of float32 leave a curvature of its square.
-    rounding = curvature.max(initial=0) * (10 * np.finfo(np.float32).eps) ** 2
+    matrices = np.asarray(normal.matrices, np.float64)[:, free][:, :, free]
+    matrix, groups = matrices.sum(0), len(matrices)
+    curvature, vectors = np.linalg.eigh(matrix)
+    by_group = np.einsum("gik,ik->gk", matrices @ vectors, vectors)
+    noise = by_group.std(0, ddof=min(1, groups - 1)) * np.sqrt(groups)
+    # What sums in the scene's numbers leave of a curvature that is 0.
+    size = np.abs(vectors).T @ np.sqrt(np.abs(np.diag(matrix)))
+    rounding = 10 * np.finfo(normal.matrices.dtype).eps * size**2
     significant = curvature > np.maximum(MIN_SIGNIFICANCE * noise, rounding)
     # The scatter of pixels is that of the score, with target, renders and Jacobians (White 1980).
-    along = evidence.scores(weights, np) @ vectors
-    spread = along - along.mean(0)
+    along = np.asarray(normal.gradient, np.float64)[free] @ vectors
+    scatter = vectors.T @ np.asarray(normal.scatter, np.float64)[np.ix_(free, free)] @ vectors
     inverse = np.where(significant, 1 / np.where(significant, curvature, 1), 0)
-    covariance = inverse[:, None] * (spread.T @ spread if scatter is None else scatter(spread)) * inverse
+    covariance = _not_negative(inverse[:, None] * scatter * inverse)
     kept = significant & (np.sqrt(np.diag(covariance)) < MAX_RELATIVE_ERROR)
 
     everywhere = np.zeros((len(free), len(vectors)))
     everywhere[free] = vectors
     inside = everywhere[:, kept]
     covariance = inside @ covariance[np.ix_(kept, kept)] @ inside.T
-    step = -inside @ (inverse * along.sum(0))[kept]
+    step = -inside @ (inverse * along)[kept]
     inverse = (inside * inverse[kept]) @ inside.T
     return Solution(inside @ inside.T, covariance, everywhere[:, ~kept], step, inverse)
 
 
-def scatter_of_blocks(images: list[np.ndarray], side: int) -> np.ndarray:
-    """(k, k) covariance of the sum of images (H, W, k) whose pixels are correlated as far as some part of `side`.
-
-    That of sums over blocks, in all places (Bartlett's window; Conley 1999, J. Econometrics 92): it counts pairs of
-    pixels at the distance d by 1 - |d_x| / side and 1 - |d_y| / side, so it is never negative.
-    """
-    total = 0
-    for image in images:
-        sums = np.cumsum(np.cumsum(np.pad(image, [(side, side - 1)] * 2 + [(0, 0)]), 0), 1)
-        blocks = sums[side:, side:] - sums[:-side, side:] - sums[side:, :-side] + sums[:-side, :-side]
-        blocks = blocks.reshape(-1, image.shape[-1])
-        total = total + blocks.T @ blocks / side**2
-    return total
+def _not_negative(covariance: np.ndarray) -> np.ndarray:
+    """Without what rounding leaves of variances that are 0."""
+    variances, vectors = np.linalg.eigh(covariance)
+    return vectors * np.maximum(variances, 0) @ vectors.T
 
 
-def rounding_covariance(influence, step, phase, noise) -> np.ndarray:
-    """(n, n) covariance that the rounding of a target adds where its noise does not hide it.
+def rounding_images(step, phase, noise) -> np.ndarray:
+    """(N, 3, ROUNDING_IMAGES) uncorrelated parts of the error of a rounded target, where its noise does not hide it.
 
     Pixels of nearly equal values are rounded alike, so that their errors do not average out as scatter over pixels has
     it. The error of rounding x is a series of sines in 2 pi k x / step, damped by noise. If what all pixels have in
     common is uniform over a step, its terms are uncorrelated (Widrow and Kollar, Quantization Noise, 2008).
 
     Args:
-        influence: (N, 3, n) of each value of the target on the answer.
         step: (N, 3); phase: (N, 3) image / step, up to whole numbers; noise: (N, 3) standard deviation / step.
     """
-    total = np.zeros((influence.shape[-1],) * 2)
-    for k in range(1, ROUNDING_TERMS + 1):
-        term = step * np.exp(2j * np.pi * k * phase - 2 * (np.pi * k * noise) ** 2)
-        sums = np.einsum("pci,pc->ci", influence, term)
-        total += np.einsum("ci,cj->ij", sums, sums.conj()).real / (2 * (np.pi * k) ** 2)
-    return total
+    k = np.arange(1, ROUNDING_IMAGES // 2 + 1)
+    terms = np.exp(2j * np.pi * k * phase[..., None] - 2 * (np.pi * k * noise[..., None]) ** 2)
+    terms *= step[..., None] / (np.sqrt(2) * np.pi * k)
+    return np.concatenate([terms.real, terms.imag], -1)
 
 
 def deviation(values) -> float:

@@ -66,9 +66,25 @@ def test_values_at_a_bound_can_be_left():
 
 @pytest.mark.parametrize("missing", ["paint.reflectance", "glass.int_ior"])
 def test_names_that_a_view_lacks_have_columns_of_zeros(missing):
-    shape = (2, 3, 3)
-    jacobian = {name: np.ones((*shape, *np.shape(v))) for name, v in VALUES.items() if name != missing}
-    columns = np.asarray(BOTH.columns(jacobian, shape))
-    assert columns.shape == (*shape, 7)
-    zero = [label.startswith(missing) for label in BOTH.labels]
-    np.testing.assert_array_equal(columns, np.broadcast_to(np.where(zero, 0, 1), columns.shape))
+    image = np.zeros((2, 3, 3))
+    jacobian = {name: np.ones((*image.shape, *np.shape(v))) for name, v in VALUES.items() if name != missing}
+    columns = np.asarray(BOTH.columns(jacobian, image))
+    assert columns.shape == (2, 3, 3, 3)
+    zero = np.array([name == missing for name in VALUES])
+    np.testing.assert_array_equal(columns, np.broadcast_to(np.where(zero, 0.0, 1.0)[:, None], columns.shape))
+
+
+def test_columns_are_colours_by_channel_and_numbers():
+    """Between themselves and the components that they hold, and as a Jacobian of images."""
+    column, seen = BOTH.entries
+    assert column.tolist() == [0, 0, 0, 1, 2, 2, 2]
+    np.testing.assert_array_equal(seen.T, [*np.eye(3), np.ones(3), *np.eye(3)])
+    x = np.arange(1.0, 8.0)
+    by_column = np.asarray(BOTH.by_column(x))
+    np.testing.assert_array_equal(by_column, [[1, 2, 3], [4, 4, 4], [5, 6, 7]])
+    np.testing.assert_array_equal(BOTH.by_component(by_column), x * [1, 1, 1, 3, 1, 1, 1])
+    rng = np.random.default_rng(0)
+    slopes = {name: rng.normal(size=(2, 3)) for name in VALUES}
+    jacobian = {n: slope[..., None] * np.eye(3) if np.shape(VALUES[n]) else slope for n, slope in slopes.items()}
+    expected = np.stack(list(slopes.values()), 1)
+    np.testing.assert_allclose(BOTH.columns(jacobian, np.zeros((2, 3))), expected, rtol=1e-6)

@@ -1,14 +1,33 @@
 """The statistics of a fit on linear problems that are known: bias, covariance, what is not determined, structure."""
 
+from typing import NamedTuple
+
 import numpy as np
 import pytest
 
 from pathjax.inverse import uncertainty
-from pathjax.inverse.uncertainty import Evidence
+from pathjax.inverse.normal import NormalEquations
 
 N, TRUTH = 2000, np.array([0.3, -0.2, 0.5])
 FREE = np.ones(3, bool)
-WEIGHTS = np.ones((N, 3))
+
+
+class Evidence(NamedTuple):
+    """Two independent renders of N pixels."""
+
+    residuals: np.ndarray  # (2, N, 3)
+    jacobians: np.ndarray  # (2, N, 3, n)
+
+    def solve(self, free=FREE):
+        (ra, rb), (Ja, Jb) = self
+        scores = (np.einsum("pci,pc->pi", Ja, rb) + np.einsum("pci,pc->pi", Jb, ra)) / 2
+        groups = [np.einsum("pci,pcj->ij", Ja[k::32], Jb[k::32]) for k in range(32)]
+        matrices = np.array([(matrix + matrix.T) / 2 for matrix in groups])
+        spread = scores - scores.mean(0)
+        gradient, loss, scatter = scores.sum(0), (ra * rb).sum() / 2, spread.T @ spread
+        return uncertainty.solve(
+            NormalEquations(matrices.sum(0), gradient, loss, scatter, matrices, self.residuals, None, ("abc",)), free
+        )
 
 
 def evidence(rng, truth=TRUTH, at=None, jacobian_noise=0.5, render_noise=0.5, target_noise=0.3):
@@ -27,7 +46,7 @@ def evidence(rng, truth=TRUTH, at=None, jacobian_noise=0.5, render_noise=0.5, ta
 def test_steps_are_unbiased_and_scatter_as_stated():
     """At the truth, where a fit ends. 400 steps: the mean is known to 1/20 of a standard error, a variance to 7 %."""
     rng = np.random.default_rng(0)
-    solutions = [uncertainty.solve(evidence(rng, at=TRUTH), WEIGHTS, np.ones(3), FREE) for _ in range(400)]
+    solutions = [evidence(rng, at=TRUTH).solve() for _ in range(400)]
     z = np.array([s.step / np.sqrt(np.diag(s.covariance)) for s in solutions])
     assert np.abs(z.mean(0)).max() < 4 / np.sqrt(400)
     assert (np.abs(z.var(0) - 1) < 4 * np.sqrt(2 / 400)).all()
@@ -36,7 +55,7 @@ def test_steps_are_unbiased_and_scatter_as_stated():
 def test_steps_from_afar_are_not_too_short():
     """One noisy Jacobian J makes J'J too large: here by a quarter, and the step by a fifth too short."""
     rng = np.random.default_rng(0)
-    steps = np.array([uncertainty.solve(evidence(rng), WEIGHTS, np.ones(3), FREE).step for _ in range(100)])
+    steps = np.array([evidence(rng).solve().step for _ in range(100)])
     error = steps.std(0) / np.sqrt(len(steps))
     assert (np.abs(steps.mean(0) - TRUTH) < 4 * error + 1e-3).all()
 
@@ -45,7 +64,7 @@ def test_a_parameter_without_influence_is_not_determined():
     rng = np.random.default_rng(2)
     e = evidence(rng)
     e.jacobians[..., 1] = 0
-    solution = uncertainty.solve(e, WEIGHTS, np.ones(3), FREE)
+    solution = e.solve()
     assert solution.undetermined.shape == (3, 1)
     np.testing.assert_allclose(np.abs(solution.undetermined[:, 0]), [0, 1, 0], atol=1e-9)
     assert solution.step[1] == pytest.approx(0, abs=1e-12)
@@ -56,7 +75,7 @@ def test_a_parameter_that_is_noise_alone_is_not_determined():
     rng = np.random.default_rng(3)
     e = evidence(rng)
     e.jacobians[..., 1] = rng.normal(size=e.jacobians.shape[:-1])
-    solution = uncertainty.solve(e, WEIGHTS, np.ones(3), FREE)
+    solution = e.solve()
     assert solution.undetermined.shape == (3, 1)
     assert abs(solution.undetermined[1, 0]) > 0.99
 
@@ -65,7 +84,7 @@ def test_only_the_combination_of_two_is_determined():
     rng = np.random.default_rng(4)
     e = evidence(rng)
     e.jacobians[..., 1] = 2 * e.jacobians[..., 0]
-    solution = uncertainty.solve(e, WEIGHTS, np.ones(3), FREE)
+    solution = e.solve()
     assert solution.undetermined.shape == (3, 1)
     direction = solution.undetermined[:, 0] / solution.undetermined[1, 0]
     np.testing.assert_allclose(direction, [-2, 1, 0], atol=1e-6)
@@ -74,13 +93,13 @@ def test_only_the_combination_of_two_is_determined():
 
 def test_components_that_are_not_free_stay():
     free = np.array([True, False, True])
-    solution = uncertainty.solve(evidence(np.random.default_rng(5)), WEIGHTS, np.ones(3), free)
+    solution = evidence(np.random.default_rng(5)).solve(free)
     assert solution.step[1] == 0 and not solution.undetermined.size
     np.testing.assert_array_equal(solution.projector[1], 0)
 
 
 def test_where_nothing_is_free_nothing_moves():
-    solution = uncertainty.solve(evidence(np.random.default_rng(5)), WEIGHTS, np.ones(3), np.zeros(3, bool))
+    solution = evidence(np.random.default_rng(5)).solve(np.zeros(3, bool))
     assert not solution.step.any() and not solution.covariance.any()
 
 
@@ -101,7 +120,8 @@ def test_errors_of_rounding_are_as_stated(pattern, noise):
         target = np.rint(exact + noise * rng.normal(size=400))
         scatter = (target - exact).var() / 400
         phase, sd = (exact - target)[:, None], np.full((400, 1), noise)
-        common = uncertainty.rounding_covariance(influence, np.ones((400, 1)), phase, sd)[0, 0]
+        parts = uncertainty.rounding_images(np.ones((400, 1)), phase, sd)
+        common = (np.einsum("pci,pck->cik", influence, parts) ** 2).sum()
         z.append((target - exact).mean() / np.sqrt(scatter + common))
     assert 0.3 < np.mean(np.square(z)) < 1.3
 
@@ -180,29 +200,6 @@ def shared_noise(rng, size=48):
     for axis in (0, 1):
         noise = np.apply_along_axis(np.convolve, axis, noise, SHARED, "valid")
     return noise / (SHARED**2).sum()
-
-
-def test_the_scatter_of_blocks_counts_pairs_by_their_distance():
-    image, side = np.random.default_rng(1).normal(size=(9, 12, 2)), 3
-    expected = np.zeros((2, 2))
-    for down, right in np.ndindex(5, 5):
-        down, right = down - 2, right - 2
-        one = image[max(down, 0) : 9 + min(down, 0), max(right, 0) : 12 + min(right, 0)].reshape(-1, 2)
-        other = image[max(-down, 0) : 9 + min(-down, 0), max(-right, 0) : 12 + min(-right, 0)].reshape(-1, 2)
-        expected += (1 - abs(down) / side) * (1 - abs(right) / side) * one.T @ other
-    np.testing.assert_allclose(uncertainty.scatter_of_blocks([image], side), expected, atol=1e-12)
-    independent = image.reshape(-1, 2)
-    np.testing.assert_allclose(uncertainty.scatter_of_blocks([image], 1), independent.T @ independent, atol=1e-12)
-
-
-def test_blocks_know_the_scatter_of_pixels_that_share_samples():
-    """Within 15 %, twice what 300 sums tell; taken for independent, it would be 0.41 of what it is."""
-    rng = np.random.default_rng(2)
-    noise = [shared_noise(rng) for _ in range(100)]
-    truth = np.mean([image.sum((0, 1)) ** 2 for image in noise])
-    found = np.mean([np.diag(uncertainty.scatter_of_blocks([image], 9)) for image in noise])
-    assert 0.85 < found / truth < 1.15
-    assert np.mean([(image**2).sum((0, 1)) for image in noise]) < 0.55 * truth
 
 
 def test_shared_samples_are_no_structure():

@@ -1,0 +1,265 @@
+"""Normal equations of least squares: what all pixels together say of some numbers, without a Jacobian of the image.
+
+With residuals r = image - target and weights W of the pixels' channels, two independent renders A and B give
+
+    loss = r_A' W r_B / 2,    gradient = (J_A' W r_B + J_B' W r_A) / 2,    matrix = (J_A' W J_B + J_B' W J_A) / 2,
+
+whose means are those of an image and a Jacobian without noise. Pixels are taken in chunks: the kernel gives the rows
+of J of a chunk, which are multiplied and added up at once. Light keeps its channel on the way, so a row of J in one
+channel knows of the same channel of colours alone: it has one entry for each colour, and one for each number.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float, Int, Real
+
+from pathjax.compile import usual_promotion
+from pathjax.derivatives.jacobian import pixel_jacobians
+from pathjax.errors import InputError
+from pathjax.integrators.options import Counts, Options, check_counts
+from pathjax.inverse import problem
+from pathjax.inverse.parameter_vector import ParameterVector
+from pathjax.inverse.problem import Views
+from pathjax.inverse.target import Target
+from pathjax.scene import parameters as named
+from pathjax.scene.scene import Scene
+from pathjax.system import memory
+
+# The matrix is summed up in so many groups of pixels, whose differences tell its noise to 13 %.
+GROUPS = 32
+# Of the rows of J of one chunk.
+CHUNK_BYTES = 1 << 25
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True, eq=False)
+class NormalEquations:
+    """What images say of P numbers, near the values that these have.
+
+    Attributes:
+        matrix: (P, P) of Gauss and Newton; unbiased, so it may be indefinite.
+        gradient: (P,) of the loss.
+        loss: (), half the weighted square of the misfit; unbiased, so it may be negative.
+        scatter: (P, P) covariance of the gradient, from its scatter over pixels.
+        matrices: (G, P, P) of groups of pixels chosen by chance, whose sum is `matrix`: their scatter is its noise.
+        residuals: (2, N, 3) image - target of the two renders, of the pixels of all views.
+        pulled: (3, P, K), by channel J' W times K images, if some were given.
+        components: names of the P numbers: `white.reflectance.r`.
+    """
+
+    matrix: jax.Array
+    gradient: jax.Array
+    loss: jax.Array
+    scatter: jax.Array
+    matrices: jax.Array
+    residuals: jax.Array
+    pulled: jax.Array | None
+    components: tuple[str, ...] = field(metadata={"static": True})
+
+
+@usual_promotion
+def normal_equations(
+    scene: Scene | Sequence[Scene],
+    names: Sequence[str],
+    target: Target | Real[ArrayLike, "H W 3"] | Sequence,
+    weights: Real[ArrayLike, "#H #W #3"] | Sequence | None = None,
+    spp: int = 64,
+    seed: int = 0,
+) -> NormalEquations:
+    """What least squares needs of images that should look like targets, without the Jacobian of the images.
+
+    A step to where they look more alike is -matrix^-1 gradient, and matrix^-1 scatter matrix^-1 is the covariance of
+    what such steps arrive at.
+
+    Args:
+        scene: a scene, or a list of views, which share parameters by name.
+        names: of parameters, as `parameters` lists them.
+        target: linear RGB or a `Target`; or a list of them, one for each view.
+        weights: of the values of the target, 1/variance; or a list of them; None: 1. Values that are clipped or not
+            measured weigh nothing.
+        spp: samples per pixel of each of the two renders.
+        seed: other seeds give independent numbers; the same seed gives the same, bit for bit, on any number of CPU
+            devices.
+    Raises:
+        InputError: as for `fit`; weights that are negative, not finite or nothing but 0; more numbers than fit into
+            memory.
+    Pixels share no samples here, and noise of targets that share some, under a wide filter, is scattered by blocks.
+    """
+    check_counts(spp, seed)
+    views = problem.build(scene, target, names, {})
+    given = [weights] * len(views.scenes) if weights is None or isinstance(scene, Scene) else list(weights)
+    if len(given) != len(views.scenes):
+        raise InputError(f"{len(views.scenes)} scenes and weights of {len(given)}; give one for each scene, or None")
+    by_view = [_weights(w, target) for w, target in zip(given, views.targets, strict=True)]
+    if not any(w.any() for w in by_view):
+        raise InputError("no pixel has a weight: all weights are 0, or the target is clipped or not measured there")
+    dtype = views.groups[0].targets.dtype
+    check_memory(views.vector, dtype)
+    flat = jnp.asarray(views.flat(by_view) / views.exposure**2, dtype)
+    values = jnp.asarray(views.start, dtype)
+    numbers = (jnp.uint32(x) for x in (spp, seed, 0))
+    found = _compiled(views.groups, values, jnp.ones_like(values), flat, *numbers, vector=views.vector, side=views.side)
+    return replace(found, residuals=found.residuals / views.exposure)
+
+
+def _weights(weights, target: Target) -> np.ndarray:
+    try:
+        weights = np.broadcast_to(np.asarray(1.0 if weights is None else weights, np.float64), target.image.shape)
+    except ValueError:
+        given = np.shape(weights)
+        raise InputError(f"weights have the shape {given}; those of their target are {target.image.shape}") from None
+    if not (np.isfinite(weights) & (weights >= 0)).all():
+        raise InputError("weights must be finite and not negative; give 0 where a value is not to be used")
+    return np.where(target.usable, weights, 0)
+
+
+def check_memory(vector: ParameterVector, dtype) -> None:
+    """Raises InputError: the matrices of so many numbers do not fit into memory."""
+    count = len(vector.labels)
+    # Of groups by channel and by component, each with a copy; and what solving takes, in float64.
+    needed = 4 * GROUPS * count**2 * np.dtype(dtype).itemsize + 8 * count**2 * 8 + 6 * CHUNK_BYTES
+    memory.check(needed, f"the normal equations of {count} numbers", "name fewer parameters")
+
+
+def sums(
+    groups: Sequence[Views],
+    values: Float[Array, " P"],
+    scale: Float[Array, " P"],
+    weights: Float[Array, "N 3"],
+    spp: Counts,
+    seed: Counts,
+    draw: Counts,
+    images: Float[Array, "N 3 K"] | None = None,
+    *,
+    vector: ParameterVector,
+    side: int = 1,
+    halves: int = 2,
+    devices: int | None = None,
+) -> NormalEquations:
+    """The normal equations of some views, in units of `scale` of the numbers.
+
+    Args:
+        weights: of all pixels, in the order of `Problem.flat`; so are `images`, for `NormalEquations.pulled`.
+        spp: of each render. seed, draw: of `Views.seeds`.
+        side: of squares of pixels beyond which the noise of a target is independent.
+        halves: 2, or 1: a single render, whose noise is in all that is quadratic.
+        devices: of `native_map`; sums are bitwise the same for every number of them.
+    """
+    by_name, by_column = vector.unpack(values), vector.by_column(scale)
+    parts, first = [], 0
+    for views in groups:
+        here = slice(first, first + views.targets.size // 3)
+        first = here.stop
+        shape = views.targets.shape
+        given = [views.targets, weights[here].reshape(shape)]
+        given += [] if images is None else [images[here].reshape(*shape, -1)]
+        seeds = jnp.stack([views.seeds(seed, draw, half) for half in range(halves)])
+        rows = partial(_rows, views, by_name, vector, by_column, spp, seeds, devices)
+        parts.append(_of_views(rows, given, vector, side, halves))
+    residuals, totals = zip(*parts, strict=True)
+    total = jax.tree.map(lambda *x: sum(x[1:], x[0]), *totals)
+    column, seen = vector.entries
+    matrices = sum(total["matrices"][:, c, column][..., column] * np.outer(seen[c], seen[c]) for c in range(3))
+    matrices = (matrices + matrices.swapaxes(1, 2)) / 2
+    gradient = total["gradient"]
+    scatter = total["squares"] - jnp.outer(gradient, gradient) / total["blocks"]
+    pulled = None if images is None else total["pulled"][:, column] * seen[..., None]
+    residuals = jnp.concatenate(residuals, axis=1)
+    labels = tuple(vector.labels)
+    return NormalEquations(matrices.sum(0), gradient, total["loss"], scatter, matrices, residuals, pulled, labels)
+
+
+def _rows(views: Views, by_name, vector, scale, spp, seeds, devices, pixels, there):
+    """Images (R, V, n, 3) and rows of J (R, V, n, Q, 3) of n pixels, for seeds (R, V)."""
+    counts = jnp.where(there, spp, 1)
+
+    def of_view(scene, seed):
+        scene = named.attached(views.with_values(scene, by_name))
+        wanted = {name: named.find(scene, name) for name in views.names}
+        work = wanted, pixels, 0, counts, seed, Options()
+        image, J, *_ = pixel_jacobians(named.nameless(scene), *work, devices=devices)
+        return image * views.exposure, vector.columns(J, image) * (scale * views.exposure)
+
+    return jax.vmap(partial(views.map, of_view))(seeds)
+
+
+def _of_views(
+    rows: Callable, given: list[Float[Array, "V H W ..."]], vector: ParameterVector, side: int, halves: int
+) -> tuple[Float[Array, "R N 3"], dict]:
+    """Residuals of the N pixels of views of one size, and sums over them.
+
+    rows: (pixels (n,), bool (n,), False where the row does not matter) -> images and rows of J.
+    given: target, weights, and images if any, of each view.
+    """
+    views, height, width, *_ = given[0].shape
+    given = [x.reshape(views, height * width, *x.shape[3:]) for x in given]
+    dtype, (column, _) = given[0].dtype, vector.entries
+    columns, components = int(column[-1]) + 1, len(column)
+    chunks, blocks = _chunks(height, width, side, 3 * columns * dtype.itemsize * halves * views)
+    product = partial(jnp.einsum, precision=lax.Precision.HIGHEST)
+
+    def add(total, pixels):
+        there = pixels.ravel() >= 0
+        each = jnp.maximum(pixels.ravel(), 0)
+        target, w, *images = (x[:, each] for x in given)
+        w = jnp.where(there[:, None], w, 0)
+        # Apart from the kernel, sums are the same program whatever the number of devices.
+        r, J = lax.optimization_barrier(rows(each, there))
+        r = r - target
+        (ra, Ja), (rb, Jb) = (r[0], J[0]), (r[-1], J[-1])
+        scores = (Ja * (w * rb)[..., None, :] + Jb * (w * ra)[..., None, :]) / 2
+        scores = vector.by_component(scores).reshape(-1, pixels.shape[-1], components).sum(1)
+        a, b = (x.reshape(views, *pixels.shape, *x.shape[2:]) for x in (Ja, w[..., None, :] * Jb))
+        sums = {
+            "matrices": product("vbgsqc,vbgsrc->gcqr", a, b),
+            "gradient": scores.sum(0),
+            "squares": product("bi,bj->ij", scores, scores),
+            "loss": (w * ra * rb).sum() / 2,
+        }
+        if images:
+            sums["pulled"] = product("vnqc,vnck->cqk", (Ja + Jb) / 2 * w[..., None, :], images[0])
+        return jax.tree.map(jnp.add, total, sums), r
+
+    shapes = {
+        "matrices": (chunks.shape[2], 3, columns, columns),
+        "gradient": (components,),
+        "squares": (components, components),
+        "loss": (),
+    }
+    if len(given) > 2:
+        shapes["pulled"] = 3, columns, given[2].shape[-1]
+    zeros = {name: jnp.zeros(shape, dtype) for name, shape in shapes.items()}
+    total, residuals = lax.scan(add, zeros, jnp.asarray(chunks))
+    # (chunks, R, V, n, 3), to the order of pixels.
+    place = np.argsort(np.where(chunks < 0, chunks.size, chunks).ravel())[: height * width]
+    residuals = jnp.moveaxis(residuals, 0, 2).reshape(*residuals.shape[1:3], -1, 3)[:, :, place]
+    return residuals.reshape(residuals.shape[0], -1, 3), {**total, "blocks": views * blocks}
+
+
+def _chunks(height: int, width: int, side: int, bytes_of_pixel: int) -> tuple[Int[np.ndarray, "C B G S"], int]:
+    """Pixels of chunks, -1 beyond the image, and the number of blocks: B blocks of S pixels of each of G groups."""
+    down, right = -(-height // side), -(-width // side)
+    pixels = np.full((down * side, right * side), -1, np.int32)
+    pixels[:height, :width] = np.arange(height * width).reshape(height, width)
+    blocks = pixels.reshape(down, side, right, side).swapaxes(1, 2).reshape(-1, side * side)
+    count = len(blocks)
+    # By chance, so that groups differ as pixels do, and chunks cost the same.
+    blocks = blocks[np.random.default_rng(0).permutation(count)]
+    groups = min(GROUPS, count)
+    chunks = -(-count * side**2 * bytes_of_pixel // CHUNK_BYTES)
+    each = -(-count // (chunks * groups))
+    spare = chunks * each * groups - count
+    blocks = np.concatenate([blocks, np.full((spare, side * side), -1, np.int32)])
+    return blocks.reshape(chunks, each, groups, side * side), count
+
+
+_compiled = jax.jit(sums, static_argnames=("vector", "side", "halves", "devices"))

@@ -1,0 +1,187 @@
+"""Normal equations: against the Jacobians that they are made of, for views, weights, blocks, chunks and devices."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import pathjax as pj
+from pathjax.inverse import normal, problem
+from pathjax.system import memory
+
+BODY = """
+<bsdf type="diffuse" id="floor"><rgb name="reflectance" value="0.6, 0.5, 0.2"/></bsdf>
+<bsdf type="roughconductor" id="metal"><float name="alpha" value="0.3"/></bsdf>
+<bsdf type="dielectric" id="glass"/>
+<shape type="rectangle"><transform name="to_world"><scale value="3"/><rotate x="1" angle="-90"/>
+  <translate y="-1"/></transform><ref id="floor"/></shape>
+<shape type="sphere"><point name="center" x="-0.9" y="0" z="0"/><ref id="metal"/></shape>
+<shape type="sphere"><point name="center" x="0.9" y="0" z="0"/><ref id="glass"/></shape>
+<emitter type="constant" id="sky"><rgb name="radiance" value="1, 0.9, 0.8"/></emitter>
+"""
+# A number that moves paths, a colour, a number, a colour.
+NAMES = ["glass.int_ior", "floor.reflectance", "metal.alpha", "sky.radiance"]
+RES, SPP, COUNT = 9, 4, 8
+# Of float32 sums of some hundred numbers, over the largest.
+ROUNDING = 3e-5
+
+
+@pytest.fixture(scope="module")
+def scene(make_scene):
+    return make_scene(BODY, res=RES, depth=3)
+
+
+@pytest.fixture(scope="module")
+def target():
+    return np.random.default_rng(4).uniform(size=(RES, RES, 3))
+
+
+def made_up(scene, wanted, pixels, first, spp, seed, options, devices=None):
+    """Stands for `pixel_jacobians`, whose kernel takes long to compile: noise, and no scene."""
+
+    def noise(number):
+        """(N, 3) from -1 to 1."""
+        which = pixels[:, None] * 3 + jnp.arange(3) + 1000 * number + (seed % 4099).astype(jnp.int32) * 7
+        return jnp.sin(which * which * 0.37)
+
+    J = {}
+    for number, (name, parameter) in enumerate(wanted.items()):
+        slope = noise(1 + number)
+        J[name] = slope[..., None] * jnp.eye(3) if parameter.shape else slope
+    return noise(0), J
+
+
+@pytest.fixture
+def without_kernel(monkeypatch):
+    monkeypatch.setattr(normal, "pixel_jacobians", made_up)
+    jax.clear_caches()
+    yield
+    jax.clear_caches()
+
+
+WEIGHTS = np.random.default_rng(0).uniform(size=(RES, RES, 3))
+
+
+def dense_of(views, target, image_and_jacobian):
+    """Residuals (2, H * W, 3) and Jacobians (2, H * W, 3, P) of the two renders of seed 3."""
+    residuals, jacobians = [], []
+    for half in (0, 1):
+        (seed,) = views.seeds(jnp.uint32(3), jnp.uint32(0), half)
+        image, J = image_and_jacobian(seed)
+        residuals.append(np.reshape(image, (RES * RES, 3)) - target.reshape(-1, 3).astype(float))
+        jacobians.append(np.concatenate([np.reshape(J[name], (RES * RES, 3, -1)) for name in NAMES], -1))
+    return np.array(residuals), np.array(jacobians, float)
+
+
+@pytest.fixture(scope="module")
+def dense(scene, target):
+    views = problem.build(scene, target, NAMES, {}).groups[0]
+    wanted = {name: scene.about.parameters[name] for name in NAMES}
+    return dense_of(views, target, lambda seed: made_up(scene, wanted, jnp.arange(RES * RES), 0, SPP, seed, None))
+
+
+def agree(found, wanted):
+    assert np.shape(found) == np.shape(wanted)
+    np.testing.assert_allclose(found, wanted, rtol=0, atol=ROUNDING * np.abs(wanted).max())
+
+
+def by_pixel(dense, weights):
+    """Scores (N, P) and matrices (N, P, P)."""
+    (ra, rb), (Ja, Jb) = dense
+    scores = (np.einsum("pci,pc->pi", Ja, weights * rb) + np.einsum("pci,pc->pi", Jb, weights * ra)) / 2
+    matrices = np.einsum("pci,pc,pcj->pij", Ja, weights, Jb)
+    return scores, (matrices + matrices.swapaxes(1, 2)) / 2
+
+
+def test_they_are_those_of_the_jacobians(scene, target, dense, without_kernel):
+    check(pj.normal_equations(scene, NAMES, target, WEIGHTS, SPP, seed=3), dense)
+
+
+@pytest.mark.slow
+def test_they_are_those_of_renders(scene, target):
+    views = problem.build(scene, target, NAMES, {}).groups[0]
+    dense = dense_of(views, target, lambda seed: pj.jacobian(scene, NAMES, SPP, seed))
+    check(pj.normal_equations(scene, NAMES, target, WEIGHTS, SPP, seed=3), dense)
+
+
+def check(found, dense):
+    scores, matrices = by_pixel(dense, WEIGHTS.reshape(-1, 3))
+    agree(found.matrix, matrices.sum(0))
+    agree(found.matrices.sum(0), matrices.sum(0))
+    agree(found.gradient, scores.sum(0))
+    agree(found.loss, (WEIGHTS.reshape(-1, 3) * dense[0].prod(0)).sum() / 2)
+    spread = scores - scores.mean(0)
+    agree(found.scatter, spread.T @ spread)
+    agree(found.residuals, dense[0])
+    assert found.components[:3] == ("glass.int_ior", "floor.reflectance.r", "floor.reflectance.g")
+
+
+def arguments(views, extra):
+    ones, numbers = jnp.ones(COUNT), (jnp.uint32(x) for x in (SPP, 3, 0))
+    values, weights = jnp.asarray(views.start, jnp.float32), jnp.ones((RES * RES, 3))
+    return views.groups, values, ones, weights, *numbers, jnp.asarray(extra, jnp.float32)
+
+
+EXTRA = np.random.default_rng(1).normal(size=(RES * RES, 3, 2))
+
+
+def test_blocks_and_chunks_are_summed_up(scene, target, dense, without_kernel, monkeypatch):
+    """Blocks of 2 x 2 pixels, some of them beyond the image, in two chunks."""
+    views = problem.build(scene, target, NAMES, {})
+    monkeypatch.setattr(normal, "CHUNK_BYTES", 2 * 4 * 3 * 4 * 50)
+    assert normal._chunks(RES, RES, 2, 2 * 4 * 3 * 4)[0].shape == (2, 1, 25, 4)
+    found = normal._compiled(*arguments(views, EXTRA), vector=views.vector, side=2)
+    scores, matrices = by_pixel(dense, np.ones((RES * RES, 3)))
+    blocks = np.pad(scores.reshape(RES, RES, COUNT), [(0, 1), (0, 1), (0, 0)]).reshape(5, 2, 5, 2, COUNT).sum((1, 3))
+    spread = blocks.reshape(-1, COUNT) - scores.sum(0) / 25
+    square = float(views.exposure) ** 2
+    agree(found.scatter / square**2, spread.T @ spread)
+    agree(found.matrix / square, matrices.sum(0))
+    agree(found.residuals, dense[0] * views.exposure)
+    agree(found.pulled, np.einsum("pci,pck->cik", dense[1].mean(0), EXTRA) * views.exposure)
+
+
+@pytest.mark.slow
+def test_sums_are_bitwise_the_same_for_every_number_of_devices(scene, target):
+    views = problem.build(scene, target, NAMES, {})
+    one, many = (normal._compiled(*arguments(views, EXTRA), vector=views.vector, devices=n) for n in (1, None))
+    for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(many), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_views_add_up(scene, target, write_scene, without_kernel):
+    """The first view twice, and another of another size."""
+    other = pj.load_scene(write_scene(BODY, res=6, depth=3))
+    names = NAMES[1:]
+    seen = pj.normal_equations([scene, scene], names, [target] * 2, [WEIGHTS, 0 * WEIGHTS], SPP)
+    alone = pj.normal_equations([scene, other], names, [target, np.ones((6, 6, 3))], [WEIGHTS, np.zeros(3)], SPP)
+    agree(seen.gradient, alone.gradient)
+    agree(seen.matrix, alone.matrix)
+    assert seen.residuals.shape == (2, 2 * RES * RES, 3) and alone.residuals.shape == (2, RES * RES + 36, 3)
+
+
+@pytest.mark.parametrize(
+    "weights, words",
+    [
+        (0.0, "no pixel has a weight"),
+        (np.ones((4, 4, 3)), "have the shape"),
+        (-1.0, "not negative"),
+        (np.nan, "finite"),
+    ],
+)
+def test_bad_weights_are_refused(scene, target, weights, words):
+    with pytest.raises(pj.InputError, match=words):
+        pj.normal_equations(scene, NAMES, target, weights)
+
+
+def test_what_is_measured_nowhere_or_weighs_nothing_where_it_is_measured_is_refused(scene, target):
+    half = np.arange(RES)[:, None, None] < 4
+    with pytest.raises(pj.InputError, match="no pixel has a weight"):
+        pj.normal_equations(scene, NAMES, pj.Target(target, measured=half), np.where(half, 0.0, 1.0))
+
+
+def test_more_than_fits_into_memory_is_refused_before_it_is_begun(scene, target, monkeypatch):
+    monkeypatch.setattr(memory, "limit", lambda: 1 << 20)
+    for call in (pj.normal_equations, lambda *args: pj.fit(args[0], args[2], args[1])):
+        with pytest.raises(pj.InputError, match=r"8 numbers take .* GiB of memory.*fewer"):
+            call(scene, NAMES, target)
