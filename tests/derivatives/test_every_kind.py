@@ -1,0 +1,210 @@
+"""Derivatives of images in every parameter of every kind, by `check_gradient`: a scene a kind.
+
+A right derivative fails with the chance 1e-3 each; seeds are fixed.
+"""
+
+import math
+from functools import cache
+
+import numpy as np
+import pytest
+
+import pathjax as pj
+from pathjax import bsdfs, emitters, textures
+
+SEEDS = 16
+# Samples per pixel to begin with, and at most; as many are taken as find an error of this size half of the time.
+SPP, MOST_SPP = 64, 4096
+RESOLUTION = 0.1
+
+# What stands around: its parameters are checked with the kinds that they are of.
+FLOOR = """<shape type="rectangle"><transform name="to_world"><scale value="3"/><rotate x="1" angle="-90"/>
+  <translate y="-1"/></transform><bsdf type="diffuse" id="around-floor"><texture type="checkerboard" name="reflectance">
+  <rgb name="color0" value="0.7, 0.6, 0.5"/><rgb name="color1" value="0.2, 0.3, 0.4"/>
+  <transform name="to_uv"><scale value="3"/></transform></texture></bsdf></shape>"""
+LIGHT = """<shape type="rectangle"><transform name="to_world"><rotate x="1" angle="90"/><translate x="1" y="2.5" z="1"/>
+  </transform><bsdf type="diffuse" id="around-lamp"/><emitter type="area" id="around-light">
+  <rgb name="radiance" value="20, 16, 12"/></emitter></shape>
+  <emitter type="constant" id="around-sky"><rgb name="radiance" value="0.1, 0.15, 0.2"/></emitter>"""
+BALL = '<shape type="sphere"><float name="radius" value="0.9"/>{}</shape>'
+PANE = '<shape type="rectangle"><transform name="to_world"><rotate y="1" angle="25"/></transform>{}</shape>'
+TINTED = '<shape type="ply"><string name="filename" value="meshes/tinted.ply"/>{}</shape>'
+GREY = '<bsdf type="diffuse" id="around-grey"/>'
+GLASS = '<float name="int_ior" value="1.5"/><float name="ext_ior" value="1"/>'
+METAL = '<rgb name="eta" value="0.2, 0.9, 1.1"/><rgb name="k" value="3.9, 2.4, 2.2"/>'
+SPECULAR = '<rgb name="specular_reflectance" value="0.9, 0.7, 0.5"/>'
+TRANSMITTED = '<rgb name="specular_transmittance" value="0.5, 0.7, 0.9"/>'
+GGX = '<string name="distribution" value="ggx"/>'
+PICTURE = """<texture type="bitmap" name="{}"><string name="filename" value="textures/marks.png"/>
+  <boolean name="raw" value="true"/></texture>"""
+
+
+def bsdf(kind, *inside):
+    return f'<bsdf type="{kind}" id="it">{"".join(inside)}</bsdf>'
+
+
+def numbers(**values):
+    return "".join(f'<float name="{name}" value="{value}"/>' for name, value in values.items())
+
+
+def rgb(name, value="0.6, 0.4, 0.7"):
+    return f'<rgb name="{name}" value="{value}"/>'
+
+
+def lit(*emitter):
+    return LIGHT + "".join(emitter) + BALL.format(GREY)
+
+
+def on_ball(*of_bsdf):
+    return LIGHT + BALL.format(bsdf(*of_bsdf))
+
+
+def on_pane(*of_bsdf):
+    return LIGHT + PANE.format(bsdf(*of_bsdf))
+
+
+AIMED = '<transform name="to_world"><lookat origin="1, 2, 3" target="0, 0, 0" up="0, 1, 0"/></transform>'
+SHEEN = numbers(sheen=0.5, sheen_tint=0.4)
+CASES = {
+    "diffuse": on_ball("diffuse", rgb("reflectance")),
+    "conductor": on_ball("conductor", METAL, SPECULAR),
+    "roughconductor": on_ball("roughconductor", METAL, SPECULAR, numbers(alpha=0.3)),
+    "roughconductor, ggx": on_ball("roughconductor", GGX, METAL, numbers(alpha=0.1)),
+    "roughconductor, brushed": on_ball("roughconductor", METAL, numbers(alpha_u=0.4, alpha_v=0.1)),
+    "roughconductor, brushed ggx": on_ball("roughconductor", GGX, METAL, numbers(alpha_u=0.1, alpha_v=0.4)),
+    "dielectric": on_ball("dielectric", GLASS, SPECULAR, TRANSMITTED),
+    "thindielectric": on_pane("thindielectric", GLASS, SPECULAR, TRANSMITTED),
+    "roughdielectric": on_ball("roughdielectric", GLASS, SPECULAR, TRANSMITTED, numbers(alpha=0.3)),
+    "roughdielectric, ggx": on_ball("roughdielectric", GGX, GLASS, numbers(alpha=0.15)),
+    "roughdielectric, brushed": on_pane("roughdielectric", GGX, GLASS, numbers(alpha_u=0.1, alpha_v=0.3)),
+    "plastic": on_ball("plastic", GLASS, SPECULAR, rgb("diffuse_reflectance")),
+    "plastic, nonlinear": on_ball("plastic", '<boolean name="nonlinear" value="true"/>', rgb("diffuse_reflectance")),
+    "roughplastic": on_ball("roughplastic", GLASS, SPECULAR, rgb("diffuse_reflectance"), numbers(alpha=0.2)),
+    "roughplastic, ggx": on_ball("roughplastic", GGX, GLASS, rgb("diffuse_reflectance"), numbers(alpha=0.3)),
+    "null": on_pane("null"),
+    "principled": on_ball(
+        "principled",
+        rgb("base_color"),
+        numbers(roughness=0.4, anisotropic=0.5, metallic=0.4, specular=0.6, spec_tint=0.3, flatness=0.4),
+        SHEEN + numbers(clearcoat=0.8, clearcoat_gloss=0.3),
+    ),
+    "principled, clear": on_ball(
+        "principled", rgb("base_color"), numbers(roughness=0.5, spec_trans=0.7, eta=1.4, metallic=0.2), SHEEN
+    ),
+    "principledthin": on_pane(
+        "principledthin",
+        rgb("base_color"),
+        numbers(roughness=0.5, anisotropic=0.4, spec_trans=0.4, eta=1.4, spec_tint=0.3, flatness=0.3, diff_trans=0.8),
+        SHEEN,
+    ),
+    "twosided": LIGHT + PANE.format(f'<bsdf type="twosided">{bsdf("diffuse", rgb("reflectance"))}</bsdf>'),
+    "blendbsdf": on_ball("blendbsdf", numbers(weight=0.4), GREY, '<bsdf type="roughconductor" id="around-metal"/>'),
+    "mask": on_pane("mask", numbers(opacity=0.4), f'<bsdf type="twosided">{GREY}</bsdf>'),
+    "bumpmap": on_ball(
+        "bumpmap",
+        '<texture type="bitmap"><string name="filename" value="textures/heights.png"/></texture>',
+        bsdf("diffuse", rgb("reflectance")).replace("it", "held"),
+    ),
+    "normalmap": on_ball(
+        "normalmap",
+        '<texture type="bitmap" name="normalmap"><string name="filename" value="textures/normals.png"/>'
+        '<boolean name="raw" value="true"/></texture>',
+        bsdf("roughconductor", METAL, numbers(alpha=0.3)).replace("it", "held"),
+    ),
+    "checkerboard": on_ball(
+        "diffuse", f'<texture type="checkerboard" name="reflectance">{rgb("color0")}{rgb("color1", "0.2")}</texture>'
+    ),
+    "bitmap": on_ball("diffuse", PICTURE.format("reflectance")),
+    "bitmap, in a metal": on_ball("roughconductor", METAL, PICTURE.format("specular_reflectance"), numbers(alpha=0.3)),
+    "bitmap, in a number": on_ball("roughconductor", GGX, METAL, PICTURE.format("alpha")),
+    "bitmap, in a weight": on_ball(
+        "blendbsdf", PICTURE.format("weight"), GREY, bsdf("conductor").replace("it", "held")
+    ),
+    "uniform": on_ball(
+        "diffuse", '<texture type="uniform" name="reflectance"><float name="value" value="0.4"/></texture>'
+    ),
+    "mesh_attribute": LIGHT
+    + TINTED.format(
+        '<bsdf type="diffuse" id="it"><texture type="mesh_attribute" name="reflectance"><string name="name" '
+        'value="vertex_color"/><float name="scale" value="0.8"/></texture></bsdf>'
+    ),
+    "area": BALL.format(GREY)
+    + '<shape type="sphere"><point name="center" value="1, 1, 1"/><float name="radius" value="0.5"/>'
+    f'<bsdf type="diffuse" id="around-lamp"/><emitter type="area" id="it">{rgb("radiance", "4, 3, 2")}</emitter>'
+    "</shape>",
+    "constant": BALL.format(GREY) + f'<emitter type="constant" id="it">{rgb("radiance")}</emitter>',
+    "envmap": BALL.format(GREY) + '<emitter type="envmap" id="it"><string name="filename" value="textures/marks.png"/>'
+    '<float name="scale" value="0.7"/></emitter>',
+    "point": lit(
+        f'<emitter type="point" id="it">{rgb("intensity", "5, 4, 3")}<point name="position" value="0, 2, 1"/></emitter>'
+    ),
+    "spot": lit(f'<emitter type="spot" id="it">{rgb("intensity", "9, 8, 7")}{AIMED}</emitter>'),
+    "directional": lit(f'<emitter type="directional" id="it">{rgb("irradiance")}{AIMED}</emitter>'),
+    "projector": lit(
+        f'<emitter type="projector" id="it">{PICTURE.format("irradiance")}{numbers(scale=9)}{AIMED}</emitter>'
+    ),
+}
+
+
+@pytest.fixture(scope="module")
+def scene_of(make_scene, root):
+    @cache
+    def scene(case):
+        text = (CASES[case] + FLOOR).replace('"textures/', f'"{root}/tests/scenes/textures/')
+        return make_scene(text, res=16, depth=5, origin="0, 1, 3.5", fov=45)
+
+    return scene
+
+
+def checked(scene):
+    return [name for name in pj.parameters(scene) if not name.startswith("around-")]
+
+
+def test_every_kind_has_a_scene_here():
+    kinds = [*bsdfs.KINDS, *textures.KINDS, *emitters.KINDS]
+    assert {case.split(",")[0] for case in CASES} == set(kinds)
+
+
+def test_every_parameter_that_a_kind_declares_is_checked(scene_of):
+    fields = {name.split(".")[1] for case in CASES for name in checked(scene_of(case))}
+    kinds = [*bsdfs.KINDS.values(), *emitters.KINDS.values(), *textures.KINDS.values()]
+    declared = {name for kind in kinds for name, each in kind.declared.items() if each.listed}
+    assert declared - {"texture"} <= fields  # what covers a spot, an image in any case, is no parameter
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", CASES)
+def test_derivatives_are_those_of_differences(scene_of, case):
+    scene = scene_of(case)
+    names, values = checked(scene), pj.parameters(scene)
+    known = scene.about.parameters
+    numbers = [name for name in names if not known[name].is_texture and not known[name].moves_paths]
+
+    @cache
+    def jacobian(spp, seed):
+        return pj.jacobian(scene, numbers, spp, seed)[1]
+
+    def check(name, spp):
+        if name not in numbers:
+            return pj.check_gradient(scene, name, spp, seeds=SEEDS)
+
+        def image(theta, seed):
+            return pj.render(pj.with_parameters(scene, {name: theta}), spp, seed)
+
+        def derivative(theta, v, seed):
+            return np.tensordot(jacobian(spp, seed)[name], v, v.ndim)
+
+        return pj.check_gradient(image, values[name], derivative=derivative, bounds=known[name].bounds, seeds=SEEDS)
+
+    found = {}
+    for name in names:
+        found[name] = check(name, SPP)
+        if found[name].passed and found[name].resolution > RESOLUTION:
+            # A power of two, so that parameters share Jacobians.
+            more = 2 ** math.ceil(2 * math.log2(found[name].resolution / RESOLUTION) + 0.5)
+            found[name] = check(name, min(SPP * more, MOST_SPP))
+    told = {
+        name: f"|z| {abs(c.z).max():.1f}, p {c.p_value:.2g}, resolves {c.resolution:.2g}" for name, c in found.items()
+    }
+    print(case, told)
+    assert all(check.passed and check.resolution < 1.5 * RESOLUTION for check in found.values()), told
