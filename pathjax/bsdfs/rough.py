@@ -3,11 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import ClassVar
 
 from pathjax.bsdfs.bsdf import BSDF
-from pathjax.bsdfs.microfacet import DISTRIBUTIONS, Distribution
+from pathjax.bsdfs.microfacet import DISTRIBUTIONS, MIN_ALPHA, Distribution
 from pathjax.kinds import Choice, Number, Row, Unused
+
+
+@dataclass(frozen=True)
+class Roughness(Number):
+    """From 0 to 1. What is smoother than MIN_ALPHA is as rough as that."""
+
+    bounds: tuple[float, float] = (0, 1)
+    least: float = MIN_ALPHA
 
 
 class Rough(BSDF):
@@ -16,9 +25,9 @@ class Rough(BSDF):
     What is smoother than `microfacet.MIN_ALPHA` is as rough as that, as in Mitsuba.
     """
 
-    alpha = Number(0.1, bounds=(0, 1), textured=True)  # None: alpha_u and alpha_v instead
-    alpha_u = Number(None, bounds=(0, 1), textured=True)
-    alpha_v = Number(None, bounds=(0, 1), textured=True)
+    alpha = Roughness(0.1, textured=True)  # None: alpha_u and alpha_v instead
+    alpha_u = Roughness(None, textured=True)
+    alpha_v = Roughness(None, textured=True)
     distribution = Choice("beckmann", options=tuple(DISTRIBUTIONS))
     smooth = True
     unused: ClassVar[Mapping[str, Unused]] = {"sample_visible": Unused("boolean", "visible normals are always drawn")}

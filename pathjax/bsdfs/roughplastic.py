@@ -11,17 +11,17 @@ from jaxtyping import Array, Float
 from pathjax.bsdfs import coat, fresnel
 from pathjax.bsdfs.microfacet import DISTRIBUTIONS, mirrored
 from pathjax.bsdfs.plastic import Plastic, base, chance_of_coat
-from pathjax.bsdfs.rough import Rough
+from pathjax.bsdfs.rough import Rough, Roughness
 from pathjax.core.math import dot, safe_divide
 from pathjax.core.types import BSDFSample
 from pathjax.core.warp import chosen, square_to_cosine_hemisphere, square_to_cosine_hemisphere_pdf
-from pathjax.kinds import Choice, Number, PerRow, Row, Unused
+from pathjax.kinds import Choice, PerRow, Row, Unused
 
 
 class RoughPlastic(Plastic):
     """As `Plastic`, but that the facets of the coat reflect and refract, each once (Walter et al. 2007)."""
 
-    alpha = Number(0.1, bounds=(0, 1))
+    alpha = Roughness(0.1)
     distribution = Choice("beckmann", options=tuple(DISTRIBUTIONS))
     coat = PerRow()  # of `coat.coats`
     delta = False

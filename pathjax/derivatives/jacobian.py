@@ -91,7 +91,8 @@ def jacobian(
     Returns:
         image and Jacobian.
     Raises:
-        InputError: unknown name, method or strategy; spp, seed or step out of range; a name of a texture.
+        InputError: unknown name, method or strategy; spp, seed or step out of range; a name of a texture; a value that
+            counts as a larger one, as a roughness of 0 does.
     """
     if isinstance(names, str):
         raise InputError(f"names is a list of names; write [{names!r}]")
@@ -103,6 +104,7 @@ def jacobian(
     options.check_counts(spp, seed)
     options.check_strategy(scene)
     wanted = {name: named.find(scene, name) for name in names}
+    named.refuse_constant(scene, wanted)
     pixels, scene = film.pixels(scene.film), named.nameless(named.attached(scene))
     image, derivatives, bias, used = pixel_jacobians(
         scene, wanted, pixels, 0, spp, seed, options, method=method, step=step

@@ -76,6 +76,7 @@ def _estimate_jvp(static, primals, tangents):
     # Attached, for derivatives of the derivative.
     scene = named.with_values(scene, varied, parameters)
     wanted = {name: parameters[name] for name in changes}
+    named.refuse_constant(scene, wanted)
     free = {name: wanted.pop(name) for name in sorted(estimator.matrix_free(scene, wanted))}
     if free:
         scene = differentiated_once(scene, "an image in a texture, or in more colours than a Jacobian has,")

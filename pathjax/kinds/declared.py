@@ -16,6 +16,7 @@ class Declared:
     bounds: tuple[float, float] = (-math.inf, math.inf)
     textured: bool = False  # a texture may stand in its place
     moves_paths: bool = False
+    least: float = -math.inf  # what is smaller counts as this
     shape = ()  # of a row's value
     dtype = None  # of the scene's reals, unless it is given
     listed = False  # is a parameter of the scene, to be set, differentiated and fitted

@@ -84,8 +84,8 @@ class Kind:
                     parameters.enter_texture(name, value, declared)
                 elif value is not None and declared.listed:
                     where = (*path, "columns", place, "values"), (row,)
-                    moves = declared.moves_paths
-                    parameters.known[name] = Parameter(*where, declared.shape, declared.bounds, key, moves)
+                    how = declared.shape, declared.bounds, key, declared.moves_paths, declared.least
+                    parameters.known[name] = Parameter(*where, *how)
         settings = tuple((key, instances[0].values[key]) for key, d in cls.declared.items() if isinstance(d, Setting))
         return cls.derived(Table(tuple(columns), cls, settings))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 
 import jax
@@ -19,6 +20,7 @@ class Parameter:
     bounds: tuple[float, float]
     field: str = ""  # what its kind calls it
     moves_paths: bool = False  # as the IOR of smooth glass does; others change what paths carry
+    least: float = -math.inf  # smaller numbers count as this one, and images do not change with them
     rows: int | None = None  # of a texture: how many entries of the array, from the index on; None: the entry alone
 
     @property

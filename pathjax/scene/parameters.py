@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
@@ -109,6 +110,18 @@ def checked(name, value, parameter: Parameter, dtype):
             given = "a value" if parameter.is_texture else np.asarray(value).tolist()
             raise InputError(f"{name} = {given} lies outside its bounds [{low:g}, {high:g}]")
     return value
+
+
+def refuse_constant(scene: Scene, wanted: Mapping[str, Parameter]) -> None:
+    """Raises InputError: one of the parameters, of which derivatives are asked for, is known to be below its least."""
+    for name, parameter in wanted.items():
+        value = parameter.get(get(scene, parameter.path))
+        if math.isfinite(parameter.least) and not parameter.is_texture and not is_traced(value):
+            if value <= parameter.least:
+                raise InputError(
+                    f"{name} = {value:g} has no derivative: what is below {parameter.least:g} counts as that, so no "
+                    "image changes with it; set a larger value"
+                )
 
 
 def get(tree, path):

@@ -162,6 +162,49 @@ def test_rough_glass_of_small_roughness_acts_as_smooth_glass(distribution):
         np.testing.assert_allclose(*means, atol=4 * 0.5 / np.sqrt(20_000) * 2.25)
 
 
+# ---- towards smooth surfaces ----------------------------------------------------------------------------------------
+
+MIRRORED = """<shape type="rectangle"><transform name="to_world"><scale value="3"/><rotate x="1" angle="-90"/>
+  <translate y="-1"/></transform><bsdf type="diffuse"><texture type="checkerboard" name="reflectance">
+  <transform name="to_uv"><scale value="4"/></transform></texture></bsdf></shape>
+  <emitter type="constant"/><shape type="sphere"><bsdf type="{}" id="it">{}</bsdf></shape>"""
+INSIDE = {
+    "conductor": '<rgb name="eta" value="0.2, 0.9, 1.1"/><rgb name="k" value="3.9, 2.4, 2.2"/>',
+    "dielectric": '<rgb name="specular_reflectance" value="0.9"/><rgb name="specular_transmittance" value="0.8"/>',
+}
+SMALL = '<float name="alpha" value="1e-3"/><string name="distribution" value="{}"/>'
+
+
+@slow
+@pytest.mark.parametrize("distribution", ["ggx", "beckmann"])
+@pytest.mark.parametrize("kind", INSIDE)
+def test_images_and_derivatives_of_small_roughnesses_are_those_of_smooth_surfaces(
+    kind, distribution, make_scene, derivatives, agree
+):
+    """Of roughness 1e-3, which turns what is seen by as much: less than the noise of edges. In the logarithm of alpha
+    an image then changes by about alpha^2, which is 0 beside the noise."""
+    of = lambda kind, inside: make_scene(MIRRORED.format(kind, inside), res=16, origin="0, 1, 4")  # noqa: E731
+    smooth, rough = of(kind, INSIDE[kind]), of(f"rough{kind}", INSIDE[kind] + SMALL.format(distribution))
+    names = [name for name in pj.parameters(smooth) if name.startswith("it.") and "ior" not in name]
+    (image, expected), (seen, found) = (
+        derivatives(scene, [*names, *more], 64, 16, first_seed)
+        for scene, more, first_seed in ((smooth, [], 1), (rough, ["it.alpha"], 101))
+    )
+    agree(seen, image, rounding=1e-3)
+    for name in names:
+        agree(found[name], expected[name], rounding=1e-3)
+    agree(found["it.alpha"], np.zeros(3))
+
+
+def test_derivatives_in_a_roughness_that_counts_as_a_larger_one_are_refused(make_scene):
+    """No image changes with it, and nothing that descends would ever leave it."""
+    scene = make_scene(MIRRORED.format("roughconductor", '<float name="alpha" value="0"/>'))
+    with pytest.raises(pj.InputError, match=r"it\.alpha = 0 has no derivative: what is below 0\.0001 counts as that"):
+        pj.jacobian(scene, ["it.alpha"])
+    with pytest.raises(pj.InputError, match=r"it\.alpha = 0.* set a larger value"):
+        jax.grad(lambda alpha: pj.render(pj.with_parameters(scene, {"it.alpha": alpha})).sum())(0.0)
+
+
 def test_nothing_is_nan_between_nearly_equal_media():
     for ior in (1.0, 1 + 1e-7, 1.001):
         materials = testing.material(RoughDielectric, alpha=0.1, int_ior=ior, ext_ior=1.0)
