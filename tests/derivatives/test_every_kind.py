@@ -14,8 +14,8 @@ from pathjax import bsdfs, emitters, textures
 
 SEEDS = 16
 # Samples per pixel to begin with, and at most; as many are taken as find an error of this size half of the time.
-SPP, MOST_SPP = 64, 4096
-RESOLUTION = 0.1
+SPP, MOST_SPP = 64, 2048
+RESOLUTION = 0.15
 
 # What stands around: its parameters are checked with the kinds that they are of.
 FLOOR = """<shape type="rectangle"><transform name="to_world"><scale value="3"/><rotate x="1" angle="-90"/>
@@ -70,7 +70,7 @@ CASES = {
     "conductor": on_ball("conductor", METAL, SPECULAR),
     "roughconductor": on_ball("roughconductor", METAL, SPECULAR, numbers(alpha=0.3)),
     "roughconductor, ggx": on_ball("roughconductor", GGX, METAL, numbers(alpha=0.1)),
-    "roughconductor, brushed": on_ball("roughconductor", METAL, numbers(alpha_u=0.4, alpha_v=0.1)),
+    "roughconductor, brushed": on_ball("roughconductor", METAL, numbers(alpha_u=0.4, alpha_v=0.2)),
     "roughconductor, brushed ggx": on_ball("roughconductor", GGX, METAL, numbers(alpha_u=0.1, alpha_v=0.4)),
     "dielectric": on_ball("dielectric", GLASS, SPECULAR, TRANSMITTED),
     "thindielectric": on_pane("thindielectric", GLASS, SPECULAR, TRANSMITTED),
@@ -139,6 +139,9 @@ CASES = {
         f'<emitter type="point" id="it">{rgb("intensity", "5, 4, 3")}<point name="position" value="0, 2, 1"/></emitter>'
     ),
     "spot": lit(f'<emitter type="spot" id="it">{rgb("intensity", "9, 8, 7")}{AIMED}</emitter>'),
+    "spot, covered": lit(
+        f'<emitter type="spot" id="it">{rgb("intensity", "9, 8, 7")}{AIMED}{rgb("texture", "0.3, 0.6, 0.9")}</emitter>'
+    ),
     "directional": lit(f'<emitter type="directional" id="it">{rgb("irradiance")}{AIMED}</emitter>'),
     "projector": lit(
         f'<emitter type="projector" id="it">{PICTURE.format("irradiance")}{numbers(scale=9)}{AIMED}</emitter>'
@@ -169,7 +172,7 @@ def test_every_parameter_that_a_kind_declares_is_checked(scene_of):
     fields = {name.split(".")[1] for case in CASES for name in checked(scene_of(case))}
     kinds = [*bsdfs.KINDS.values(), *emitters.KINDS.values(), *textures.KINDS.values()]
     declared = {name for kind in kinds for name, each in kind.declared.items() if each.listed}
-    assert declared - {"texture"} <= fields  # what covers a spot, an image in any case, is no parameter
+    assert declared <= fields
 
 
 @pytest.mark.slow
@@ -207,4 +210,4 @@ def test_derivatives_are_those_of_differences(scene_of, case):
         name: f"|z| {abs(c.z).max():.1f}, p {c.p_value:.2g}, resolves {c.resolution:.2g}" for name, c in found.items()
     }
     print(case, told)
-    assert all(check.passed and check.resolution < 1.5 * RESOLUTION for check in found.values()), told
+    assert all(check.passed and check.resolution < 2 * RESOLUTION for check in found.values()), told
