@@ -2,18 +2,30 @@
 
 from __future__ import annotations
 
+import atexit
 import functools
+import gc
 import os
+import shutil
 import signal
+import tempfile
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
+
+# The workers of a run, and what processes they start, share what they compile, in a folder that goes with the run.
+# Before JAX is imported, which reads this then.
+if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
+    _shared = tempfile.mkdtemp(prefix="pathjax-tests-")
+    atexit.register(shutil.rmtree, _shared, ignore_errors=True)
+    os.environ |= {"JAX_COMPILATION_CACHE_DIR": _shared, "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
 
 import pathjax  # before anything starts JAX's backend  # isort: skip
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.experimental.compilation_cache import compilation_cache
 
 from pathjax.derivatives import jacobian, tangents
 from pathjax.integrators import pixel
@@ -23,7 +35,11 @@ from pathjax.rendering.render import pixel_means
 from pathjax.scene import build
 from pathjax.sensors.film import image_shape, pixel_count
 
-os.environ["PATHJAX_CACHE"] = "0"  # tests leave the user's cache of kernels alone, and compile what they test
+os.environ["PATHJAX_CACHE"] = "0"  # tests leave the user's cache of kernels alone
+
+# Programs that are traced are many objects that stay: to look through all of them for garbage, as often as Python does,
+# takes a quarter of the time of tracing.
+gc.set_threshold(50_000, 20, 50)
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -41,6 +57,16 @@ def interrupts_are_heard():
             signal.signal(number, handler)
     if hasattr(signal, "pthread_sigmask"):
         signal.pthread_sigmask(signal.SIG_UNBLOCK, (signal.SIGINT, signal.SIGTERM))
+
+
+@pytest.fixture(scope="module")
+def compiled_anew():
+    """Nothing is taken from what other tests have compiled: for those that time compilation."""
+    compilation_cache.reset_cache()  # JAX asks once whether to keep anything
+    jax.config.update("jax_enable_compilation_cache", False)
+    yield
+    jax.config.update("jax_enable_compilation_cache", True)
+    compilation_cache.reset_cache()
 
 
 @pytest.fixture(scope="session")

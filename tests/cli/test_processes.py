@@ -92,7 +92,8 @@ def interrupt(root, environment):
 
     def once(arguments, event, seconds):
         command = [sys.executable, "-c", TELLTALE, *map(str, arguments)]
-        with subprocess.Popen(command, cwd=root, env=environment, **PIPES) as started:
+        compiling = environment | {"JAX_ENABLE_COMPILATION_CACHE": "0"}  # else what compiles is soon over
+        with subprocess.Popen(command, cwd=root, env=compiling, **PIPES) as started:
             try:
                 first_line_with(started.stderr, event)
                 time.sleep(seconds)
