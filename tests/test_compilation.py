@@ -34,7 +34,14 @@ LARGE = (
     *("more_shapes", "nested", "normals", "plastics", "principled"),
     *("rough_glass", "rough_metals", "shapes_and_filters", "textures", "turned"),
 )
-SCENES = [pytest.param(name, marks=pytest.mark.slow if name in LARGE else ()) for name in NAMES]
+# Those that hold no kind which the others lack.
+REPEATED = ("conductors", "glass_in_glass", "nine_spheres")
+
+
+def but(*slow):
+    """All scenes, of which these are slow."""
+    return [pytest.param(name, marks=pytest.mark.slow if name in slow else ()) for name in NAMES]
+
 
 pytestmark = pytest.mark.skipif(not native(), reason="native loops are off")
 
@@ -57,7 +64,7 @@ def assert_one_native_kernel(compiled):
 # ---- native kernels -------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize("name", but(*LARGE))
 def test_every_scene_renders_in_one_native_kernel(kernel_of, name):
     assert_one_native_kernel(kernel_of(name).compiled)
 
@@ -97,7 +104,7 @@ def test_closest_hit_is_one_native_kernel(shipped, name, devices):
     assert_one_native_kernel(lowered.compile())
 
 
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize("name", but(*LARGE, *REPEATED))
 def test_output_variables_are_one_native_kernel(shipped, name):
     pixels = jnp.arange(256, dtype=jnp.int32)
     scene = replace(shipped(name, res=16), about=None)
@@ -195,7 +202,7 @@ def test_what_lanes_leave_to_vmap_is_told_with_its_place(left_to_vmap):
     assert all(f"/{Path(__file__).name}:" in entry for entry in left_to_vmap)
 
 
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize("name", but(*LARGE, *REPEATED))
 def test_no_primitive_of_an_image_is_left_to_vmap(shipped, left_to_vmap, name):
     """What JAX unpacks arrays by, from one version to the next, must have a rule, or all kernels are slower."""
     scene = replace(shipped(name, res=16), about=None)
@@ -224,9 +231,7 @@ def test_no_primitive_of_light_on_patches_is_left_to_vmap(shipped, left_to_vmap)
 QUICK_DERIVATIVES = ("furnace", "glass_ball")
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=() if name in QUICK_DERIVATIVES else pytest.mark.slow) for name in NAMES]
-)
+@pytest.mark.parametrize("name", but(*set(NAMES).difference(QUICK_DERIVATIVES)))
 def test_no_primitive_of_a_derivative_is_left_to_vmap(shipped, left_to_vmap, name):
     """Nor of the terms of the series, from which derivatives are taken too, nor of the step of an IOR."""
     scene = shipped(name, res=16)

@@ -18,6 +18,8 @@ from pathjax.images import rel_mse
 
 ROOT = Path(__file__).resolve().parents[2]
 CORNELL, FURNACE = (str(ROOT / "scenes" / f"{name}.xml") for name in ("cornell_box", "furnace"))
+# `bench` times compilation.
+pytestmark = pytest.mark.usefixtures("compiled_anew")
 SMALL = ["-D", "res=8", "--spp", "2,32", "--reference-spp", "512", "--repeat", "2"]
 
 needs_mitsuba = pytest.mark.skipif(not importlib.util.find_spec("mitsuba"), reason="Mitsuba is not installed")
@@ -33,7 +35,7 @@ def run(*arguments, status=0):
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory):
+def folder(compiled_anew, tmp_path_factory):
     """A report of everything but Mitsuba."""
     folder = tmp_path_factory.mktemp("bench") / "report"
     run(CORNELL, *SMALL, "-o", str(folder))
@@ -108,6 +110,7 @@ def test_plot(folder, scene):
         assert len(np.unique(np.asarray(picture.convert("L")))) > 10
 
 
+@pytest.mark.slow
 def test_float64_has_a_process_of_its_own():
     request = {"scene": FURNACE, "parameters": {"res": "4"}, "spp": 2, "seeds": [0, 1]}
     report, arrays = peers.call("pathjax_alone", {**request, "dtype": "float64"})
@@ -145,13 +148,11 @@ def test_a_scene_without_noise(tmp_path, capsys, write_scene):
 
 
 @needs_matplotlib
-def test_an_interrupt_keeps_the_scenes_that_are_done(tmp_path, capsys, monkeypatch):
-    done = bench.measure
-
-    def measure(file, defines, plan):
+def test_an_interrupt_keeps_the_scenes_that_are_done(scene, tmp_path, capsys, monkeypatch):
+    def measure(file, *_):
         if file == CORNELL:
             raise KeyboardInterrupt
-        return done(file, defines, plan)
+        return {name: value for name, value in scene.items() if name != "plot"} | {"file": file}
 
     monkeypatch.setattr(bench, "measure", measure)
     run(FURNACE, FURNACE, CORNELL, *SMALL, "--quick", "-o", str(tmp_path), status=1)

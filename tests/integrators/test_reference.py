@@ -16,7 +16,7 @@ from pathjax.sensors import film
 
 ROOT = Path(__file__).resolve().parents[2]
 NAMES = sorted(path.stem for path in (*ROOT.glob("scenes/*.xml"), *ROOT.glob("tests/scenes/*.xml")))
-QUICK = ("cornell_box", "glass_and_mirror", "triangle_box")
+QUICK = ("cornell_box", "glass_and_mirror")
 SPP, SEED = 4, 7
 # What rounding leaves of a sample after some ten vertices, relative to it or to the mean of the image; and the share of
 # samples that it may send another way, at an edge or where roulette decides. A wrong term changes nearly all.
