@@ -22,10 +22,13 @@ FLOOR = """<shape type="rectangle"><transform name="to_world"><scale value="3"/>
   <translate y="-1"/></transform><bsdf type="diffuse" id="around-floor"><texture type="checkerboard" name="reflectance">
   <rgb name="color0" value="0.7, 0.6, 0.5"/><rgb name="color1" value="0.2, 0.3, 0.4"/>
   <transform name="to_uv"><scale value="3"/></transform></texture></bsdf></shape>"""
-LIGHT = """<shape type="rectangle"><transform name="to_world"><rotate x="1" angle="90"/><translate x="1" y="2.5" z="1"/>
-  </transform><bsdf type="diffuse" id="around-lamp"/><emitter type="area" id="around-light">
-  <rgb name="radiance" value="20, 16, 12"/></emitter></shape>
-  <emitter type="constant" id="around-sky"><rgb name="radiance" value="0.1, 0.15, 0.2"/></emitter>"""
+AROUND = """<shape type="rectangle"><transform name="to_world"><rotate x="1" angle="90"/>
+  <translate x="1" y="2.5" z="1"/></transform><bsdf type="diffuse" id="around-lamp"/>
+  <emitter type="area" id="around-light">
+  <rgb name="radiance" value="{}"/></emitter></shape>
+  <emitter type="constant" id="around-sky"><rgb name="radiance" value="{}"/></emitter>"""
+# How rough something is shows best under a lamp alone, in whose light what is smooth is noisy.
+LIGHT, LAMP = AROUND.format("4, 3, 2", "0.4, 0.5, 0.6"), AROUND.format("20, 16, 12", "0.1, 0.15, 0.2")
 BALL = '<shape type="sphere"><float name="radius" value="0.9"/>{}</shape>'
 PANE = '<shape type="rectangle"><transform name="to_world"><rotate y="1" angle="25"/></transform>{}</shape>'
 TINTED = '<shape type="ply"><string name="filename" value="meshes/tinted.ply"/>{}</shape>'
@@ -55,12 +58,16 @@ def lit(*emitter):
     return LIGHT + "".join(emitter) + BALL.format(GREY)
 
 
+def lights(of_bsdf):
+    return LAMP if any(word in text for text in of_bsdf for word in ("alpha", "roughness")) else LIGHT
+
+
 def on_ball(*of_bsdf):
-    return LIGHT + BALL.format(bsdf(*of_bsdf))
+    return lights(of_bsdf) + BALL.format(bsdf(*of_bsdf))
 
 
 def on_pane(*of_bsdf):
-    return LIGHT + PANE.format(bsdf(*of_bsdf))
+    return lights(of_bsdf) + PANE.format(bsdf(*of_bsdf))
 
 
 AIMED = '<transform name="to_world"><lookat origin="1, 2, 3" target="0, 0, 0" up="0, 1, 0"/></transform>'
