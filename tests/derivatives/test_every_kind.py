@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import pathjax as pj
-from pathjax import bsdfs, emitters, textures
+from pathjax import bsdfs, emitters, media, textures
 
 SEEDS = 16
 # Samples per pixel to begin with, and at most; as many are taken as find an error of this size half of the time.
@@ -52,6 +52,11 @@ def numbers(**values):
 
 def rgb(name, value="0.6, 0.4, 0.7"):
     return f'<rgb name="{name}" value="{value}"/>'
+
+
+def filled(*of_medium):
+    medium = f'<medium type="homogeneous" name="interior" id="it">{"".join(of_medium)}</medium>'
+    return LIGHT + BALL.format(f'<bsdf type="null"/>{medium}')
 
 
 def lit(*emitter):
@@ -135,6 +140,10 @@ CASES = {
         '<bsdf type="diffuse" id="it"><texture type="mesh_attribute" name="reflectance"><string name="name" '
         'value="vertex_color"/><float name="scale" value="0.8"/></texture></bsdf>'
     ),
+    "homogeneous": filled(rgb("sigma_t", "0.5, 0.8, 1"), rgb("albedo"), numbers(scale=1.5)),
+    "homogeneous, absorbing": filled(rgb("sigma_t", "0.5, 0.8, 1"), rgb("albedo", "0")),
+    "isotropic": filled(rgb("sigma_t", "0.5, 2, 4"), rgb("albedo"), '<phase type="isotropic"/>'),
+    "hg": filled(rgb("sigma_t", "1"), rgb("albedo"), f'<phase type="hg" id="phase">{numbers(g=0.6)}</phase>'),
     "area": BALL.format(GREY)
     + '<shape type="sphere"><point name="center" value="1, 1, 1"/><float name="radius" value="0.5"/>'
     f'<bsdf type="diffuse" id="around-lamp"/><emitter type="area" id="it">{rgb("radiance", "4, 3, 2")}</emitter>'
@@ -157,11 +166,14 @@ CASES = {
 
 
 @pytest.fixture(scope="module")
-def scene_of(make_scene, root):
+def scene_of(write_scene, root):
     @cache
     def scene(case):
         text = (CASES[case] + FLOOR).replace('"textures/', f'"{root}/tests/scenes/textures/')
-        return make_scene(text, res=16, depth=5, origin="0, 1, 3.5", fov=45)
+        file = write_scene(text, res=16, depth=5, origin="0, 1, 3.5", fov=45)
+        if "<medium" in text:
+            file.write_text(file.read_text().replace('<integrator type="path">', '<integrator type="volpath">'))
+        return pj.load_scene(file)
 
     return scene
 
@@ -171,13 +183,14 @@ def checked(scene):
 
 
 def test_every_kind_has_a_scene_here():
-    kinds = [*bsdfs.KINDS, *textures.KINDS, *emitters.KINDS]
+    kinds = [*bsdfs.KINDS, *textures.KINDS, *emitters.KINDS, *media.KINDS, *media.PHASES]
     assert {case.split(",")[0] for case in CASES} == set(kinds)
 
 
 def test_every_parameter_that_a_kind_declares_is_checked(scene_of):
     fields = {name.split(".")[1] for case in CASES for name in checked(scene_of(case))}
-    kinds = [*bsdfs.KINDS.values(), *emitters.KINDS.values(), *textures.KINDS.values()]
+    rooms = bsdfs.KINDS, emitters.KINDS, textures.KINDS, media.KINDS, media.PHASES
+    kinds = [kind for room in rooms for kind in room.values()]
     declared = {name for kind in kinds for name, each in kind.declared.items() if each.listed}
     assert declared <= fields
 
