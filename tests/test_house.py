@@ -14,6 +14,7 @@ ROOMS = (
     "errors",
     "system",
     "compile",
+    "distributed",
     "core",
     "images",
     "kinds",

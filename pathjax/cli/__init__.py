@@ -10,6 +10,7 @@ import contextlib
 import importlib
 import warnings
 
+from pathjax import distributed
 from pathjax.cli.arguments import parser
 from pathjax.errors import InputError, InputWarning
 from pathjax.system.interrupts import leave
@@ -23,15 +24,35 @@ def main(arguments: list[str] | None = None) -> int:
     options, output = parser().parse_args(arguments), Output()
     with _warnings_as_messages():
         try:
+            _join(options)
             # Only the command that is asked for: the solvers of `fit` alone take half a second.
             status = importlib.import_module(f"pathjax.cli.{options.command}").run(options, output)
         except InputError as error:
             say(str(error))
             status = WRONG
+        except distributed.ProcessLost as error:
+            say(f"process {distributed.index()} ends, as {error}")
+            status = FAILED
         except KeyboardInterrupt:
             say("interrupted" if output.written else "interrupted; nothing was written")
             status = FAILED
-    return leave(FAILED if output.failed and status == DONE else status)
+    status = FAILED if output.failed and status == DONE else status
+    # Else JAX waits at the end for those that have ended, or for those that go on without this one.
+    return leave(status, at_once=status != DONE and distributed.count() > 1)
+
+
+def _join(options) -> None:
+    """The other processes, if there are any."""
+    given = {name: getattr(options, name, None) for name in ("coordinator", "processes", "process")}
+    if all(value is None for value in given.values()):
+        return
+    if given["coordinator"] == "auto":
+        given = {}
+    elif None in given.values():
+        raise InputError("--coordinator, --processes and --process belong together; give all three")
+    elif given["process"] >= given["processes"]:
+        raise InputError(f"--process {given['process']} of {given['processes']}: they are counted from 0")
+    distributed.start(**given)
 
 
 @contextlib.contextmanager

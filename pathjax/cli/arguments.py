@@ -27,6 +27,7 @@ def parser() -> argparse.ArgumentParser:
     render.add_argument("--seed", type=_seed, default=0, metavar="K")
     render.add_argument("--strategy", default="mis", metavar="{mis,light,bsdf}", help="how light is sampled")
     render.add_argument("--json", action="store_true", help="print one JSON object on stdout")
+    _add_processes(render)
 
     batch = subparsers.add_parser("batch", help="render many scenes, which share kernels")
     batch.add_argument("jobs", metavar="JOBS.jsonl", help="a JSON object a line: see `pathjax help batch`")
@@ -116,6 +117,13 @@ def _pair(text: str) -> tuple[str, str]:
     if not name or not equals:
         raise argparse.ArgumentTypeError(f"{text!r} is not of the form name=value")
     return name, value
+
+
+def _add_processes(parser: argparse.ArgumentParser) -> None:
+    coordinator = "address of the first of several processes that share the work, or auto, where JAX finds the cluster"
+    parser.add_argument("--coordinator", metavar="HOST:PORT", help=coordinator)
+    parser.add_argument("--processes", type=_positive, metavar="N", help="how many there are")
+    parser.add_argument("--process", type=_seed, metavar="I", help="which of them this is, from 0")
 
 
 def _part(text: str) -> tuple[int, int]:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 
-from pathjax import emitters
+from pathjax import distributed, emitters
 from pathjax.cli import DONE, FAILED
 from pathjax.cli.inputs import load
 from pathjax.errors import InputError
@@ -41,12 +41,15 @@ def run(options, output: Output) -> int:
     render = Render(
         scene, options.error, options.time, options.spp, options.seed, options.strategy, options.checkpoint
     )
-    with Console(stderr=True).status("compiling"):
+    first = distributed.index() == 0  # of several processes, the one that tells and writes
+    with Console(stderr=True, quiet=not first).status("compiling"):
         wait_for(render.compile)
         first_hits = wait_for(lambda: _first_hits(scene, options))
     # From here on a signal only ends the rendering: what is rendered is written, however many come.
     with Interrupts() as interrupts:
-        result = render.run(progress=True)
+        result = render.run(progress=first)
+        if not first:
+            return DONE if result.reason != "interrupted" else FAILED
         layers = first_hits | _image_layers("error", result.standard_error)
         channels = {name: layers[name] for name in layers if name.partition(".")[0] in options.aov}
         if "bounces" in options.aov:

@@ -93,12 +93,12 @@ def wait_for(call: Callable[[], R]) -> R:
     return result
 
 
-def leave(status: int) -> int:
-    """Return a program's exit status; or end it, if a call that it no longer waits for goes on.
+def leave(status: int, at_once: bool = False) -> int:
+    """Return a program's exit status; or end it, if a call that it no longer waits for goes on, or `at_once`.
 
     XLA aborts the process if the interpreter ends under such a call.
     """
-    if not all(end.is_set() for end in _ends):
+    if at_once or not all(end.is_set() for end in _ends):
         for stream in (sys.stdout, sys.stderr):
             with suppress(Exception):
                 stream.flush()

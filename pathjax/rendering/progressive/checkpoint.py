@@ -15,7 +15,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from pathjax import version
+from pathjax import distributed, version
 from pathjax.errors import InputError, InputWarning
 from pathjax.rendering.progressive.passes import State
 from pathjax.rendering.progressive.replicates import one_if_equal
@@ -62,7 +62,8 @@ class Checkpoint:
         self.problem: str | None = None  # why the last state is not in the file
         self._saved, self._cost = 0.0, _FIRST_COST
         # What a killed process left half written.
-        for part in self.path.parent.glob(f".{glob.escape(self.path.name)}.*.part"):
+        parts = () if distributed.index() else self.path.parent.glob(f".{glob.escape(self.path.name)}.*.part")
+        for part in parts:
             with contextlib.suppress(OSError):
                 part.unlink()
 
@@ -100,7 +101,10 @@ class Checkpoint:
     def save(self, state: State) -> None:
         """Raises:
         InputError: it cannot be written; the last one that was is intact.
+        Of several processes the first one writes.
         """
+        if distributed.index():
+            return
         started = time.perf_counter()
         # Before the first sample nothing needs to be kept, only to be known to be writable.
         arrays = {}

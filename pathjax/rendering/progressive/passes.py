@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import ClassVar
@@ -11,8 +11,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pathjax import emitters
-from pathjax.compile import MANY_ITEMS, calls_at_once, concurrently, devices_of_a_call
+from pathjax import distributed, emitters
+from pathjax.compile import MANY_ITEMS, calls_at_once, devices_of_a_call
 from pathjax.integrators import pixel, reconstruction
 from pathjax.integrators.options import DEFAULTS, Options
 from pathjax.rendering.progressive import replicates
@@ -47,6 +47,14 @@ class State:
 
     # What a checkpoint keeps, beside the means: one number for each pixel, or one for all.
     of_pixels: ClassVar[tuple[str, ...]] = ("count", "weights")
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """All but the means, which all processes have from the same calls."""
+        return {name: getattr(self, name) for name in ("goal", *self.of_pixels)}
+
+    def take(self, arrays: Mapping[str, np.ndarray]) -> None:
+        for name, array in arrays.items():
+            setattr(self, name, array)
 
     def moments(self) -> tuple[np.ndarray, np.ndarray]:
         """The image and its variance, (H W, 3) each."""
@@ -169,34 +177,34 @@ def start(scene: Scene) -> State:
 def plan(state: State, spp: int) -> None:
     """Begin a round that ends with `spp` samples a pixel, on average; what a pixel has already it keeps."""
     state.plan(spp)
+    state.take(distributed.of_first(state.arrays()))
 
 
 def extend(
     scene: Scene, state: State, seed: int, options: Options, stopped: Callable[[], object] = lambda: False
-) -> Iterator[None]:
-    """Render what is missing of the round; yields after every call of the kernel, when the state is whole.
+) -> Iterator[bool]:
+    """Render what is missing of the round; yields after every call of the kernel, when the state is whole: False where
+    it was stopped.
 
     The samples of a pixel are added in portions that depend on its own count and goal alone, so that a state which was
     saved between two calls leads to the same bits.
 
     Args:
-        stopped: asked by other threads before each call. Once it is true none begins; those that run are waited for.
+        stopped: asked before each call. Once it is true none begins; those that run are waited for.
     """
     kernel, chunk = compile(scene, options), _chunk(scene)
 
     def rendered(portion):
-        if stopped():
-            return None
         numbers = np.zeros((3, chunk), np.int32)
         numbers[:, : len(portion[0])] = portion
         return np.asarray(kernel(numbers, np.uint32(seed), *state.more(portion[0], chunk)))
 
-    for portion, means in concurrently(rendered, _portions(state, chunk)):
+    for portion, means in distributed.dealt(rendered, _portions(state, chunk), stopped):
         if means is None:
-            yield
+            yield False
             return
         state.add(*portion, means)
-        yield
+        yield True
 
 
 def _portions(state: State, chunk: int) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
@@ -259,6 +267,6 @@ def _replicate_sums(scene, numbers, seed, scale, *, options):
 
 def _chunk(scene: Scene) -> int:
     """Pixels of a call: all calls have one shape, so one kernel, and each of those that run at once gets as many."""
-    count, at_once = film.pixel_count(film.of_samples(scene.film)), calls_at_once()
+    count, at_once = film.pixel_count(film.of_samples(scene.film)), calls_at_once() * distributed.count()
     calls = at_once * -(-count // (at_once * CHUNK_PIXELS))
     return min(count, max(-(-count // calls), _LEAST_CHUNK))

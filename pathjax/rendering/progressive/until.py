@@ -13,14 +13,16 @@ from pathlib import Path
 
 import numpy as np
 
+from pathjax import distributed
 from pathjax.compile import usual_promotion
 from pathjax.errors import InputError
 from pathjax.integrators.options import Options, check_counts
 from pathjax.rendering.progressive import error_estimate, passes, replicates
-from pathjax.rendering.progressive.checkpoint import Checkpoint, identity
+from pathjax.rendering.progressive.checkpoint import Checkpoint, fingerprint, identity
 from pathjax.scene.scene import Scene
 from pathjax.sensors import film
 from pathjax.system.interrupts import Interrupts
+from pathjax.version import __version__
 
 # Samples of every pixel before their number may differ.
 PILOT_SPP = 16
@@ -28,6 +30,8 @@ PILOT_SPP = 16
 # lacking, so as not to pass it by, but never less than LEAST_GROWTH.
 MOST_GROWTH, LEAST_GROWTH, CAUTION = 2.0, 1.05, 0.75
 MAX_SPP = 2**31 - 1
+# Why a round may be left.
+REASONS = None, "time limit", "interrupted"
 UNKNOWN = error_estimate.ImageError(math.nan, math.nan)
 
 
@@ -112,10 +116,22 @@ class Render:
             self.checkpoint = Checkpoint(checkpoint, identity(scene, self.seed, strategy, adaptive))
             self.state = self.checkpoint.load(self.state)
             self.checkpoint.save(self.state)
+        if distributed.count() > 1:
+            distributed.same("version of pathjax", __version__)
+            distributed.same("scene", fingerprint(scene))
+            self._agree()
         if not adaptive or self.state.spp > self.spp:
             passes.plan(self.state, self.spp)
         elif not self.state.spp:
             passes.plan(self.state, min(PILOT_SPP, self.spp))
+
+    def _agree(self) -> None:
+        """Begin where the first process does, who alone needs to see the checkpoint."""
+        state = self.state
+        facts = np.array([state.spp, state.seconds], np.float32)
+        facts, state.means = distributed.of_first((facts, state.means))
+        state.take(distributed.of_first(state.arrays()))
+        state.spp, state.seconds = int(facts[0]), float(facts[1])
 
     def compile(self) -> None:
         started = time.perf_counter()
@@ -150,13 +166,13 @@ class Render:
             return None
 
         while True:
-            for _ in passes.extend(self.scene, state, self.seed, self.options, stopped):
+            for goes_on in passes.extend(self.scene, state, self.seed, self.options, stopped):
                 state.seconds = time.perf_counter() - started
                 if self.checkpoint is not None:
                     self.checkpoint.save_if_due(state)
                 show(self, error)
-                if reason := stopped():
-                    return reason, None
+                if not goes_on:
+                    return REASONS[distributed.highest(REASONS.index(stopped()))], None
             if state.spp >= self.spp:
                 return "spp", None
             image, variance, error = found = self._evaluate()

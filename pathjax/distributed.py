@@ -1,0 +1,166 @@
+"""Several processes, on one machine or on many, that render one image by JAX's distributed runtime.
+
+All of them run the same program, and do the same but for the calls of kernels, which are dealt out, and for what is
+written, which is the first one's. Whatever decides how a render goes on (time, signals, the noise so far) is agreed
+upon, so that they never part.
+"""
+
+from __future__ import annotations
+
+import os
+import socket
+import sys
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from itertools import islice
+from pathlib import Path
+from typing import TypeVar
+
+import jax
+import numpy as np
+
+from pathjax.compile import calls_at_once, concurrently
+from pathjax.errors import InputError
+
+T = TypeVar("T")
+# Seconds without a sign of life after which JAX ends all processes, and those in which they must find each other.
+PATIENCE, MEETING = 10, 60
+# Calls of each device between two exchanges: all wait for the slowest, so the fewer exchanges the better; but signals
+# are heard then.
+_CALLS = 2
+
+_peers: list[tuple[str, int]] = []  # host and process number in the system, by process
+
+
+class ProcessLost(RuntimeError):
+    """Another process ended, so this one cannot go on."""
+
+
+def start(coordinator: str | None = None, processes: int | None = None, process: int | None = None) -> None:
+    """Join the other processes; before JAX's first array. Each process of the cluster calls it.
+
+    Args:
+        coordinator: HOST:PORT at which the first process is found, the same for all; None, like what follows, where
+            JAX finds the cluster by itself (SLURM, Open MPI, Kubernetes).
+        processes: how many there are; process: which of them this is, from 0.
+    Raises:
+        InputError: the others were not found, two have one number, or JAX's backend has started already.
+    """
+    try:
+        jax.config.update("jax_cpu_collectives_implementation", "gloo")
+        jax.distributed.initialize(
+            coordinator, processes, process, initialization_timeout=MEETING, heartbeat_timeout_seconds=PATIENCE
+        )
+    except (RuntimeError, ValueError) as error:
+        where = f"at {coordinator}" if coordinator else "in this environment"
+        raise InputError(
+            f"process {process} found no others {where} within {MEETING} s; start all of them, each with a number of "
+            f"its own, with the address of the first ({str(error).splitlines()[0]})"
+        ) from None
+    here = np.frombuffer(socket.gethostname().encode()[:64].ljust(64, b"\0"), np.uint8)
+    with _stdout_as_stderr():
+        found = exchanged((here, np.int32(os.getpid())))
+    _peers.extend((bytes(host).rstrip(b"\0").decode(errors="replace"), int(number)) for host, number in found)
+
+
+def count() -> int:
+    return jax.process_count() if _peers else 1
+
+
+def index() -> int:
+    """Of this process; 0 is the one that writes and tells."""
+    return jax.process_index() if _peers else 0
+
+
+def exchanged(tree: T) -> list[T]:
+    """What each process gives, by process; arrays of the same shapes.
+
+    Raises:
+        ProcessLost: one has ended.
+    """
+    from jax.experimental import multihost_utils
+
+    try:
+        gathered = jax.tree.map(np.array, multihost_utils.process_allgather(tree))
+    except Exception as error:  # of whatever type the transport has it
+        raise ProcessLost(f"{_lost()}: {str(error).splitlines()[0]}") from None
+    return [jax.tree.map(lambda x, i=i: x[i], gathered) for i in range(jax.process_count())]
+
+
+def of_first(tree: T) -> T:
+    """What the first process gives."""
+    return exchanged(tree)[0] if count() > 1 else tree
+
+
+def same(what: str, digest: str) -> None:
+    """Raises:
+    InputError: processes differ in what the digest is of.
+    """
+    if count() > 1:
+        own = np.frombuffer(digest.encode(), np.uint8)
+        others = [i for i, theirs in enumerate(exchanged(own)) if (theirs != own).any()]
+        if others:
+            raise InputError(f"process {index()} has another {what} than process {others[0]}; give all the same")
+
+
+def highest(number: int) -> int:
+    """Of the numbers that processes give."""
+    return int(max(exchanged(np.int32(number)))) if count() > 1 else number
+
+
+def dealt(f: Callable[[T], np.ndarray], items: Iterable[T], stopped: Callable[[], object]) -> Iterator[tuple]:
+    """`concurrently`, of which each process does its share: pairs (item, f(item)) in order, the same in all.
+
+    Args:
+        f: of an item, an array of one shape for all items.
+        stopped: once it is true in any process, the result is None, and no more is asked for.
+    """
+    if count() == 1:
+        yield from concurrently(lambda item: None if stopped() else f(item), items)
+        return
+    items, each = iter(items), _CALLS * calls_at_once()
+    while batch := list(islice(items, each * count())):
+        if highest(bool(stopped())):
+            yield batch[0], None
+            return
+        # Who has nothing to do repeats what another one does, since all give arrays of one shape.
+        mine = batch[index() :: count()] or batch[:1]
+        done = np.stack([result for _, result in concurrently(f, mine)])
+        room = np.zeros((-(-len(batch) // count()), *done.shape[1:]), done.dtype)
+        room[: len(done)] = done
+        results = exchanged(room)
+        for place, item in enumerate(batch):
+            yield item, results[place % count()][place // count()]
+
+
+@contextmanager
+def _stdout_as_stderr() -> Iterator[None]:
+    """The transport tells on stdout whom it has found, past Python's own."""
+    sys.stdout.flush()
+    kept = os.dup(1)
+    os.dup2(2, 1)
+    try:
+        yield
+    finally:
+        os.dup2(kept, 1)
+        os.close(kept)
+
+
+def _lost() -> str:
+    """Which of the others has ended, where that can be known: on this machine."""
+    here = socket.gethostname()
+    gone = [process for process, (host, number) in enumerate(_peers) if host == here and _ended(number)]
+    if gone:
+        return f"process {', '.join(map(str, gone))} has ended"
+    return "another process has ended, or cannot be reached"
+
+
+def _ended(number: int) -> bool:
+    try:
+        os.kill(number, 0)
+        state = Path(f"/proc/{number}/stat").read_text().rpartition(")")[2].split()[0]
+    except FileNotFoundError:  # no Linux
+        return False
+    except OSError:
+        return True
+    return state in ("Z", "X")  # ended, but nobody has asked for its status
