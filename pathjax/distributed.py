@@ -20,6 +20,7 @@ import jax
 import numpy as np
 
 from pathjax.compile import calls_at_once, concurrently
+from pathjax.compile.jax_compat import gathered
 from pathjax.errors import InputError
 
 T = TypeVar("T")
@@ -78,13 +79,11 @@ def exchanged(tree: T) -> list[T]:
     Raises:
         ProcessLost: one has ended.
     """
-    from jax.experimental import multihost_utils
-
     try:
-        gathered = jax.tree.map(np.array, multihost_utils.process_allgather(tree))
+        found = jax.tree.map(np.array, gathered(tree))
     except Exception as error:  # of whatever type the transport has it
         raise ProcessLost(f"{_lost()}: {str(error).splitlines()[0]}") from None
-    return [jax.tree.map(lambda x, i=i: x[i], gathered) for i in range(jax.process_count())]
+    return [jax.tree.map(lambda x, i=i: x[i], found) for i in range(jax.process_count())]
 
 
 def of_first(tree: T) -> T:

@@ -19,6 +19,7 @@ __all__ = [
     "ad",
     "batching",
     "called_program",
+    "gathered",
     "is_symbolic_zero",
     "is_traced",
     "jaxpr_as_fun",
@@ -86,3 +87,10 @@ def scan_parts(eqn, values) -> tuple[list, list, list]:
     else:  # jax 0.12
         n, m, _ = (len(tree.vals) for tree in eqn.params["ft_in"].unpack())
     return values[:n], values[n : n + m], values[n + m :]
+
+
+def gathered(tree):
+    """What all processes give: a tree of arrays (processes, ...)."""
+    from jax.experimental import multihost_utils  # takes a moment, and one process never needs it
+
+    return multihost_utils.process_allgather(tree)
