@@ -204,7 +204,8 @@ def sweep(structure: Record, memory: Memory, due: Bool[Array, ""]) -> Memory:
     zeros = [jnp.zeros(nothing.shape, structure.weight.dtype)] * 3
     first = Sweep(jnp.int32(0), window > 0, nothing, nothing, zeros, memory.total)
     last = lax.while_loop(lambda state: state.goes_on, step, first)
-    lost = memory.lost | jnp.where(due & ~all_set(last.stopped != 0), 1, 0)
+    # At the end there may be nothing left to sweep.
+    lost = memory.lost | jnp.where((window > 0) & ~all_set(last.stopped != 0), 1, 0)
     return memory._replace(total=last.total, swept=jnp.where(due, memory.clock, memory.swept), lost=lost)
 
 
