@@ -2,7 +2,7 @@
 
 `fitting` holds `fit` and its answer. A `problem` is moved on in its `state` by the stages `scan`, `approach` and
 `refine`. They evaluate the `normal` equations of a `parameter_vector`, and `losses` that follow from these; `weights`
-and `uncertainty` say what pixels tell.
+and `uncertainty` say what pixels tell. Textures go another way, `many`, by the `products` J v and J^T v and a `prior`.
 """
 
 from pathjax.inverse.fitting import Fit, fit

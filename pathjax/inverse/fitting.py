@@ -27,8 +27,11 @@ from jaxtyping import Array, Real
 from pathjax.compile import usual_promotion
 from pathjax.errors import InputError
 from pathjax.integrators.options import check_counts
-from pathjax.inverse import problem, uncertainty
+from pathjax.inverse import problem, uncertainty, weights
 from pathjax.inverse.approach import approach
+from pathjax.inverse.many import Search
+from pathjax.inverse.prior import Prior
+from pathjax.inverse.problem import Problem
 from pathjax.inverse.refine import refine
 from pathjax.inverse.scan import scan as scanned
 from pathjax.inverse.state import State
@@ -48,7 +51,8 @@ class Fit:
 
     values: dict[str, np.ndarray]
     standard_errors: dict[str, np.ndarray]  # inf: the images do not determine it
-    covariance: np.ndarray  # (n, n) in the order of `components`; rows of what is not determined: inf, nan beside it
+    # (n, n) in the order of `components`; rows of what is not determined: inf, nan beside it. None: of many numbers.
+    covariance: np.ndarray | None
     components: list[str]
     undetermined: list[dict[str, float]]  # directions that the images do not determine: component -> change
     at_bound: list[str]  # components that ended at a bound of their parameter
@@ -67,8 +71,18 @@ class Fit:
         return self.scenes[0]
 
     @property
-    def correlation(self) -> np.ndarray:
-        """(n, n); nan beside what is not determined."""
+    def seen(self) -> dict[str, np.ndarray]:
+        """By name, which texels and other parameters the images determine: bool, of the shape but for channels."""
+        return {
+            name: np.isfinite(error).all(-1) if error.shape[-1:] == (3,) else np.isfinite(error)
+            for name, error in self.standard_errors.items()
+        }
+
+    @property
+    def correlation(self) -> np.ndarray | None:
+        """(n, n); nan beside what is not determined. None: of many numbers."""
+        if self.covariance is None:
+            return None
         sigma = np.sqrt(np.diag(self.covariance))
         with np.errstate(invalid="ignore"):
             return self.covariance / np.outer(sigma, sigma)
@@ -85,6 +99,7 @@ def fit(
     seed: int = 0,
     solver: object = None,
     scan: bool = True,
+    smoothness: float | str | None = None,
     progress: bool | Callable[[dict], None] = False,
 ) -> Fit:
     """Find parameters with which the scene looks like the target.
@@ -100,16 +115,21 @@ def fit(
         seed: of the first render; all others follow from it.
         solver: an optimistix least-squares solver or minimiser for the approach; default: LevenbergMarquardt.
         scan: try indices of refraction over their whole range first, since a local method finds the nearest minimum.
+        smoothness: of textures, how much neighbouring texels are expected to differ, in the root mean square and in
+            units of the parameter; "auto" finds it out; None: nothing is supposed of neighbours.
         progress: True for a line on stderr at each step, or a function that is called with each entry of the history.
     Returns:
         Fit. Ctrl-C ends it with what it has, marked as not converged.
     Raises:
         InputError: an unknown or repeated name, a start outside its bounds, a target of another size, with negative or
-            non-finite values, fewer measured pixels than unknowns.
+            non-finite values, fewer measured pixels than unknowns that are no texels; smoothness without a texture;
+            more numbers than memory has room for.
     Standard errors come from the scatter of the scores over pixels (White 1980). They hold the noise of target, its
     rounding, renders and Jacobians, and suppose that the scene can look like the target: `converged` is False where
     neighbouring residuals agree too well for noise (`uncertainty.structure`). The differences that stand for
     derivatives in an IOR have a bias (`jacobian`), which does not move the root of the score.
+    Those of textures, and of more than 300 numbers together, are those of the posterior, from a few draws of it
+    (`many`): uncertain by 10 to 20 %, and inf where no pixel tells anything of a texel, which keeps what was supposed.
     Clipped pixels are left out, and so are those that noise may have clipped: to leave out only those that it did clip
     would keep the darker ones. Which these are is told by renders and the noise around, never by the pixel itself.
     """
@@ -119,6 +139,10 @@ def fit(
         raise InputError(f"solver is a {type(solver).__name__}; use a least-squares solver or minimiser of optimistix")
     tell = _print_step if progress is True else progress or None
     views = problem.build(scene, target, names, start or {})
+    if problem.is_many(views.vector):
+        return _fit_many(views, spp, seed, smoothness, tell)
+    if smoothness is not None:
+        raise InputError("smoothness is about the texels of textures, and none is fitted")
     with Interrupts() as interrupts:
         state = State(views, spp, seed, solver, tell, interrupts)
         try:
@@ -127,6 +151,38 @@ def fit(
         except KeyboardInterrupt:
             converged, message = False, "interrupted"
         return _result(state, converged, message)
+
+
+def _fit_many(problem: Problem, spp: int, seed: int, smoothness, tell) -> Fit:
+    prior = Prior(problem.vector, problem.start, smoothness)
+    with Interrupts() as interrupts:
+        search = Search(problem, spp, seed, prior, tell, interrupts)
+        try:
+            with interrupts.raised():
+                converged, message = search.run()
+        except KeyboardInterrupt:
+            converged, message = False, "interrupted"
+        vector = problem.vector
+        values = vector.unpack(search.values)
+        images, residuals = _seen(problem, search.halves, search.noise) if search.noise else ([], [])
+        at_bound = (search.values <= search.low) | (search.values >= search.high)
+        labels = vector.labels
+        return Fit(
+            values=values,
+            standard_errors=vector.unpack(search.standard_errors),
+            covariance=None,
+            components=labels,
+            undetermined=[],
+            at_bound=[labels[i] for i in np.flatnonzero(at_bound)],
+            converged=converged,
+            message=message,
+            images=images,
+            residuals=residuals,
+            history=search.history,
+            compile_seconds=search.products.compile_seconds,
+            run_seconds=time.perf_counter() - search.started - search.products.compile_seconds,
+            scenes=[problem.with_values(scene, values) for scene in problem.scenes],
+        )
 
 
 def step_text(entry: dict) -> str:
@@ -171,15 +227,7 @@ def _result(state: State, converged: bool, message: str) -> Fit:
         unknown = (np.abs(solution.undetermined) > uncertainty.TOUCHED_SHARE).any(1)
         covariance[unknown] = covariance[:, unknown] = np.nan
         covariance[unknown, unknown] = np.inf
-    images, residuals = [], []
-    if state.noise is not None:
-        for (a, b), target, variance in zip(state.halves(), problem.targets, state.noise.values, strict=True):
-            mean = (a + b) / 2
-            images.append((mean + target.image) / problem.exposure)
-            # Of both: the scatter of the residuals themselves says how noisy the target is.
-            relative = np.where(target.usable, mean / np.sqrt(variance), np.nan)
-            spread = np.nanstd(relative) if target.usable.any() else 1.0
-            residuals.append(relative / max(spread, np.finfo(float).tiny))
+    images, residuals = _seen(problem, state.halves(), state.noise) if state.noise else ([], [])
     return Fit(
         values=values,
         standard_errors=vector.unpack(np.sqrt(np.diag(covariance))),
@@ -196,3 +244,16 @@ def _result(state: State, converged: bool, message: str) -> Fit:
         run_seconds=time.perf_counter() - state.started - state.compile_seconds,
         scenes=[problem.with_values(scene, values) for scene in problem.scenes],
     )
+
+
+def _seen(problem: Problem, halves: weights.Halves, noise: weights.Noise):
+    """Images of the views (H, W, 3), and residuals in standard deviations."""
+    images, residuals = [], []
+    for (a, b), target, variance in zip(halves, problem.targets, noise.values, strict=True):
+        mean = (a + b) / 2
+        images.append((mean + target.image) / problem.exposure)
+        # Of both: the scatter of the residuals themselves says how noisy the target is.
+        relative = np.where(target.usable, mean / np.sqrt(variance), np.nan)
+        spread = np.nanstd(relative) if target.usable.any() else 1.0
+        residuals.append(relative / max(spread, np.finfo(float).tiny))
+    return images, residuals

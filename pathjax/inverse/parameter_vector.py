@@ -24,6 +24,11 @@ class ParameterVector:
     parameters: tuple[tuple[str, Parameter], ...]
 
     @property
+    def count(self) -> int:
+        """n."""
+        return sum(math.prod(p.shape) for _, p in self.parameters)
+
+    @property
     def labels(self) -> list[str]:
         """Of the components: `glass.int_ior`, `white.reflectance.r`, `wall.reflectance[0, 2].r`."""
         return [f"{name}{suffix}" for name, p in self.parameters for suffix in _suffixes(p.shape)]
@@ -31,7 +36,7 @@ class ParameterVector:
     @property
     def bounds(self) -> np.ndarray:
         """(n, 2)."""
-        return np.array([p.bounds for _, p in self.parameters for _ in range(math.prod(p.shape))])
+        return np.concatenate([np.tile(p.bounds, (math.prod(p.shape), 1)) for _, p in self.parameters])
 
     def pack(self, values: Mapping) -> np.ndarray:
         """(n,) float64."""

@@ -16,6 +16,9 @@ from pathjax.scene import parameters as named
 from pathjax.scene.scene import Scene
 from pathjax.sensors import film
 
+# Up to so many numbers are fitted by their Jacobian.
+MOST_COLUMNS = 300
+
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
@@ -114,11 +117,6 @@ def build(scene, target, names, start) -> Problem:
         holder = next((s for s in scenes if name in named.about(s).parameters), scenes[0])
         found[name] = named.find(holder, name)
         values[name] = named.parameters(holder)[name]
-        if found[name].is_texture:
-            raise InputError(
-                f"{name} is a texture, and fit takes no more unknowns than a Jacobian has columns; descend along the "
-                "gradient that jax.grad gives of a loss of `render` (`pathjax help derivatives` has ten lines that do)"
-            )
     for name, value in start.items():
         if name not in found:
             raise InputError(f"start names {name}, which is not fitted; fitted are {', '.join(names)}")
@@ -126,11 +124,11 @@ def build(scene, target, names, start) -> Problem:
         values[name] = named.checked(f"start of {name}:", value, found[name], dtype)
     targets = [_target(s, t, i, len(scenes)) for i, (s, t) in enumerate(zip(scenes, targets, strict=True))]
     vector = ParameterVector(tuple(found.items()))
-    pixels, unknowns = sum(int(t.usable.any(-1).sum()) for t in targets), len(vector.labels)
+    pixels = sum(int(t.usable.any(-1).sum()) for t in targets)
     if not pixels:
         raise InputError("every pixel of the target is clipped or left out; give one that is exposed for the scene")
-    if pixels < unknowns:
-        raise InputError(f"{pixels} pixels cannot determine {unknowns} numbers; give larger targets or more views")
+    if pixels < vector.count and not is_many(vector):
+        raise InputError(f"{pixels} pixels cannot determine {vector.count} numbers; give larger targets or more views")
     level = np.concatenate([target.image[target.usable] for target in targets]).mean()
     exposure = float(np.exp2(-np.floor(np.log2(level)))) if level > 0 else 1.0
     targets = [
@@ -141,6 +139,11 @@ def build(scene, target, names, start) -> Problem:
     own = [replace(each, film=film.with_own_samples(each.film)) for each in scenes]
     groups = _groups(own, targets, exposure, names)
     return Problem(scenes, targets, exposure, rounding, groups, vector, vector.pack(values))
+
+
+def is_many(vector: ParameterVector) -> bool:
+    """Whether there are more numbers than a Jacobian should have columns."""
+    return vector.count > MOST_COLUMNS or any(p.is_texture for _, p in vector.parameters)
 
 
 def _target(scene, target, number, count) -> Target:

@@ -207,7 +207,7 @@ def test_what_takes_a_derivative_of_each_number_refuses_textures(screen):
     with pytest.raises(pj.InputError, match=f"{NAME} is a texture"):
         pj.jacobian(screen, [NAME], 1)
     with pytest.raises(pj.InputError, match=f"{NAME} is a texture"):
-        pj.fit(screen, np.ones((RES, RES, 3)), [NAME])
+        pj.normal_equations(screen, [NAME], np.ones((RES, RES, 3)))
     with pytest.raises(pj.InputError, match="second derivatives are not"):
         jax.hessian(lambda x: pj.render(pj.with_parameters(screen, {NAME: x}), 1).sum())(pj.parameters(screen)[NAME])
 

@@ -168,8 +168,11 @@ def test_what_images_do_not_determine_is_named(make_scene, store):
 
 
 def test_a_parameter_that_does_not_show_is_named(make_scene, store):
-    body = ROOM + """<bsdf type="diffuse" id="hidden"><rgb name="reflectance" value="0.5"/></bsdf>
+    body = (
+        ROOM
+        + """<bsdf type="diffuse" id="hidden"><rgb name="reflectance" value="0.5"/></bsdf>
 <shape type="sphere"><point name="center" x="0" y="0" z="90"/><ref id="hidden"/></shape>"""
+    )
     scene = make_scene(body, res=16, depth=2, origin="0, 0.5, 3", fov=50)
     target = store(pj.render(scene, 256, seed=1))
     fit = pj.fit(scene, target, ["floor.reflectance", "hidden.reflectance"], spp=32)

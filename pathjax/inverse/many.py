@@ -1,0 +1,308 @@
+"""Fits of many numbers, such as the texels of textures: Gauss-Newton without J, on J v and J^T v.
+
+    (J' W J + P + damping) step = J' W (target - image) + P (mean - values)
+
+by conjugate gradients, with the precision P of a `Prior`. The paths of J are the same for all products of a step, and
+independent of those of the image, so that noise does not bias the right-hand side; every step has fresh ones. Samples
+are few at first, and grow when the image misses the target by no more than its noise. Pixels that tell nearly nothing
+are left out.
+
+Standard errors come from draws of the posterior: with e1 and e2 of unit normal numbers, the solution for the right-hand
+side J' W^(1/2) e1 + P^(1/2) e2 has the covariance (J' W J + P)^-1 (Papandreou and Yuille 2010, NIPS).
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+import numpy as np
+from scipy import ndimage
+from scipy.sparse.linalg import LinearOperator, cg
+
+from pathjax.errors import InputError
+from pathjax.inverse import weights
+from pathjax.inverse.prior import Prior, is_grid
+from pathjax.inverse.problem import Problem
+from pathjax.inverse.products import Products
+from pathjax.inverse.uncertainty import MAX_RELATIVE_ERROR
+from pathjax.system import memory
+from pathjax.system.interrupts import Interrupts
+
+# The samples of each level, as parts of those of the last.
+LEVELS = 16, 4, 1
+# Samples of the products of J: one with J' W J costs as much as two or three images of so many.
+PRODUCT_SPP = 8
+MAX_STEPS, MAX_ITERATIONS, TOLERANCE = 4, 30, 0.03
+# Pixels are left out that tell less than this part of what those tell that half of all is known from.
+LEAST_TOLD = 0.02
+# A level is left when what the image misses is no more than this part of the variance of noise.
+SETTLED = 1.0
+# Where the last step led is looked at with this part of the samples.
+CHECK_PART = 4
+# A step is taken back if what the image misses has grown by so many standard errors.
+GROWN, DAMPING = 4, 0.1
+# Steps are made with other weights, if the target's noise turns out so many times what it was taken for.
+OTHER_NOISE = 1.5
+# Neighbouring residuals may be correlated by so much: what is supposed of texels shows in many pixels, faintly.
+MOST_AGREEMENT = 0.05
+# Draws of the posterior: variances of texels are means over windows of so many texels, those of other numbers are not.
+TEXEL_DRAWS, OTHER_DRAWS, WINDOW = 3, 16, 5
+# Renders from which the variance of a pixel is found; smoothed over so many pixels, and floored at a part of the mean.
+BATCHES, SMOOTHED, FLOOR = 4, 0.8, 0.02
+# Arrays of the size of the parameters, in float64, that a fit holds at once.
+ARRAYS = 24
+
+
+class Search:
+    """Values, and what the last renders said."""
+
+    def __init__(
+        self, problem: Problem, spp: int, seed: int, prior: Prior, tell: Callable | None, interrupts: Interrupts
+    ):
+        count = len(problem.start)
+        memory.check(8 * ARRAYS * count, f"fits of {count} numbers", "fit a smaller texture, or fewer at once")
+        self.problem, self.vector, self.prior = problem, problem.vector, prior
+        self.products, self.random = Products(problem, seed), np.random.default_rng(seed)
+        self.values = problem.start.astype(float)
+        self.low, self.high = self.vector.bounds.T
+        self.spp = 2 * spp
+        self.target_part: float | None = None  # variance of the target, over that of one sample; None: not known
+        self.standard_errors = np.full(len(self.values), np.nan)
+        self.halves: weights.Halves = []  # of all pixels, when they were surveyed last
+        self.noise: weights.Noise | None = None
+        self.accepted: tuple[np.ndarray, float] | None = None  # values, and how much their image misses
+        self.damping = 0.0
+        self.history: list[dict] = []
+        self.tell, self.interrupts, self.started = tell, interrupts, time.perf_counter()
+
+    def run(self) -> tuple[bool, str]:
+        """Find values and standard errors. Returns whether it converged, and what to mind."""
+        self.survey()
+        for part in LEVELS:
+            if part == LEVELS[-1]:
+                self.survey()
+            self.descend(_whole(self.spp / part), part == LEVELS[-1])
+        supposed, found = 2 * self.render_part, self.check()
+        if not 1 / OTHER_NOISE < found / supposed < OTHER_NOISE:
+            self.descend(_whole(self.spp), True)
+            supposed, found = self.render_part + self.target_part, self.check()
+        self.find_errors(np.sqrt(found / supposed))
+        self.survey()
+        return self.verdict()
+
+    def descend(self, samples: int, last: bool) -> None:
+        """Steps with so many samples, until what the image misses was no more than noise."""
+        for _ in range(MAX_STEPS):
+            excess = self.look(samples)
+            self.step()
+            if last:
+                self.step_again()
+            self.record(samples)
+            self.deviation = self.draw()
+            self.prior.estimate(self.values, self.deviation)
+            if excess < SETTLED:
+                break
+
+    def check(self) -> float:
+        """Look at where the last step led. Returns the variance of target and image, over that of one sample."""
+        equations = self.weights, self.render_part
+        self.excess = self.look(_whole(self.spp / CHECK_PART))
+        self.weights, self.render_part = equations
+        # The expectation of this square is the number of parameters that the pixels determine: so many values are
+        # fitted to noise, and the others miss the noise of the target.
+        determined = (self.weights * self.push(self.deviation) ** 2).sum()
+        left = max((self.weights > 0).sum() - determined, 1)
+        self.target_part = float(np.clip(self.missed / left, 0, 1))
+        return self.render_part + self.target_part
+
+    # ---- pixels -----------------------------------------------------------------------------------------------------
+
+    def survey(self) -> None:
+        """Render all pixels with few samples: how noisy each is, what it misses, and which of them tell something."""
+        problem, products = self.problem, self.products
+        products.keep([np.ones(t.image.shape[:2], bool) for t in problem.targets])
+        self.accepted = None  # what was missed is of other pixels from now on
+        self.renders, self.variances = 0, [np.zeros(t.image.shape) for t in problem.targets]
+        self.target = products.kept([t.image for t in problem.targets])
+        spread = [products.spread(half) for half in self.render(2 * weights.NOISE_SPP)]
+        self.halves = list(zip(*spread, strict=True))
+        self.noise = weights.noise(self.halves, problem, self.spp)
+        sure = weights.surely_unclipped(self.halves, problem, self.noise)
+        usable = [t.usable & unclipped for t, unclipped in zip(problem.targets, sure, strict=True)]
+        slope = products.spread(products.push(self.values, self.prior.scale, PRODUCT_SPP, products.next_draw()))
+        told = [(u * s**2 / v).sum(-1) for s, u, v in zip(slope, usable, self.variance(), strict=True)]
+        most = np.sort(np.concatenate([each.ravel() for each in told]))[::-1]
+        if not most[0] > 0:
+            raise InputError("no pixel of the target that may be used depends on what is to be fitted")
+        least = LEAST_TOLD * most[np.searchsorted(np.cumsum(most), most.sum() / 2)]
+        self.usable = usable
+        products.keep([each > least for each in told])
+        self.target = products.kept([t.image for t in problem.targets])
+
+    def render(self, samples: int) -> tuple[np.ndarray, np.ndarray]:
+        """Residuals (N, 3) of two independent renders, of half the samples each; adds to what is known of noise."""
+        products, each = self.products, samples // BATCHES
+        batches = [products.images(self.values, each, products.next_draw()) for _ in range(BATCHES)]
+        variance = np.var(batches, axis=0, ddof=1)
+        if self.renders:
+            # Means of many samples may be better than the number of samples says.
+            self.render_part = float(np.mean(variance / products.kept(self.variance()))) / BATCHES
+        spread = products.spread(variance * each)
+        self.variances = [known + more for known, more in zip(self.variances, spread, strict=True)]
+        self.renders += 1
+        a, b = (np.mean(half, 0) - self.target for half in (batches[: BATCHES // 2], batches[BATCHES // 2 :]))
+        return a, b
+
+    def variance(self) -> list[np.ndarray]:
+        """(H, W, 3) of one sample, of each view."""
+        found = []
+        for total, mask in zip(self.variances, self.products.masks, strict=True):
+            smooth = ndimage.gaussian_filter(total / self.renders, (SMOOTHED, SMOOTHED, 0), truncate=2)
+            found.append(smooth + FLOOR * smooth[mask].mean(0) + self.problem.rounding**2)
+        return found
+
+    def look(self, samples: int) -> float:
+        """Render the kept pixels at the values. Returns what they miss, over the noise, both squared.
+
+        If that has grown, the last step is taken back, and damped from now on (Levenberg).
+        """
+        problem, products = self.problem, self.products
+        # The noise is that of earlier renders: pixels that it made bright by chance must not weigh less for it.
+        variance = products.kept(self.variance())
+        rounding = products.kept([np.broadcast_to(t.step, t.image.shape) for t in problem.targets]) ** 2 / 12
+        usable = products.kept(self.usable)
+        a, b = self.render(samples)
+        target_part = self.render_part if self.target_part is None else self.target_part
+        self.weights = usable / (variance * (self.render_part + target_part) + rounding)
+        missed = (usable * a * b / variance).sum(-1)
+        mean, error = missed.mean(), missed.std() / np.sqrt(len(missed))
+        if self.accepted is not None and mean > self.accepted[1] + GROWN * error:
+            self.values, self.damping = self.accepted[0], max(10 * self.damping, DAMPING)
+            a, b = self.render(samples)
+        else:
+            self.accepted, self.damping = (self.values, mean), self.damping / 10
+        self.residual = (a + b) / 2
+        self.missed = float((usable * a * b / variance).sum())
+        self.loss = float((self.weights * a * b).sum() / 2)
+        return 2 * self.loss / max(usable.sum(), 1)
+
+    # ---- parameters -------------------------------------------------------------------------------------------------
+
+    def step(self) -> None:
+        """Gauss-Newton at the values, with what was looked at."""
+        products, prior, values, w = self.products, self.prior, self.values, self.weights
+        draw, n = products.next_draw(), len(values)
+        self.pull = lambda adjoint: products.pull(values, adjoint, PRODUCT_SPP, draw)
+        self.push = lambda change: products.push(values, change, PRODUCT_SPP, draw)
+        gradient = self.pull(w * self.residual) + prior.gradient(values)
+        # What is at a bound and would leave it stays there.
+        free = ~((values <= self.low) & (gradient > 0) | (values >= self.high) & (gradient < 0))
+        # As J >= 0 for what light is multiplied by, sums of rows are bounds of the diagonal.
+        self.rows = np.abs(self.pull(w * self.push(np.ones(n))))
+        self.diagonal = self.rows + prior.diagonal()
+        damping = self.damping * self.diagonal
+
+        def matrix(x):
+            x = np.where(free, x, 0)
+            return np.where(free, self.pull(w * self.push(x)) + prior.times(x) + damping * x, 0)
+
+        shape = (n, n)
+        self.matrix = LinearOperator(shape, matrix, dtype=float)
+        self.preconditioner = LinearOperator(shape, lambda x: x / self.diagonal, dtype=float)
+        self.free = free
+        self.values = np.clip(values + self.solve(-gradient), self.low, self.high)
+
+    def step_again(self) -> None:
+        """Another step, on the image as J has it after the last one.
+
+        Noise makes J' W J of few samples too large, and steps too short. Other paths show what is left.
+        """
+        products, (before, _) = self.products, self.accepted
+        moved = products.push(before, self.values - before, 2 * PRODUCT_SPP, products.next_draw())
+        self.residual = self.residual + moved
+        self.step()
+
+    def solve(self, right: np.ndarray) -> np.ndarray:
+        """What solves the equations of the last step for another right-hand side."""
+        right = np.where(self.free, right, 0)
+        how = dict(rtol=TOLERANCE, maxiter=MAX_ITERATIONS, M=self.preconditioner, callback=self.listen)
+        return cg(self.matrix, right, **how)[0]
+
+    def draw(self) -> np.ndarray:
+        """(n,) a deviation from the values, as the posterior has it."""
+        noise = self.random.normal(size=self.weights.shape)
+        return self.solve(self.pull(np.sqrt(self.weights) * noise) + self.prior.draw(self.random))
+
+    def find_errors(self, larger: float) -> None:
+        """Standard errors of all numbers, inf of those of which no pixel knows anything by itself.
+
+        larger: than in the equations of the last step, in which the target was taken to be as noisy as the image.
+        """
+        grids = all(is_grid(p) for _, p in self.vector.parameters)
+        count = TEXEL_DRAWS if grids else OTHER_DRAWS
+        draws = [self.deviation, *(self.draw() for _ in range(count - 1))]
+        known = [self.known() for _ in range(count)]
+        # The diagonal says how they differ from texel to texel, and the draws how much larger they are than it says.
+        ratio = self.local_mean(np.mean(np.square(draws), 0) * self.diagonal)
+        found = larger * np.sqrt(ratio / self.diagonal)
+        rows = np.where(self.rows > 0, self.rows, 1)
+        known = self.local_mean(np.mean(known, 0) / rows) * self.rows
+        unseen = known * (MAX_RELATIVE_ERROR * self.prior.scale) ** 2 < 1
+        self.standard_errors = np.where(unseen, np.inf, found)
+
+    def known(self) -> np.ndarray:
+        """(n,) whose expectation is the diagonal of J' W J, of two independent J, so that their noise adds nothing."""
+        products = self.products
+        noisy = np.sqrt(self.weights) * self.random.normal(size=self.weights.shape)
+        a, b = (products.pull(self.values, noisy, PRODUCT_SPP, products.next_draw()) for _ in range(2))
+        return a * b
+
+    def local_mean(self, x: np.ndarray) -> np.ndarray:
+        """(n,) of texels, means over windows of them; of other numbers themselves."""
+        parts = self.vector.unpack(x)
+        for name, p in self.vector.parameters:
+            if is_grid(p):
+                size = (WINDOW, WINDOW) + (1,) * (len(p.shape) - 2)
+                parts[name] = ndimage.uniform_filter(parts[name], size)
+        return self.vector.pack(parts)
+
+    # ---- the end ----------------------------------------------------------------------------------------------------
+
+    def verdict(self) -> tuple[bool, str]:
+        self.noise = weights.noise(self.halves, self.problem, weights.NOISE_SPP)
+        agreement, structured = weights.structure(self.halves, self.problem, self.noise, self.usable)
+        if structured and agreement > MOST_AGREEMENT:
+            return False, (
+                f"the residuals have structure: neighbouring pixels are correlated by {agreement:.0%}. The scene "
+                "cannot look like the target, or what is supposed of texels is too strong; look at the residuals"
+            )
+        if self.excess > SETTLED:
+            return (
+                False,
+                f"the image still misses the target by more than its noise after {MAX_STEPS} steps; try more spp",
+            )
+        message = "converged: what the image misses is noise"
+        unseen = int(np.isinf(self.standard_errors).sum())
+        if unseen:
+            message += (
+                f"; of {unseen} of {len(self.values)} numbers the pixels tell nothing: they are what was supposed"
+            )
+        return True, message
+
+    def record(self, samples: int) -> None:
+        self.listen()
+        values = {name: float(np.mean(value)) for name, value in self.vector.unpack(self.values).items()}
+        seconds = time.perf_counter() - self.started
+        entry = {"stage": "descend", "spp": samples, "values": values, "loss": self.loss, "seconds": seconds}
+        self.history.append(entry)
+        if self.tell:
+            self.tell(entry)
+
+    def listen(self, _=None) -> None:
+        if self.interrupts.heard:  # its exception may have been lost, while Python collected garbage
+            raise KeyboardInterrupt
+
+
+def _whole(samples: float) -> int:
+    return max(int(samples) // BATCHES, 1) * BATCHES

@@ -1,0 +1,119 @@
+"""What a fit of many numbers evaluates: images of some pixels, J v and J^T v, of all views, without J.
+
+What is of pixels is (N, 3), of the kept pixels of all views one after another; what is of parameters (n,), in float64.
+Each evaluation is one kernel for a part of the pixels, so that a fit compiles three kernels, whichever pixels it keeps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from pathjax.inverse.compiled_cache import compiled
+from pathjax.inverse.problem import Problem, Views
+from pathjax.rendering.render import render_pixels
+
+# Pixels are rendered in so many parts, but in parts that are worth a kernel's start.
+PARTS, LEAST_PART = 8, 4096
+
+
+class Products:
+    """The kept pixels of a problem, and the kernels for them."""
+
+    def __init__(self, problem: Problem, seed: int):
+        self.problem, self.vector, self.seed = problem, problem.vector, jnp.uint32(seed)
+        self.dtype = problem.groups[0].targets.dtype
+        self.compile_seconds, self.draws = 0.0, 0
+        self.keep([np.ones(t.image.shape[:2], bool) for t in problem.targets])
+
+    def keep(self, masks: list[np.ndarray]) -> None:
+        """Evaluate from now on the pixels (H, W) bool of each view."""
+        self.masks = masks
+        self.parts: list[tuple[Views, jax.Array, np.ndarray]] = []  # group, pixels (V, part), where they are in (N,)
+        first = np.cumsum([0, *(int(mask.sum()) for mask in masks)])
+        self.count = int(first[-1])
+        for views in self.problem.groups:
+            own = [np.flatnonzero(masks[number].ravel()) for number in views.numbers]
+            part = min(max(masks[views.numbers[0]].size // PARTS, LEAST_PART), masks[views.numbers[0]].size)
+            for begin in range(0, max(map(len, own), default=0), part):
+                pixels = np.zeros((len(own), part), np.int32)
+                places = np.full((len(own), part), self.count)  # beyond the last: of no pixel
+                for row, (number, mine) in enumerate(zip(views.numbers, own, strict=True)):
+                    here = mine[begin : begin + part]
+                    pixels[row, : len(here)] = here
+                    places[row, : len(here)] = first[number] + begin + np.arange(len(here))
+                self.parts.append((views, jnp.asarray(pixels), places))
+
+    def next_draw(self) -> jax.Array:
+        """A number for renders that are independent of all before."""
+        self.draws += 1
+        return jnp.uint32(self.draws)
+
+    def images(self, values: np.ndarray, spp: int, draw, half: int = 0) -> np.ndarray:
+        """(N, 3), exposed."""
+        found = np.zeros((self.count + 1, 3))
+        for views, pixels, places in self.parts:
+            found[places] = self._run(_image, values, views, pixels, spp, draw, half)
+        return found[:-1]
+
+    def push(self, values: np.ndarray, change: np.ndarray, spp: int, draw) -> np.ndarray:
+        """J change: (n,) -> (N, 3)."""
+        found = np.zeros((self.count + 1, 3))
+        change = jnp.asarray(change, self.dtype)
+        for views, pixels, places in self.parts:
+            found[places] = self._run(_push, values, views, pixels, spp, draw, 0, change)
+        return found[:-1]
+
+    def pull(self, values: np.ndarray, adjoint: np.ndarray, spp: int, draw) -> np.ndarray:
+        """J^T adjoint: (N, 3) -> (n,)."""
+        padded = np.concatenate([adjoint, np.zeros((1, 3))])
+        total = np.zeros(len(values))
+        for views, pixels, places in self.parts:
+            mine = jnp.asarray(padded[places], self.dtype)
+            total += self._run(_pull, values, views, pixels, spp, draw, 0, mine)
+        return total
+
+    def spread(self, kept: np.ndarray, other: float = 0.0) -> list[np.ndarray]:
+        """(N, C) of the kept pixels to (H, W, C) of each view, with `other` elsewhere."""
+        parts = np.split(kept, np.cumsum([int(mask.sum()) for mask in self.masks])[:-1])
+        images = []
+        for mask, part in zip(self.masks, parts, strict=True):
+            image = np.full((*mask.shape, kept.shape[1]), other)
+            image[mask] = part
+            images.append(image)
+        return images
+
+    def kept(self, by_view: list[np.ndarray]) -> np.ndarray:
+        """The inverse of `spread`."""
+        return np.concatenate([image[mask] for image, mask in zip(by_view, self.masks, strict=True)])
+
+    def _run(self, function: Callable, values, views: Views, pixels, spp: int, draw, half: int, *more):
+        values = jnp.asarray(values, self.dtype)
+        arguments = values, views, pixels, jnp.uint32(spp), views.seeds(self.seed, draw, half), *more
+        bound = partial(function, vector=self.vector)
+        program, seconds = compiled((function, self.vector), lambda *a: jax.jit(bound).lower(*a).compile(), *arguments)
+        self.compile_seconds += seconds
+        return np.asarray(program(*arguments), float)
+
+
+def _image(values, views: Views, pixels, spp, seeds, vector):
+    """(V, part, 3)."""
+    by_name = vector.unpack(values)
+
+    def one(scene, work):
+        seed, pixels = work
+        return render_pixels(views.with_values(scene, by_name), pixels, 0, spp, seed) * views.exposure
+
+    return views.map(one, (seeds, pixels))
+
+
+def _push(values, views, pixels, spp, seeds, change, vector):
+    return jax.jvp(lambda values: _image(values, views, pixels, spp, seeds, vector), (values,), (change,))[1]
+
+
+def _pull(values, views, pixels, spp, seeds, adjoint, vector):
+    return jax.vjp(lambda values: _image(values, views, pixels, spp, seeds, vector), values)[1](adjoint)[0]

@@ -1,0 +1,167 @@
+"""Textures from images: recovery within stated errors, texels that no pixel sees, what is supposed, bad input."""
+
+import numpy as np
+import pytest
+
+import pathjax as pj
+from pathjax.images import write_exr
+from pathjax.inverse.parameter_vector import ParameterVector
+from pathjax.inverse.prior import Prior
+from pathjax.kinds.parameter import Parameter
+from pathjax.system import memory
+
+NAME = "picture.reflectance"
+SIZE = 16
+
+
+@pytest.fixture(scope="module")
+def wall(make_scene, tmp_path_factory):
+    """A textured square before a lamp, whose left part is in view."""
+    file = tmp_path_factory.mktemp("pictures") / "wall.exr"
+    numbers = np.random.default_rng(1).uniform(0.2, 0.8, (3, SIZE, SIZE)).astype(np.float32)
+    write_exr(file, dict(zip("RGB", numbers, strict=True)), {})
+    picture = (
+        f'<texture type="bitmap" name="reflectance"><string name="filename" value="{file}"/>'
+        '<boolean name="raw" value="true"/></texture>'
+    )
+    return make_scene(
+        f'<bsdf type="diffuse" id="picture">{picture}</bsdf>'
+        '<shape type="rectangle"><transform name="to_world"><translate x="0.5"/></transform><ref id="picture"/></shape>'
+        '<shape type="rectangle"><transform name="to_world"><rotate y="1" angle="180"/><translate z="5"/>'
+        '</transform><emitter type="area" id="lamp"><rgb name="radiance" value="20, 18, 15"/></emitter></shape>',
+        res=40,
+        depth=2,
+        fov=28,
+    )
+
+
+@pytest.fixture(scope="module")
+def truth(wall):
+    return np.asarray(pj.parameters(wall)[NAME])
+
+
+@pytest.fixture(scope="module")
+def target(wall):
+    return np.asarray(pj.render(wall, 64, seed=9))
+
+
+@pytest.fixture(scope="module")
+def fit(wall, truth, target):
+    return pj.fit(wall, target, [NAME], start={NAME: np.full(truth.shape, 0.5)}, spp=16)
+
+
+@pytest.mark.slow
+def test_a_texture_is_recovered_within_its_errors(fit, truth):
+    assert fit.converged, fit.message
+    error, stated = fit.values[NAME] - truth, fit.standard_errors[NAME]
+    known = stated < 0.1
+    assert known.mean() > 0.3
+    # Stated errors are uncertain by 10 to 20 %, and hundreds of texels leave 3 %.
+    assert 0.7 < np.sqrt(np.mean((error / stated)[known] ** 2)) < 1.4
+    assert np.sqrt(np.mean(error[stated < 0.02] ** 2)) < 0.025
+
+
+@pytest.mark.slow
+def test_texels_that_no_pixel_sees_are_named_and_keep_their_start(fit):
+    seen = fit.seen[NAME]
+    assert seen.shape == (SIZE, SIZE)
+    # The square reaches from -0.5 to 1.5, and the picture to tan(14 degrees) 4 = 1: to the twelfth texel, and at the
+    # other end, where the texture repeats, the last one.
+    assert not seen[:, 13:15].any() and seen[:, :12].all()
+    assert np.isinf(fit.standard_errors[NAME][:, 13:15]).all()
+    assert np.abs(fit.values[NAME][:, 13:15] - 0.5).max() < 0.05
+    assert "tell nothing" in fit.message
+
+
+@pytest.mark.slow
+def test_the_result_is_that_of_any_fit(fit, wall, truth):
+    np.testing.assert_array_equal(pj.parameters(fit.scene)[NAME], fit.values[NAME].astype(np.float32))
+    assert fit.images[0].shape == (40, 40, 3) and fit.covariance is None and fit.correlation is None
+    assert len(fit.components) == truth.size and {entry["stage"] for entry in fit.history} == {"descend"}
+    spp = [entry["spp"] for entry in fit.history]
+    assert spp == sorted(spp) and spp[-1] == 32
+
+
+@pytest.mark.slow
+def test_interrupted_fits_give_what_they_have(wall, truth, target):
+    def interrupt(entry):
+        raise KeyboardInterrupt
+
+    found = pj.fit(wall, target, [NAME], start={NAME: np.full(truth.shape, 0.5)}, spp=16, progress=interrupt)
+    assert not found.converged and found.message == "interrupted"
+    assert np.isnan(found.standard_errors[NAME]).all() and (found.values[NAME] != 0.5).any()
+
+
+@pytest.mark.parametrize(
+    "start, how, says",
+    [
+        (np.zeros((8, 8, 3)), {}, [NAME, "16, 16, 3", "8 x 8 x 3"]),
+        (0.5, {"smoothness": -1}, ["smoothness = -1", "auto"]),
+        (0.5, {"smoothness": "much"}, ["smoothness = 'much'"]),
+    ],
+)
+def test_bad_input_is_refused(wall, target, start, how, says):
+    with pytest.raises(pj.InputError) as refused:
+        pj.fit(wall, target, [NAME], start={NAME: start}, **how)
+    assert all(part in str(refused.value) for part in says)
+
+
+def test_masks_that_leave_nothing_are_refused(wall, target):
+    with pytest.raises(pj.InputError, match="every pixel"):
+        pj.fit(wall, pj.Target(target, measured=np.zeros((40, 40, 1), bool)), [NAME])
+
+
+def test_what_memory_has_no_room_for_is_refused(wall, target, monkeypatch):
+    monkeypatch.setattr(memory, "limit", lambda: 1000)
+    with pytest.raises(pj.InputError, match="768 numbers.*smaller texture"):
+        pj.fit(wall, target, [NAME])
+
+
+def test_smoothness_without_a_texture_is_refused(wall, target):
+    with pytest.raises(pj.InputError, match="no.* is fitted"):
+        pj.fit(wall, target, ["lamp.radiance"], smoothness=0.1)
+
+
+# ---- the prior ------------------------------------------------------------------------------------------------------
+
+
+def texture(height, width):
+    shape = height, width, 3
+    return ParameterVector((("a", Parameter((), (0,), shape, (0.0, 1.0), rows=height * width)),))
+
+
+def matrix(prior):
+    return np.stack([prior.times(row) for row in np.eye(len(prior.mean))])
+
+
+def test_the_precision_of_a_prior_is_that_of_its_gradient_diagonal_and_draws():
+    prior = Prior(texture(3, 4), np.full(36, 0.5), 0.2)
+    P = matrix(prior)
+    np.testing.assert_allclose(P, P.T)
+    np.testing.assert_allclose(np.diag(P), prior.diagonal())
+    x = np.random.default_rng(0).normal(size=36)
+    np.testing.assert_allclose(prior.gradient(x) - prior.gradient(0 * x), P @ x)
+    # Between equal texels there is nothing, and the start is where the density is largest.
+    np.testing.assert_allclose(prior.gradient(prior.mean), 0, atol=1e-12)
+    random = np.random.default_rng(0)
+    draws = np.stack([prior.draw(random) for _ in range(1000)])
+    spread = np.sqrt((np.diag(P)[:, None] * np.diag(P) + P**2) / 1000)
+    assert np.abs((draws.T @ draws / 1000 - P) / spread).max() < 5  # 666 nearly normal numbers: a false alarm in 2000
+
+
+def test_differences_of_texels_are_as_large_as_was_supposed():
+    prior = Prior(texture(12, 12), np.full(432, 0.5), 0.02)
+    covariance = np.linalg.inv(matrix(prior))
+    random = np.random.default_rng(2)
+    draws = (np.linalg.cholesky(covariance) @ random.normal(size=(432, 20))).T.reshape(20, 12, 12, 3)
+    down, right = np.diff(draws, axis=1), np.diff(draws, axis=2)
+    rms = np.sqrt((np.sum(down**2) + np.sum(right**2)) / (down.size + right.size))
+    assert abs(rms / 0.02 - 1) < 0.02  # 8580 independent differences leave 0.8 %
+
+
+def test_the_size_of_differences_is_found_where_values_are_known():
+    vector, random = texture(24, 24), np.random.default_rng(3)
+    prior = Prior(vector, np.full(1728, 0.5), "auto")
+    prior.estimate(0.5 + 0.03 * random.normal(size=1728), 1e-9 * random.normal(size=1728))
+    # Of independent texels: the root mean square of differences.
+    assert abs(prior.difference["a"] / (0.03 * np.sqrt(2)) - 1) < 0.1
