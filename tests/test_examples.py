@@ -18,6 +18,7 @@ SMALL = {
     "radiosity": ["--res", "32", "--spp", "16", "--patches", "60", "200"],
     "own_loss": ["--res", "16", "--spp", "8", "--steps", "5"],
     "choices": ["--res", "16", "--spp", "4,16", "--seeds", "2", "--reference-spp", "256"],
+    "rough_metal": ["--res", "24", "--target-spp", "256", "--spp", "32"],
     "own_bsdf": ["--res", "24", "--target-spp", "256", "--spp", "16"],
     "original_results": ["--res", "32", "--spp", "8"],
     "check_mitsuba": ["--res", "32", "--spp", "16", "--seeds", "8"],

@@ -189,7 +189,7 @@ def _rows(views: Views, by_name, vector, scale, spp, seeds, devices, pixels, the
         image, J, *_ = pixel_jacobians(named.nameless(scene), *work, devices=devices)
         return image * views.exposure, vector.columns(J, image) * (scale * views.exposure)
 
-    return jax.vmap(partial(views.map, of_view))(seeds)
+    return lax.map(partial(views.map, of_view), seeds)
 
 
 def _of_views(

@@ -35,8 +35,11 @@ class ParameterVector:
 
     @property
     def bounds(self) -> np.ndarray:
-        """(n, 2)."""
-        return np.concatenate([np.tile(p.bounds, (math.prod(p.shape), 1)) for _, p in self.parameters])
+        """(n, 2) between which values count."""
+        limits = [(max(p.bounds[0], p.least), p.bounds[1]) for _, p in self.parameters]
+        return np.concatenate(
+            [np.tile(pair, (math.prod(p.shape), 1)) for pair, (_, p) in zip(limits, self.parameters, strict=True)]
+        )
 
     def pack(self, values: Mapping) -> np.ndarray:
         """(n,) float64."""
@@ -101,17 +104,30 @@ class ParameterVector:
             first += count
         return jnp.concatenate(parts, -1)
 
+    @property
+    def _logarithmic(self) -> np.ndarray:
+        """(n,) bool: what counts is the ratio of two values, as of roughnesses, which begin at their least."""
+        return np.array([math.isfinite(p.least) for _, p in self.parameters for _ in range(math.prod(p.shape))])
+
+    @property
+    def _limits(self) -> tuple[np.ndarray, np.ndarray]:
+        """(2, n) bounds, of their logarithms where these are what counts; and whether they are two."""
+        bounds = self.bounds.T
+        limits = np.where(self._logarithmic, np.log(np.where(self._logarithmic, bounds, 1)), bounds)
+        return limits, np.isfinite(limits[1])
+
     def bounded(self, x):
         """Unbounded (n,) to values: logistic between two bounds; above one, exponential where small, else linear."""
-        low, high = (jnp.asarray(b, x.dtype) for b in self.bounds.T)
-        two = jnp.isfinite(high)
-        width = jnp.where(two, high - low, 1)
-        return low + jnp.where(two, width * jax.nn.sigmoid(x), jax.nn.softplus(jnp.where(two, 0, x)))
+        (low, high), two = self._limits
+        width = jnp.asarray(np.where(two, high - low, 1), x.dtype)
+        beyond = jnp.where(two, width * jax.nn.sigmoid(x), jax.nn.softplus(jnp.where(two, 0, x)))
+        y = jnp.asarray(low, x.dtype) + beyond
+        return jnp.where(self._logarithmic, jnp.exp(jnp.where(self._logarithmic, y, 0)), y)
 
     def unbounded(self, values) -> np.ndarray:
         """Inverse of `bounded`; values at a bound are taken a little inside."""
-        low, high = self.bounds.T
-        two = np.isfinite(high)
+        (low, high), two = self._limits
+        values = np.where(self._logarithmic, np.log(np.where(self._logarithmic, values, 1)), values)
         width = np.where(two, high - low, 1)
         share = np.clip((values - low) / width, _EDGE, np.where(two, 1 - _EDGE, np.inf))
         return np.where(two, np.log(share) - np.log1p(-np.where(two, share, 0)), share + np.log(-np.expm1(-share)))
@@ -119,7 +135,10 @@ class ParameterVector:
     def scale(self, values) -> np.ndarray:
         """(n,) what counts as a large change: the range between two bounds, else the value itself."""
         low, high = self.bounds.T
-        return np.where(np.isfinite(high), high - low, np.maximum(np.abs(values - np.maximum(low, 0)), _EDGE))
+        ranges = np.isfinite(high) & ~self._logarithmic
+        origin = np.where(self._logarithmic, 0, np.maximum(low, 0))
+        least = np.where(self._logarithmic, low, _EDGE)
+        return np.where(ranges, high - low, np.maximum(np.abs(values - origin), least))
 
 
 def _is_color(parameter: Parameter) -> bool:

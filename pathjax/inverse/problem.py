@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 
 from pathjax.errors import InputError
 from pathjax.images.metrics import ROUNDING
@@ -33,7 +34,7 @@ class Views:
     numbers: tuple[int, ...] = field(metadata={"static": True})  # of each view, its place in the caller's list
 
     def map(self, f, seeds):
-        """f(scene, seed) over the views, in one kernel; seeds: (V,) uint32."""
+        """f(scene, seed) of one view after the other, by one kernel; seeds: (V,) uint32."""
         leaves, tree = jax.tree.flatten(self.scene)
 
         def one(varying, seed):
@@ -41,7 +42,8 @@ class Views:
             merged = [leaf if axis is None else next(rest) for leaf, axis in zip(leaves, self.axes, strict=True)]
             return f(jax.tree.unflatten(tree, merged), seed)
 
-        return jax.vmap(one)([leaf for leaf, axis in zip(leaves, self.axes, strict=True) if axis == 0], seeds)
+        stacked = [leaf for leaf, axis in zip(leaves, self.axes, strict=True) if axis == 0]
+        return lax.map(lambda each: one(*each), (stacked, seeds))
 
     def seeds(self, seed, draw, half: int):
         """(V,) uint32 of one of two independent halves, others for every draw.
@@ -122,6 +124,9 @@ def build(scene, target, names, start) -> Problem:
             raise InputError(f"start names {name}, which is not fitted; fitted are {', '.join(names)}")
         dtype = scenes[0].camera.origin.dtype
         values[name] = named.checked(f"start of {name}:", value, found[name], dtype)
+    for each in scenes:
+        held = {name: parameter for name, parameter in found.items() if name in named.about(each).parameters}
+        named.refuse_constant(Problem.with_values(each, values), held)
     targets = [_target(s, t, i, len(scenes)) for i, (s, t) in enumerate(zip(scenes, targets, strict=True))]
     vector = ParameterVector(tuple(found.items()))
     pixels = sum(int(t.usable.any(-1).sum()) for t in targets)

@@ -28,7 +28,6 @@ ROUNDING_IMAGES = 16
 class Solution(NamedTuple):
     """What one evaluation says about n components, in units of their scale."""
 
-    projector: np.ndarray  # (n, n) onto what is determined
     covariance: np.ndarray  # (n, n) within it
     undetermined: np.ndarray  # (n, k) directions, columns
     step: np.ndarray  # (n,) of Newton's method towards the root, within what is determined
@@ -63,7 +62,7 @@ def solve(normal: NormalEquations, free: np.ndarray) -> Solution:
     covariance = inside @ covariance[np.ix_(kept, kept)] @ inside.T
     step = -inside @ (inverse * along)[kept]
     inverse = (inside * inverse[kept]) @ inside.T
-    return Solution(inside @ inside.T, covariance, everywhere[:, ~kept], step, inverse)
+    return Solution(covariance, everywhere[:, ~kept], step, inverse)
 
 
 def _not_negative(covariance: np.ndarray) -> np.ndarray:

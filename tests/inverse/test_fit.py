@@ -386,6 +386,40 @@ def test_ior_and_colours_are_recovered_together(ball, ball_target):
     assert np.abs(z_scores(fit, pj.parameters(ball))).max() < 4.5
 
 
+# ---- rough metal ----------------------------------------------------------------------------------------------------
+
+METAL = ["metal.alpha", "metal.specular_reflectance"]
+
+
+@pytest.fixture(scope="module")
+def rough_ball(write_scene, tmp_path_factory):
+    """A file: a rough ball in a grey room with windows."""
+    sky = np.full((16, 32, 3), 0.4, np.float32)
+    sky[3:7, 2:5], sky[4:8, 10:13], sky[9:13, 27:30] = (4, 5, 6), (6, 5, 4), (2, 4, 2)
+    file = tmp_path_factory.mktemp("sky") / "sky.exr"
+    write_exr(file, dict(zip("RGB", np.moveaxis(sky, -1, 0), strict=True)), {})
+    metal = '''<bsdf type="roughconductor" id="metal"><string name="distribution" value="ggx"/>
+<float name="alpha" value="0.15"/><rgb name="specular_reflectance" value="0.9, 0.6, 0.3"/></bsdf>'''
+    light = f'<emitter type="envmap"><string name="filename" value="{file}"/></emitter>'
+    return write_scene(f'<shape type="sphere">{metal}</shape>{light}', res=32, depth=2, fov=32)
+
+
+@pytest.mark.slow
+def test_roughness_and_colour_are_recovered_from_a_target_of_mitsuba(rough_ball):
+    mi = pytest.importorskip("mitsuba")
+    mi.set_variant("scalar_rgb")
+    target = np.array(mi.render(mi.load_file(str(rough_ball)), spp=512, seed=3), float)
+    scene = pj.load_scene(rough_ball)
+    truth = {name: np.asarray(pj.parameters(scene)[name]) for name in METAL}
+    for alpha in (0.03, 0.5):
+        for color in (0.4, 0.95):
+            fit = pj.fit(scene, target, METAL, start=dict(zip(METAL, (alpha, color), strict=True)), spp=64)
+            assert fit.converged, fit.message
+            # 4 numbers, the same ones from all starts, beyond 3.5 sigma by chance: 2e-3.
+            assert np.abs(z_scores(fit, truth)).max() < 3.5
+            assert all((fit.standard_errors[name] < 0.02 * truth[name]).all() for name in METAL)
+
+
 # ---- bad input ------------------------------------------------------------------------------------------------------
 
 

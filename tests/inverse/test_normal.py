@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import pathjax as pj
+from pathjax.compile import native_map
 from pathjax.inverse import normal, problem
 from pathjax.system import memory
 
@@ -24,6 +25,7 @@ NAMES = ["glass.int_ior", "floor.reflectance", "metal.alpha", "sky.radiance"]
 RES, SPP, COUNT = 9, 4, 8
 # Of float32 sums of some hundred numbers, over the largest.
 ROUNDING = 3e-5
+WEIGHTS = np.random.default_rng(0).uniform(size=(RES, RES, 3))
 
 
 @pytest.fixture(scope="module")
@@ -37,29 +39,33 @@ def target():
 
 
 def made_up(scene, wanted, pixels, first, spp, seed, options, devices=None):
-    """Stands for `pixel_jacobians`, whose kernel takes long to compile: noise, and no scene."""
+    """Stands for `pixel_jacobians`, whose kernel takes long to compile: noise from -1 to 1, and no scene."""
 
-    def noise(number):
-        """(N, 3) from -1 to 1."""
-        which = pixels[:, None] * 3 + jnp.arange(3) + 1000 * number + (seed % 4099).astype(jnp.int32) * 7
-        return jnp.sin(which * which * 0.37)
+    def of_pixel(work):
+        pixel, seed = work
+        which = pixel * 3 + jnp.arange(3) + (seed % 4099).astype(jnp.int32) * 7
+        return [jnp.sin((which + 1000 * number) ** 2 * 0.37) for number in range(1 + len(wanted))]
 
-    J = {}
-    for number, (name, parameter) in enumerate(wanted.items()):
-        slope = noise(1 + number)
-        J[name] = slope[..., None] * jnp.eye(3) if parameter.shape else slope
-    return noise(0), J
+    image, *slopes = native_map(of_pixel, (pixels, jnp.broadcast_to(seed, pixels.shape)), devices=devices)
+    J = zip(wanted.items(), slopes, strict=True)
+    return image, {name: s[..., None] * jnp.eye(3) if parameter.shape else s for (name, parameter), s in J}
 
 
 @pytest.fixture
-def without_kernel(monkeypatch):
-    monkeypatch.setattr(normal, "pixel_jacobians", made_up)
-    jax.clear_caches()
-    yield
+def no_kernel(monkeypatch):
+    """(what stands for `pixel_jacobians`)."""
+
+    def put(instead):
+        monkeypatch.setattr(normal, "pixel_jacobians", instead)
+        jax.clear_caches()
+
+    yield put
     jax.clear_caches()
 
 
-WEIGHTS = np.random.default_rng(0).uniform(size=(RES, RES, 3))
+@pytest.fixture
+def without_kernel(no_kernel):
+    no_kernel(made_up)
 
 
 def dense_of(views, target, image_and_jacobian):
@@ -125,12 +131,18 @@ def arguments(views, extra):
 EXTRA = np.random.default_rng(1).normal(size=(RES * RES, 3, 2))
 
 
-def test_blocks_and_chunks_are_summed_up(scene, target, dense, without_kernel, monkeypatch):
+def test_blocks_and_chunks_are_summed_up_alike_on_any_number_of_devices(
+    scene, target, dense, without_kernel, monkeypatch
+):
     """Blocks of 2 x 2 pixels, some of them beyond the image, in two chunks."""
     views = problem.build(scene, target, NAMES, {})
     monkeypatch.setattr(normal, "CHUNK_BYTES", 2 * 4 * 3 * 4 * 50)
     assert normal._chunks(RES, RES, 2, 2 * 4 * 3 * 4)[0].shape == (2, 1, 25, 4)
-    found = normal._compiled(*arguments(views, EXTRA), vector=views.vector, side=2)
+    found, on_one = (
+        normal._compiled(*arguments(views, EXTRA), vector=views.vector, side=2, devices=n) for n in (None, 1)
+    )
+    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(on_one), strict=True):
+        np.testing.assert_array_equal(a, b)
     scores, matrices = by_pixel(dense, np.ones((RES * RES, 3)))
     blocks = np.pad(scores.reshape(RES, RES, COUNT), [(0, 1), (0, 1), (0, 0)]).reshape(5, 2, 5, 2, COUNT).sum((1, 3))
     spread = blocks.reshape(-1, COUNT) - scores.sum(0) / 25
@@ -142,13 +154,6 @@ def test_blocks_and_chunks_are_summed_up(scene, target, dense, without_kernel, m
 
 
 @pytest.mark.slow
-def test_sums_are_bitwise_the_same_for_every_number_of_devices(scene, target):
-    views = problem.build(scene, target, NAMES, {})
-    one, many = (normal._compiled(*arguments(views, EXTRA), vector=views.vector, devices=n) for n in (1, None))
-    for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(many), strict=True):
-        np.testing.assert_array_equal(a, b)
-
-
 def test_views_add_up(scene, target, write_scene, without_kernel):
     """The first view twice, and another of another size."""
     other = pj.load_scene(write_scene(BODY, res=6, depth=3))
@@ -185,3 +190,22 @@ def test_more_than_fits_into_memory_is_refused_before_it_is_begun(scene, target,
     for call in (pj.normal_equations, lambda *args: pj.fit(args[0], args[2], args[1])):
         with pytest.raises(pj.InputError, match=r"8 numbers take .* GiB of memory.*fewer"):
             call(scene, NAMES, target)
+
+
+def test_what_no_image_changes_with_is_named(scene, target, no_kernel):
+    """Parameters of zero derivative everywhere."""
+
+    def unchanged(scene, wanted, pixels, *work, **how):
+        image, J = made_up(scene, wanted, pixels, *work, **how)
+        return image, jax.tree.map(jnp.zeros_like, J)
+
+    no_kernel(unchanged)
+    fit = pj.fit(scene, target, NAMES[1:3], spp=4)
+    assert [list(direction) for direction in fit.undetermined] == [[name] for name in fit.components]
+    assert all(np.isinf(error).all() for error in fit.standard_errors.values())
+    np.testing.assert_allclose(fit.values[NAMES[1]], pj.parameters(scene)[NAMES[1]], rtol=1e-5)  # where it began
+
+
+def test_a_roughness_that_counts_as_a_larger_one_is_refused(scene, target):
+    with pytest.raises(pj.InputError, match=r"metal.alpha = 0 has no derivative.*larger"):
+        pj.fit(scene, target, ["metal.alpha"], start={"metal.alpha": 0.0})

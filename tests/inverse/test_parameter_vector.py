@@ -66,7 +66,7 @@ def test_values_at_a_bound_can_be_left():
 
 @pytest.mark.parametrize("missing", ["paint.reflectance", "glass.int_ior"])
 def test_names_that_a_view_lacks_have_columns_of_zeros(missing):
-    image = np.zeros((2, 3, 3))
+    image = np.zeros((2, 3, 3), np.float32)
     jacobian = {name: np.ones((*image.shape, *np.shape(v))) for name, v in VALUES.items() if name != missing}
     columns = np.asarray(BOTH.columns(jacobian, image))
     assert columns.shape == (2, 3, 3, 3)
@@ -87,4 +87,16 @@ def test_columns_are_colours_by_channel_and_numbers():
     slopes = {name: rng.normal(size=(2, 3)) for name in VALUES}
     jacobian = {n: slope[..., None] * np.eye(3) if np.shape(VALUES[n]) else slope for n, slope in slopes.items()}
     expected = np.stack(list(slopes.values()), 1)
-    np.testing.assert_allclose(BOTH.columns(jacobian, np.zeros((2, 3))), expected, rtol=1e-6)
+    np.testing.assert_allclose(BOTH.columns(jacobian, np.zeros((2, 3), np.float32)), expected, rtol=1e-6)
+
+
+def test_what_counts_from_its_least_on_is_approached_by_its_logarithm():
+    """Halfway lies the geometric mean, and a value at its least has a derivative."""
+    alpha = ParameterVector((("metal.alpha", Parameter(("a",), (0,), (), (0, 1), least=1e-4)),))
+    np.testing.assert_array_equal(alpha.bounds, [[1e-4, 1]])
+    assert float(alpha.bounded(jnp.zeros(1))[0]) == pytest.approx(1e-2, rel=1e-5)
+    for value in (1e-4, 1e-3, 0.3, 1.0):
+        x = jnp.asarray(alpha.unbounded(np.array([value])), jnp.float32)
+        assert float(alpha.bounded(x)[0]) == pytest.approx(value, rel=0.02)
+        assert float(jax.jacfwd(alpha.bounded)(x)[0, 0]) > 1e-3 * value
+    np.testing.assert_array_equal(alpha.scale(np.array([0.02])), [0.02])

@@ -88,14 +88,14 @@ def test_only_the_combination_of_two_is_determined():
     assert solution.undetermined.shape == (3, 1)
     direction = solution.undetermined[:, 0] / solution.undetermined[1, 0]
     np.testing.assert_allclose(direction, [-2, 1, 0], atol=1e-6)
-    np.testing.assert_allclose(solution.projector @ solution.undetermined, 0, atol=1e-9)
+    np.testing.assert_allclose(solution.inverse @ solution.undetermined, 0, atol=1e-9)
 
 
 def test_components_that_are_not_free_stay():
     free = np.array([True, False, True])
     solution = evidence(np.random.default_rng(5)).solve(free)
     assert solution.step[1] == 0 and not solution.undetermined.size
-    np.testing.assert_array_equal(solution.projector[1], 0)
+    np.testing.assert_array_equal(solution.inverse[1], 0)
 
 
 def test_where_nothing_is_free_nothing_moves():
