@@ -271,26 +271,6 @@ def test_rough_glass_is_no_smooth_interface_to_splitting_and_derivatives(tmp_pat
     assert "it.int_ior" in pj.parameters(scene) and "it.specular_reflectance" not in pj.parameters(scene)
 
 
-@slow
-@pytest.mark.parametrize(
-    ("scene", "name"),
-    [
-        ("rough_metals", "gold.alpha"),
-        ("rough_metals", "copper.alpha"),
-        ("rough_metals", "brushed.alpha_u"),
-        ("rough_glass", "frosted.alpha"),
-        ("rough_glass", "frosted.int_ior"),
-        ("rough_glass", "bubble.alpha"),
-        ("rough_glass", "bubble.int_ior"),
-        ("rough_glass", "pane.int_ior"),
-        ("rough_glass", "stained.specular_transmittance"),
-        ("rough_glass", "stained.int_ior"),
-    ],
-)
-def test_derivatives_are_those_of_images(shipped, scene, name):
-    assert pj.check_gradient(shipped(scene, res=16), name, spp=64).passed
-
-
 def tables(*instances):
     return bsdfs.build(list(instances), np.float32, (), Parameters())
 
