@@ -123,7 +123,7 @@ def main():
 
     rows = []
     for integrator, what in CASES:
-        theta, bounds, reach = {"albedo": (0.5, (0, 1), None), "place": (0.0, (-np.inf, np.inf), 0.02)}[what]
+        theta, bounds, reach = {"albedo": (0.5, (0, 1), None), "place": (0.0, None, 0.02)}[what]
         renderer = Mitsuba(mi, integrator, what, options.res, options.spp)
         check = pj.check_gradient(
             renderer.image, theta, derivative=renderer.derivative, bounds=bounds, reach=reach, seeds=options.seeds

@@ -143,6 +143,8 @@ def test_bad_input_is_refused(room):
         pj.check_gradient(room, "floor.reflectance", seeds=2)
     with pytest.raises(pj.InputError, match="between 0 and 1"):
         pj.check_gradient(room, "floor.reflectance", false_alarm=0)
+    with pytest.raises(pj.InputError, match="a scene has its own"):
+        pj.check_gradient(room, "floor.reflectance", derivative=lambda *of: 0)
     right = Renderer()
     with pytest.raises(pj.InputError, match="derivative is missing"):
         pj.check_gradient(right.image, 0.5)

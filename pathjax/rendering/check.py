@@ -74,7 +74,7 @@ def check_gradient(
     at: ArrayLike,
     *,
     derivative: Derivative,
-    bounds: tuple[float, float] = (-math.inf, math.inf),
+    bounds: tuple[float, float] | None = None,
     reach: float | None = None,
     seed: int = 0,
     seeds: int = 16,
@@ -91,7 +91,7 @@ def check_gradient(
     seed: int = 0,
     *,
     derivative: Derivative | None = None,
-    bounds: tuple[float, float] = (-math.inf, math.inf),
+    bounds: tuple[float, float] | None = None,
     reach: float | None = None,
     seeds: int = 16,
     block: int = 8,
@@ -114,8 +114,9 @@ def check_gradient(
         seed: of the first comparison.
         derivative: of such a function, what is to be tested: (theta, v, seed) -> derivative of the image along v, that
             of a number being along v = 1. It need not share random numbers with the image, but finds more if it does.
-        bounds: of each entry of theta.
-        reach: how far the five values lie apart in all; None: a tenth of the value, or of the range, if that is finite.
+        bounds: of each entry of such a theta; None: any number.
+        reach: how far the five values of such a theta lie apart in all; None: a tenth of the value, or of the range, if
+            that is finite.
         seeds: number of independent comparisons, at least 3.
         block: side of the blocks of pixels over which derivatives are averaged.
         false_alarm: chance that a right derivative does not pass, in (0, 1). Means over blocks are taken to be normally
@@ -131,10 +132,12 @@ def check_gradient(
         raise InputError(f"false_alarm = {false_alarm}; it is a probability, between 0 and 1")
     nodes = None
     if isinstance(of, Scene):
+        if derivative is not None or bounds is not None or reach is not None:
+            raise InputError("derivative, bounds and reach are those of a function; a scene has its own")
         of, derivative, at, bounds, nodes = _of_scene(of, at, spp)
     if derivative is None:
         raise InputError("derivative is missing: of a function it is what is tested, (theta, v, seed) -> derivative")
-    theta = np.asarray(at, float)
+    theta, bounds = np.asarray(at, float), bounds or (-math.inf, math.inf)
     direction, nodes = _direction(theta, bounds, reach) if nodes is None else (np.ones(theta.shape), nodes)
     derivatives, differences = [], []
     for k in range(seed, seed + seeds):
@@ -215,10 +218,9 @@ def _compared(direction, derivatives, differences, largest, block, false_alarm):
     floor = np.finfo(np.float32).eps * (size + largest)
     error = np.sqrt(gap.var(0, ddof=1) / seeds + floor**2 + np.finfo(float).tiny)
     z = gap.mean(0) / error
-    largest = np.abs(z).max()
-    p_value = 0.0
-    if np.isfinite(largest):
-        p_value = -math.expm1(z.size * math.log1p(-min(2 * stats.t.sf(largest, seeds - 1), 1 - 1e-16)))
+    worst, p_value = np.abs(z).max(), 0.0
+    if np.isfinite(worst):
+        p_value = -math.expm1(z.size * math.log1p(-min(2 * stats.t.sf(worst, seeds - 1), 1 - 1e-16)))
     limit = stats.t.isf(-math.expm1(math.log1p(-false_alarm) / z.size) / 2, seeds - 1)
     found = np.abs(slope) > 0
     resolution = float((limit * error[found] / np.abs(slope[found])).min()) if found.any() else math.inf
