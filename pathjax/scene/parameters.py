@@ -115,13 +115,15 @@ def checked(name, value, parameter: Parameter, dtype):
 def refuse_constant(scene: Scene, wanted: Mapping[str, Parameter]) -> None:
     """Raises InputError: one of the parameters, of which derivatives are asked for, is known to be below its least."""
     for name, parameter in wanted.items():
-        value = parameter.get(get(scene, parameter.path))
-        if math.isfinite(parameter.least) and not parameter.is_texture and not is_traced(value):
-            if value <= parameter.least:
-                raise InputError(
-                    f"{name} = {value:g} has no derivative: what is below {parameter.least:g} counts as that, so no "
-                    "image changes with it; set a larger value"
-                )
+        values = get(scene, parameter.path)
+        if not math.isfinite(parameter.least) or parameter.is_texture or is_traced(values):
+            continue
+        value = parameter.get(np.asarray(values))
+        if value <= parameter.least:
+            raise InputError(
+                f"{name} = {value:g} has no derivative: what is below {parameter.least:g} counts as that, so no image "
+                "changes with it; set a larger value"
+            )
 
 
 def get(tree, path):
