@@ -9,6 +9,7 @@ traces images of the scenes and their derivatives, for shapes are known by then,
 from __future__ import annotations
 
 import dataclasses
+import gc
 import importlib
 import inspect
 import pkgutil
@@ -99,6 +100,7 @@ def fit(pj, file: Path) -> None:
 
 
 if __name__ == "__main__":
+    gc.set_threshold(50_000, 20, 50)  # most objects stay: to look for garbage as often as Python does takes long
     package, paths = load("pathjax"), [Path(name) for name in sys.argv[1:] if name != "--no-fit"]
     for path in paths:
         trace(package, path)
