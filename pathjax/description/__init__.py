@@ -7,9 +7,11 @@ Matrices are float64, (4, 4), acting on column vectors. `name` is the id that pa
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
-from pathjax.description.elements import Document, Element
+from pathjax.description.elements import Document, Element, nearest
+from pathjax.errors import InputError
 from pathjax.kinds import Instance
 
 
@@ -33,6 +35,16 @@ class Integrator:
     media: bool = False  # participating media are rendered; else they are left out
 
 
+class View(NamedTuple):
+    """What one sensor says."""
+
+    camera: object  # a `sensors.Sensor`
+    film: object  # a `sensors.film.HDRFilm`
+    spp: int
+    sampler: str  # the type that the file names; pathjax uses its own
+    medium: Instance | None  # in which the camera is
+
+
 @dataclass(frozen=True)
 class Description:
     file: str
@@ -48,3 +60,33 @@ class Description:
     # What was read, to be written again, and what each of its elements became: an `Instance`, a `Shape`, ...
     document: Document | None = None
     made: Mapping[Element, object] = field(default_factory=dict)
+    # Of all sensors, by id, or by number where they have none, in the order of the file; or why one cannot be used.
+    views: Mapping[str, View | InputError] = field(default_factory=dict)
+    seen: str = ""  # the name of that which is used
+
+    def seen_by(self, which: int | str) -> Description:
+        """The same, seen by the sensor of this number or name.
+
+        Raises:
+            InputError: there is none, or it cannot be used.
+        """
+        name = chosen(list(self.views), which, self.file)
+        view = self.views[name]
+        if isinstance(view, InputError):
+            raise view
+        return replace(self, **view._asdict(), seen=name)
+
+
+def chosen(sensors: list[str], which: int | str, file: str) -> str:
+    """The name of the sensor of this name or number.
+
+    Raises:
+        InputError: there is none.
+    """
+    if which in sensors:
+        return str(which)
+    if str(which).isdigit() and int(which) < len(sensors):
+        return sensors[int(which)]
+    ids = [name for number, name in enumerate(sensors) if name != str(number)]
+    known = f"0 to {len(sensors) - 1}" + (f" or {', '.join(ids)}" if ids else "")
+    raise InputError(f"{file}: there is no sensor {which!r}; use {known}{nearest(str(which), ids)}")

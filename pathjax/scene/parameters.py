@@ -72,9 +72,7 @@ def nameless(scene: Scene) -> Scene:
 
 
 def about(scene: Scene) -> About:
-    if scene.about is None:
-        raise InputError("this scene was stripped of its names; take the one that load_scene returned")
-    return scene.about
+    return scene.described
 
 
 def find(scene: Scene, name: str) -> Parameter:

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import jax
 from jaxtyping import Array, Int
 
 from pathjax import bsdfs
 from pathjax.bsdfs import Materials
+from pathjax.compile import usual_promotion
 from pathjax.emitters import Lights
+from pathjax.errors import InputError
 from pathjax.media import Media
 from pathjax.scene.metadata import About
 from pathjax.sensors import Camera
@@ -39,6 +41,41 @@ class Scene:
     # Parameters that `with_parameters` set to traced values, by name. They carry the derivative, and tables hold the
     # same numbers detached: so a derivative that comes by a table is one that was asked for by other means.
     varied: dict[str, Array] = field(default_factory=dict)
+
+    @property
+    def sensors(self) -> tuple[str, ...]:
+        """Names of the sensors of the scene's file, in its order: ids, or numbers from 0 where they have none."""
+        return tuple(self.described.description.views)
+
+    @usual_promotion
+    def with_sensor(self, which: int | str) -> Scene:
+        """The scene seen by another sensor of its file, with its film; all else is shared, also present parameters.
+
+        Args:
+            which: one of `sensors`, or its number, from 0.
+        Raises:
+            InputError: there is no such sensor, it is not supported, or it stands in another medium.
+        """
+        about = self.described
+        description = about.description.seen_by(which)
+        if self.media is not None and description.medium is not about.description.medium:
+            name = description.seen
+            raise InputError(f"sensor {name!r} stands in another medium; load the scene with sensor={name!r}")
+        dtype = self.camera.origin.dtype
+        view = description.camera.build(description.film, dtype), description.film.build(dtype)
+        camera, film = jax.device_put(view)
+        return replace(self, camera=camera, film=film, about=replace(about, description=description))
+
+    @property
+    def described(self) -> About:
+        """`about`, where it is there.
+
+        Raises:
+            InputError: the scene was stripped of it.
+        """
+        if self.about is None:
+            raise InputError("this scene was stripped of its names; take the one that load_scene returned")
+        return self.about
 
     @property
     def scatters(self) -> bool:

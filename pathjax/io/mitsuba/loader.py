@@ -96,12 +96,11 @@ class _Loader:
             raise element.error(f"{element}: one <integrator> is supported here; the first is at {first}")
         if not scene["sensor"]:
             raise self.document.root.error('the scene has no <sensor>; add <sensor type="perspective">')
-        seen = _chosen(scene["sensor"], sensor)
-        for element in scene["sensor"]:
-            if element is not seen:
-                self.note(element, f"is left out, as the sensor at {seen.place} is used; `sensor` chooses another")
-
-        camera, film, spp, sampler, medium = self.make(seen, sensors.KINDS, read=_sensor)
+        names = [element.id or str(number) for number, element in enumerate(scene["sensor"])]
+        name = d.chosen(names, sensor, scene["sensor"][0].file)
+        seen = scene["sensor"][names.index(name)]
+        views = {each: self.view(element, seen) for each, element in zip(names, scene["sensor"], strict=True)}
+        camera, film, spp, sampler, medium = views[name]
         if scene["integrator"]:
             integrator = self.make(scene["integrator"][0], integrators.KINDS)
         else:
@@ -141,7 +140,23 @@ class _Loader:
             tuple(self.notes),
             self.document,
             self.made,
+            views,
+            name,
         )
+
+    def view(self, element: Element, seen: Element) -> d.View | InputError:
+        """Of a sensor. One other than that which is used may be what is not supported, and has one note alone."""
+        if element is seen:
+            return self.make(element, sensors.KINDS, read=_sensor)
+        notes = list(self.notes)
+        try:
+            view = self.make(element, sensors.KINDS, read=_sensor)
+        except InputError as error:
+            view = error
+            self.making.clear()
+        self.notes = notes
+        self.note(element, f"is left out, as the sensor at {seen.place} is used; `sensor` chooses another")
+        return view
 
     def check_media(
         self,
@@ -322,17 +337,6 @@ def _emitter(loader: _Loader, fields: Fields, name: str) -> Instance:
     return emitters.KINDS[fields.type].read(loader, fields, name)
 
 
-def _chosen(elements: list[Element], which: int | str) -> Element:
-    """The sensor of this number, or id."""
-    for number, element in enumerate(elements):
-        if which in (number, str(number)) or (element.id and which == element.id):
-            return element
-    ids = [element.id for element in elements if element.id]
-    known = f"0 to {len(elements) - 1}" + (f" or {', '.join(ids)}" if ids else "")
-    place = elements[0]
-    raise InputError(f"{place.file}: there is no sensor {which!r}; use {known}{nearest(str(which), ids)}")
-
-
 def _usual_bsdf(shape: Element, lit: bool) -> Element:
     """What Mitsuba takes for the bsdf that a shape lacks: grey, or what reflects nothing where light comes from it."""
     reflectance = Element("float", {"name": "reflectance", "value": "0" if lit else "0.5"}, shape.file, shape.line)
@@ -340,8 +344,7 @@ def _usual_bsdf(shape: Element, lit: bool) -> Element:
     return shape.children[-1]
 
 
-def _sensor(loader: _Loader, fields: Fields) -> tuple[sensors.Sensor, film.HDRFilm, int, str, Instance | None]:
-    """Camera, film, samples per pixel, sampler, the medium around."""
+def _sensor(loader: _Loader, fields: Fields) -> d.View:
     camera = sensors.KINDS[fields.type].read(loader, fields)
     films, drawn = fields.objects("film"), fields.objects("sampler")
     made = loader.make(films[0], film.KINDS) if films else film.HDRFilm()
@@ -349,7 +352,7 @@ def _sensor(loader: _Loader, fields: Fields) -> tuple[sensors.Sensor, film.HDRFi
     sampler = drawn[0].attributes["type"] if drawn else "independent"
     around = fields.objects("medium")
     medium = loader.shared(around[0], around[0].id or "sensor_medium") if around else None
-    return camera, made, spp, sampler, medium
+    return d.View(camera, made, spp, sampler, medium)
 
 
 def _kind_of_light(element: Element) -> type[emitters.Emitter]:

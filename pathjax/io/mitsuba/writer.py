@@ -55,7 +55,7 @@ def save(description: d.Description, values: Mapping[str, np.ndarray], path: Pat
 class _Writer:
     def __init__(self, description: d.Description, values: Mapping[str, np.ndarray], path: Path, sources: set):
         self.document, self.made, self.values = description.document, description.made, values
-        self.path, self.sources = path, sources
+        self.path, self.sources, self.seen = path, sources, description.views[description.seen]
         self.files: dict[Path, Callable[[], None]] = {}  # and what writes each
         self.images = _changed_images(description.made.values(), values)
 
@@ -73,7 +73,9 @@ class _Writer:
         if not element.children:
             return f"{start}/>\n"
         # Of several sensors the one that is used comes first.
-        children = sorted(element.children, key=lambda child: child.tag == "sensor" and child not in self.made)
+        children = sorted(
+            element.children, key=lambda child: child.tag == "sensor" and self.made.get(child) is not self.seen
+        )
         inside = "".join(self.text(child, depth + 1) for child in children)
         return f"{start}>\n{inside}{'    ' * depth}</{element.tag}>\n"
 
