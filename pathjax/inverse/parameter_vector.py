@@ -37,9 +37,7 @@ class ParameterVector:
     def bounds(self) -> np.ndarray:
         """(n, 2) between which values count."""
         limits = [(max(p.bounds[0], p.least), p.bounds[1]) for _, p in self.parameters]
-        return np.concatenate(
-            [np.tile(pair, (math.prod(p.shape), 1)) for pair, (_, p) in zip(limits, self.parameters, strict=True)]
-        )
+        return np.repeat(limits, [math.prod(p.shape) for _, p in self.parameters], axis=0)
 
     def pack(self, values: Mapping) -> np.ndarray:
         """(n,) float64."""
