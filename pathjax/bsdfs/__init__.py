@@ -108,6 +108,10 @@ class Materials:
     wrappers: tuple[Table, ...] = ()
     levels: tuple[tuple[int, ...], ...] = field(default=(), metadata={"static": True})
     passing: tuple[tuple[int, ...], ...] = field(default=(), metadata={"static": True})
+    # By wrapper, places of the columns in whose numbers `leaf` tells the derivative of its weight; empty: in none.
+    recorded: tuple[tuple[int | None, ...], ...] = field(default=(), metadata={"static": True})
+    # For derivatives: which of the surfaces that a shadow ray passes has its `passing` nudged, and by what.
+    nudged: tuple[Int[Array, ""], Float[Array, "held columns"]] | None = None
 
 
 def build(bsdfs: list[Instance], dtype, path: tuple, parameters: Parameters) -> Materials:
@@ -213,12 +217,18 @@ def leaf(
     return tree.Leaf(kind, row, frame, wi, None, ())
 
 
-def passing(materials: Materials, shape: Index, surface: Surface, front: Bool[Array, ""]) -> Float[Array, ""]:
-    """Share of light that a side of a shape lets straight on."""
+def passing(
+    materials: Materials,
+    shape: Index,
+    surface: Surface,
+    front: Bool[Array, ""],
+    nudges: Float[Array, "held columns"] | None = None,
+) -> Float[Array, ""]:
+    """Share of light that a side of a shape lets straight on. nudges: of `tree.passing`."""
     passes = partial(has, materials, capability="passes")
     code = select(materials, shape, front)
     if materials.wrappers:
-        return tree.passing(materials, code, front, surface, passes)
+        return tree.passing(materials, code, front, surface, passes, nudges)
     return passes(code[0]).astype(surface.p.dtype)
 
 

@@ -13,12 +13,13 @@ from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from pathjax.bsdfs.wrapper import Turning, Wrapper
+from pathjax.bsdfs.wrapper import Choosing, Turning, Wrapper
 from pathjax.compile import compute_once
 from pathjax.core.math import at, cross, dot, normalize, safe_divide, smaller, to_local, to_world
 from pathjax.core.types import Frame, Surface
@@ -74,6 +75,14 @@ class Turn(NamedTuple):
     roughness: Float[Array, ""]  # squared, of the facets that would have normals like that; 0: they cast no shadows
 
 
+class Chosen(NamedTuple):
+    """What one step on the way to a leaf has chosen from, for derivatives."""
+
+    row: Int[Array, ""]
+    factor: Float[Array, ""]  # of the leaf's weight
+    by: Float[Array, " columns"]  # derivative of the factor in what `Materials.recorded` names
+
+
 class Leaf(NamedTuple):
     """What scatters at a vertex."""
 
@@ -84,6 +93,7 @@ class Leaf(NamedTuple):
     # Share over probability of what was chosen: 1 but for its derivative. None: nothing was to be chosen.
     weight: Float[Array, ""] | None
     turns: tuple[Turn, ...]
+    chosen: tuple[Chosen, ...] = ()  # by step, of `steps`; nothing where `Materials.recorded` is empty
 
 
 def leaf(
@@ -104,6 +114,7 @@ def leaf(
     """
     upright, weight, turns = frame, jnp.ones_like(wi[2]), ()
     node, frame, wi, turns = _entered(node, frame, wi, turns)
+    recorded, trace = materials.recorded, []
     for level in materials.levels:
         for place in level:
             table = materials.wrappers[place]
@@ -118,10 +129,15 @@ def leaf(
                 turns = (*turns, Turn(before, roughness))
                 node = jnp.where(here, _held(p, wi[2] > 0)[0], node)
             else:
-                choice = partial(_choice, table.kind, p, wi[2] > 0, u, weight, differentiated)
-                node, u, weight = compute_once(lax.cond(here, choice, lambda same=(node, u, weight): same))
+                columns = recorded[place] if recorded else None
+                if recorded:
+                    none = jnp.zeros((len(columns),), weight.dtype)
+                    trace.append(Chosen(jnp.int32(0), jnp.ones_like(weight), none))
+                same = node, u, weight, *trace[-1:]
+                choice = partial(_choice, table.kind, p, node, wi[2] > 0, u, weight, differentiated, columns)
+                node, u, weight, *trace[-1:] = compute_once(lax.cond(here, choice, lambda same=same: same))
             node, frame, wi, turns = _entered(node, frame, wi, turns)
-    return Leaf(node[0], node[1], frame, wi, weight, turns)
+    return Leaf(node[0], node[1], frame, wi, weight, turns, tuple(trace))
 
 
 def _entered(node, frame, wi, turns):
@@ -136,17 +152,37 @@ def _held(p, front):
     return at(p.nodes, jnp.where(front, 0, 1))
 
 
-def _choice(kind, p, front, u, weight, differentiated):
-    """One of two, the number for the next choice, and the weight."""
+def _choice(kind, p, node, front, u, weight, differentiated, columns):
+    """One of two, the number for the next choice, the weight, and where columns are given what was Chosen."""
     share = kind.share(p)
     chance = lax.stop_gradient(share)
     if differentiated:
         chance = jnp.clip(chance, MIN_CHANCE, 1 - MIN_CHANCE)
     first, second = _held(p, front)
     takes_second = u < chance
-    weight = weight * jnp.where(takes_second, safe_divide(share, chance), safe_divide(1 - share, 1 - chance))
+    factor = jnp.where(takes_second, safe_divide(share, chance), safe_divide(1 - share, 1 - chance))
+    weight = weight * factor
     u = jnp.where(takes_second, safe_divide(u, chance), safe_divide(u - chance, 1 - chance))
-    return jnp.where(takes_second, second, first), u, weight
+    following = jnp.where(takes_second, second, first), u, weight
+    if columns is None:
+        return following
+    by_share = jnp.where(takes_second, safe_divide(1.0, chance), -safe_divide(1.0, 1 - chance))
+    return *following, Chosen(node[1], factor, by_share * share_by(kind, p, columns))
+
+
+def steps(materials) -> list[int]:
+    """Places of the wrappers that `leaf` chooses from, one after another."""
+    places = (place for level in materials.levels for place in level)
+    return [place for place in places if materials.wrappers[place].kind.chooses]
+
+
+def share_by(kind: type[Choosing], p: Row, columns: tuple[int | None, ...]) -> Float[Array, " columns"]:
+    """Derivative of the share of the second of two in some columns of the table."""
+
+    def share(nudges):
+        return kind.share(p.nudged({column: nudges[s] for s, column in enumerate(columns) if column is not None}))
+
+    return jax.jacfwd(share)(jnp.zeros((len(columns),), kind.share(p).dtype))
 
 
 def _turned(kind, p, surface, upright, frame, wi):
@@ -189,13 +225,21 @@ def seen_by_turned(turns: tuple[Turn, ...], n: Float[Array, "3"], d: Float[Array
 
 
 def passing(
-    materials, node: Node, front: Bool[Array, ""], surface: Surface, passes: Callable, level: int = 0
+    materials,
+    node: Node,
+    front: Bool[Array, ""],
+    surface: Surface,
+    passes: Callable,
+    nudges: Float[Array, "held columns"] | None = None,
+    level: int = 0,
+    place_in_tree: int = 0,
 ) -> Float[Array, ""]:
     """Share of light that goes straight on: the probability with which `leaf` comes to a leaf that passes.
 
     Args:
         front: which side is seen.
         passes: whether leaves of a kind do.
+        nudges: added to what each of `on_the_way` looks up in the columns that are `Materials.recorded`.
     """
     kind, row, turned = node
     front = front | (turned == 1)
@@ -204,13 +248,39 @@ def passing(
         table = materials.wrappers[place]
         here = kind == len(materials.tables) + place
 
-        def through(table=table, here=here):
+        def through(table=table, here=here, place=place):
             p = Row(table, jnp.where(here, row, 0), surface, materials.textures)
-            shares = [passing(materials, held, front, surface, passes, level + 1) for held in _held(p, front)]
+            following = place_in_tree + 1, place_in_tree + 1 + most_on_the_way(materials, level + 1)
+            held = zip(_held(p, front), following, strict=False)
+            shares = [passing(materials, each, front, surface, passes, nudges, level + 1, n) for each, n in held]
             if len(shares) == 1:
                 return shares[0]
+            if nudges is not None:
+                of_columns = zip(materials.recorded[place], nudges[place_in_tree], strict=True)
+                p = p.nudged({column: nudge for column, nudge in of_columns if column is not None})
             second = table.kind.share(p)
             return (1 - second) * shares[0] + second * shares[1]
 
         share = lax.cond(here, through, lambda share=share: share)
     return share
+
+
+def on_the_way(materials, node: Node, front: Bool[Array, ""], level: int = 0) -> list[tuple[Int[Array, ""], ...]]:
+    """Kind and row of all that `passing` may meet in a tree: what is first, then all behind its first, then behind its
+    second; of leaves, and where there is nothing, the kind is none of a wrapper.
+    """
+    if level >= len(materials.passing):
+        return []
+    kind, row, turned = node
+    front = front | (turned == 1)
+    held = jnp.full((2, 3), -1, jnp.int32)
+    for place in materials.passing[level]:
+        here = kind == len(materials.tables) + place
+        found = _held(Row(materials.wrappers[place], jnp.where(here, row, 0)), front)
+        held = jnp.where(here, jnp.concatenate([found, held])[:2], held)
+    return [(kind, row)] + [each for side in held for each in on_the_way(materials, side, front, level + 1)]
+
+
+def most_on_the_way(materials, level: int = 0) -> int:
+    """Number of those that are `on_the_way` from a level on."""
+    return 2 ** max(len(materials.passing) - level, 0) - 1

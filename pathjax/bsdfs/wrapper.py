@@ -20,6 +20,7 @@ class Wrapper(BSDF):
     """
 
     nested: ClassVar[int] = 1  # bsdfs that stand inside it in a file
+    chooses: ClassVar[bool] = False  # among these, by `share`
     nodes = PerRow()  # (2, bsdfs held, 3) int32: of its front and its back, the `tree.Node`s of what it holds
 
     @classmethod
@@ -54,6 +55,8 @@ class Wrapper(BSDF):
 
 class Choosing(Wrapper):
     """Two bsdfs, of which chance takes one at each point, so that it is their mixture in the mean."""
+
+    chooses = True
 
     @staticmethod
     @abstractmethod

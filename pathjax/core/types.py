@@ -45,6 +45,8 @@ class Surface(NamedTuple):
     attributes: dict[str, Float[Array, "3"]] | None = None  # of the mesh, by name; None: no texture of the scene asks
     # How p moves with u and with v, along the surface; 0 where that is not known. None: no bsdf of the scene asks.
     along: tuple[Float[Array, "3"], Float[Array, "3"]] | None = None
+    # Number of the first corner of a triangle among all, and the shares of its three. None: no derivative asks.
+    corners: tuple[Int[Array, ""], Float[Array, "3"]] | None = None
 
 
 class BSDFSample(NamedTuple):

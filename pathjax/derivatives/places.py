@@ -8,8 +8,11 @@ bsdf is.
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import accumulate, pairwise
 from types import SimpleNamespace
 
 import jax.numpy as jnp
@@ -18,10 +21,12 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from pathjax import emitters
+from pathjax.bsdfs import tree
 from pathjax.core.math import at
 from pathjax.core.types import EmitterSample, Hit, Ray
 from pathjax.emitters import Choice
 from pathjax.integrators.random_numbers import Bounce
+from pathjax.integrators.shadow import Passed
 from pathjax.integrators.vertex import Vertex
 from pathjax.kinds import Declared
 from pathjax.scene import parameters as named
@@ -38,7 +43,7 @@ Pairs = tuple[tuple[Int[Array, ""], Float[Array, "..."]], ...]
 # By slot, the column that is looked up; None: none.
 Columns = tuple[int | None, ...]
 
-BSDFS, TEXTURES = ("materials", "tables"), ("materials", "textures")
+BSDFS, WRAPPERS, TEXTURES = (("materials", each) for each in ("tables", "wrappers", "textures"))
 
 
 @dataclass(frozen=True)
@@ -49,14 +54,31 @@ class Slots:
     lights: tuple[Columns, ...]  # by table; none of backgrounds
     backgrounds: tuple[tuple[int, int, int], ...]  # table, row, column: of all at once, as all are met at once
     colors: int  # of the slots of bsdfs
+    wrappers: tuple[Columns, ...]  # by table of bsdfs that hold others
+    choices: tuple[tuple[int, int, int], ...]  # of `tree.steps`: the step, its wrapper, and which of its columns
+    on_the_way: int  # wrappers that `tree.on_the_way` tells; each has a slot for each column
+    corners: bool  # whether what meshes carry is differentiated
 
     @property
     def of_bsdfs(self) -> int:
         return max(map(len, self.bsdfs), default=0)
 
     @property
+    def of_choices(self) -> int:
+        return len(self.choices)
+
+    @property
+    def of_passed(self) -> int:
+        return self.on_the_way * max(map(len, self.wrappers), default=0)
+
+    @property
     def of_lights(self) -> int:
         return max([len(self.backgrounds), *map(len, self.lights)])
+
+    def numbered(self, start: int) -> list[range]:
+        """Slots of bsdfs, of lights, of choices among bsdfs and of what is passed, counted through all of these."""
+        counts = self.of_bsdfs, self.of_lights, self.of_choices, self.of_passed
+        return [range(*each) for each in pairwise(accumulate(counts, initial=start))]
 
 
 # ---- what is differentiated -----------------------------------------------------------------------------------------
@@ -69,11 +91,26 @@ def tables_of_textures(scene: Scene, path: tuple) -> list[tuple]:
 
 
 def paths(scene: Scene) -> set[tuple]:
-    """Of all arrays that may be differentiated."""
-    tables = [(*BSDFS, i) for i in range(len(scene.materials.tables))] + tables_of_textures(scene, TEXTURES)
+    """Of all arrays that may be differentiated. Textures and backgrounds that do not tell their entries may not."""
+    tables = [(*BSDFS, i) for i in range(len(scene.materials.tables))] + [(*WRAPPERS, i) for i in _choosing(scene)]
+    covers = tables_of_textures(scene, TEXTURES)
     for i in range(len(scene.emitters)):
-        tables += [("emitters", i, "table"), *tables_of_textures(scene, ("emitters", i, "textures"))]
-    return {path for table in tables for path in _columns(scene, table)}
+        tables.append(("emitters", i, "table"))
+        covers += tables_of_textures(scene, ("emitters", i, "textures"))
+
+    def tells_entries(path):
+        return named.get(scene, path).kind.tells_entries()
+
+    found = {path for table in filter(tells_entries, covers) for path in _columns(scene, table)}
+    for table in tables:
+        found |= {p for p in _columns(scene, table) if not _declared(scene, p).shared or tells_entries(table)}
+    shapes = enumerate(scene.geometry.tables)
+    return found | {("geometry", "tables", i, "attributes", name) for i, each in shapes for name in each.attributes}
+
+
+def _choosing(scene: Scene) -> list[int]:
+    """Wrappers whose parameters decide what is chosen."""
+    return [i for i, table in enumerate(scene.materials.wrappers) if table.kind.chooses]
 
 
 def _columns(scene: Scene, table: tuple) -> dict[tuple, int]:
@@ -82,10 +119,21 @@ def _columns(scene: Scene, table: tuple) -> dict[tuple, int]:
     return {(*table, "columns", i, "values"): i for i, column in enumerate(columns) if column is not None}
 
 
+def _in_textures(scene: Scene, paths: Iterable[tuple], of_textures: tuple) -> dict[tuple[int, int | str], tuple]:
+    """Of those arrays that textures look up: by table, and column or name of what meshes carry."""
+    found: dict[tuple[int, int | str], tuple] = {}
+    for number, path in enumerate(tables_of_textures(scene, of_textures)):
+        table = named.get(scene, path)
+        found |= {(number, place): column for column, place in _columns(scene, path).items() if column in paths}
+        names = table.kind.attributes(dict(table.settings))
+        found |= {(number, each[-1]): each for each in paths if each[0] == "geometry" and each[-1] in names}
+    return found
+
+
 def slots(scene: Scene, paths: Paths) -> Slots:
     def looked_up(table, textures):
         """Colours and numbers that are looked up in a table."""
-        textured = any(path in paths for each in tables_of_textures(scene, textures) for path in _columns(scene, each))
+        textured = bool(_in_textures(scene, paths, textures))
         columns = named.get(scene, table).columns
         held = _columns(scene, table).items()
         found = [i for path, i in held if path in paths or (textured and columns[i].texture is not None)]
@@ -100,6 +148,9 @@ def slots(scene: Scene, paths: Paths) -> Slots:
 
         return tuple(filled(c, most) + filled(n, numbers) for c, n in found), most
 
+    choosing, count = _choosing(scene), len(scene.materials.wrappers)
+    wrappers, _ = joined([looked_up((*WRAPPERS, i), TEXTURES) if i in choosing else ([], []) for i in range(count)])
+    wrappers = wrappers if any(map(len, wrappers)) else ()
     bsdfs, colors = joined([looked_up((*BSDFS, i), TEXTURES) for i in range(len(scene.materials.tables))])
     of_lights = [looked_up(("emitters", i, "table"), ("emitters", i, "textures")) for i in range(len(scene.emitters))]
     behind = emitters.backgrounds(scene.emitters)
@@ -107,24 +158,51 @@ def slots(scene: Scene, paths: Paths) -> Slots:
     backgrounds = [
         (i, row, column) for i in behind for column in sum(of_lights[i], []) for row in range(scene.emitters[i].count)
     ]
-    return Slots(bsdfs, lights, tuple(backgrounds), colors)
+    choices = tuple(
+        (step, place, number)
+        for step, place in enumerate(tree.steps(scene.materials) if wrappers else ())
+        for number, column in enumerate(wrappers[place])
+        if column is not None
+    )
+    met = {place for level in scene.materials.passing for place in level if wrappers}
+    passed = any(column is not None for place in met for column in wrappers[place])
+    on_the_way = tree.most_on_the_way(scene.materials) if passed else 0
+    corners = any(path[0] == "geometry" for path in paths)
+    return Slots(bsdfs, lights, tuple(backgrounds), colors, wrappers, choices, on_the_way, corners)
+
+
+def prepared(scene: Scene, slots: Slots, number: Int[Array, ""]) -> Scene:
+    """The scene that tells of its vertices what derivatives take. number: of a surface that a shadow ray passes."""
+    materials = replace(scene.materials, recorded=slots.wrappers)
+    if slots.on_the_way:
+        none = jnp.zeros((slots.on_the_way, len(slots.wrappers[0])), scene.camera.origin.dtype)
+        materials = replace(materials, nudged=(number, none))
+    return replace(scene, materials=materials, geometry=replace(scene.geometry, corners=slots.corners))
 
 
 def nudged(scene: Scene, slots: Slots, nudges: Float[Array, " slots"]) -> Scene:
-    """The scene where each slot's number is larger by its nudge, of bsdfs first, in all channels."""
+    """The scene where each slot's number is larger by its nudge, in all channels; behind the first, of `numbered`.
+
+    Those of choices are left as they are: see `by_choices`.
+    """
+    of_bsdfs, of_lights, _, of_passed = slots.numbered(start=1)
 
     def of(table, columns, nudges):
         return table.nudged({column: nudges[s] for s, column in enumerate(columns) if column is not None})
 
-    bsdfs = tuple(map(of, scene.materials.tables, slots.bsdfs, [nudges] * len(slots.bsdfs)))
-    beyond = nudges[slots.of_bsdfs :]
+    own = [nudges[of_bsdfs.start :]] * len(slots.bsdfs)
+    materials = replace(scene.materials, tables=tuple(map(of, scene.materials.tables, slots.bsdfs, own)))
+    if of_passed:
+        number, none = materials.nudged
+        materials = replace(materials, nudged=(number, nudges[of_passed.start :].reshape(none.shape)))
+    beyond = nudges[of_lights.start :]
     tables = [of(each.table, columns, beyond) for each, columns in zip(scene.emitters, slots.lights, strict=True)]
     for s, (i, row, column) in enumerate(slots.backgrounds):
         nudge = tables[i].columns[column].nudge
         nudge = jnp.zeros((scene.emitters[i].count,), beyond.dtype) if nudge is None else nudge
         tables[i] = tables[i].nudged({column: nudge.at[row].set(beyond[s])})
     lights = tuple(replace(each, table=table) for each, table in zip(scene.emitters, tables, strict=True))
-    return replace(scene, materials=replace(scene.materials, tables=bsdfs), emitters=lights)
+    return replace(scene, materials=materials, emitters=lights)
 
 
 # ---- the list -------------------------------------------------------------------------------------------------------
@@ -144,8 +222,10 @@ def count(scene: Scene, path: tuple) -> int:
 
 def of_colors(scene: Scene, path: tuple) -> bool:
     """Whether an array holds colours; else it holds numbers."""
+    if named.get(scene, path).ndim > 1:
+        return True
     declared = _declared(scene, path)
-    return named.get(scene, path).ndim > 1 or (declared.shared and declared.colors)
+    return declared.shared and declared.colors
 
 
 def _declared(scene: Scene, path: tuple) -> Declared:
@@ -166,7 +246,42 @@ def of_bsdf(scene: Scene, paths: Paths, slots: Slots, slot: int, here: Vertex) -
     ]
     calls = alike(found, here.wi.dtype)
     pairs = calls[0]() if len(calls) == 1 else lax.switch(jnp.maximum(here.kind, 0), calls)
-    return _entries(pairs, whole=not any(path[:2] == TEXTURES for path in paths))
+    return _entries(pairs, whole=not _in_textures(scene, paths, TEXTURES))
+
+
+def by_choices(slots: Slots, here: Vertex) -> Float[Array, " slots"]:
+    """Derivatives of `here.weight` in the numbers of the wrappers that were chosen from."""
+
+    def of(step, number):
+        others = (each.factor for other, each in enumerate(here.chosen) if other != step)
+        return math.prod(others, start=here.chosen[step].by[number])
+
+    return jnp.stack([of(step, number) for step, _, number in slots.choices])
+
+
+def of_choice(scene: Scene, paths: Paths, slots: Slots, slot: int, here: Vertex) -> Entries:
+    """Of a number of `by_choices`."""
+    first, _ = firsts(scene, paths)
+    step, place, number = slots.choices[slot]
+    column, row = slots.wrappers[place][number], here.chosen[step].row
+    call = partial(_of_row, scene, first, (*WRAPPERS, place), column, row, TEXTURES, here.surface)
+    return _entries(alike([call], here.wi.dtype)[0](), whole=not _in_textures(scene, paths, TEXTURES))
+
+
+def of_passed(scene: Scene, paths: Paths, slots: Slots, slot: int, passed: Passed) -> Entries:
+    """Of a number that is looked up at a surface that a shadow ray passes."""
+    place, number = divmod(slot, len(slots.wrappers[0]))
+    kind, row = passed.held[place]
+    first, _ = firsts(scene, paths)
+    place = kind - len(scene.materials.tables)
+
+    def of(i, columns):
+        mine = jnp.where(place == i, row, 0)
+        return lambda: _of_row(scene, first, (*WRAPPERS, i), columns[number], mine, TEXTURES, passed.surface)
+
+    calls = alike([of(*each) for each in enumerate(slots.wrappers)], passed.surface.p.dtype)
+    pairs = calls[0]() if len(calls) == 1 else lax.switch(jnp.maximum(place, 0), calls)
+    return _entries(pairs, whole=not _in_textures(scene, paths, TEXTURES))
 
 
 def of_hit(scene: Scene, paths: Paths, slots: Slots, slot: int, ray: Ray, hit: Hit, here: Vertex | None) -> Entries:
@@ -254,15 +369,9 @@ def _of_row(scene: Scene, first: dict, path: tuple, column: int | None, row, of_
     values, codes = (getattr(named.get(scene, path).columns[column], each) for each in ("values", "texture"))
     begins = first.get((*path, "columns", column, "values"))
     constant = () if begins is None else ((jnp.int32(begins + row), jnp.ones((), values.dtype)),)
-    wanted = {
-        (number, place): first[of_texture]
-        for number, table in enumerate(tables_of_textures(scene, of_textures) if of_textures else ())
-        for of_texture, place in _columns(scene, table).items()
-        if of_texture in first
-    }
-    if codes is None or not wanted:
+    if codes is None or not (wanted := _in_textures(scene, first, of_textures)):
         return constant
-    code = at(codes, row)
+    code, wanted = at(codes, row), {key: first[each] for key, each in wanted.items()}
     textured = partial(named.get(scene, of_textures).entries, code, surface, wanted)
     return lax.cond(code[0] >= 0, *alike([textured, lambda: constant], values.dtype))
 

@@ -36,6 +36,7 @@ from pathjax.emitters import Choice
 from pathjax.integrators import path, pixel
 from pathjax.integrators.options import Options
 from pathjax.integrators.random_numbers import Bounce, bounce_numbers
+from pathjax.integrators.shadow import none_passed
 from pathjax.scene import parameters as named
 from pathjax.scene.scene import Scene
 
@@ -84,37 +85,63 @@ def extend(
     slots: places.Slots,
     paths: places.Paths,
     scale: Float[Array, "3"],
-) -> tuple[path.Path, Record]:
-    """`path.extend` and the Record of the vertex, whose `begins` is not known here.
+    number: Int[Array, ""],
+) -> tuple[path.Path, Record, Bool[Array, ""]]:
+    """`path.extend`, the Record of the vertex, whose `begins` is not known here, and whether it is the vertex itself.
 
-    options: by vertex. scale: what derivatives are multiplied by.
+    Each surface that the vertex's shadow ray passes has a Record of its own, before that of the vertex.
+
+    Args:
+        options: by vertex.
+        scale: what derivatives are multiplied by.
+        number: of the Record among those of the vertex.
     """
+    scene = places.prepared(scene, slots, number)
     hit, here, u = path.meet(scene, now, u, options)
+    if slots.of_passed:
+        now = now._replace(L=now.L._replace(nudged=none_passed(scene)))
+    of_bsdfs, of_lights, of_choices, of_passed = slots.numbered(start=1)
 
     def varied(changes):
-        changed = places.nudged(scene, slots, changes[1:])
-        of = now._replace(throughput=now.throughput + changes[0])
-        on = path.onward(changed, choice, of, hit, here, u, options)
+        changed = places.nudged(scene, slots, changes)
+        of, there = now._replace(throughput=now.throughput + changes[0]), here
+        if of_choices:
+            change = jnp.dot(changes[of_choices.start : of_choices.stop], places.by_choices(slots, here))
+            there = here._replace(weight=here.weight + change)
+        on = path.onward(changed, choice, of, hit, there, u, options)
         return (on.L.emission, on.L.light, on.throughput), on
 
-    count = slots.of_bsdfs + slots.of_lights
-    zeros = jnp.zeros((1 + count,), scale.dtype)
+    count = of_passed.stop
+    zeros = jnp.zeros((count,), scale.dtype)
     push = partial(jax.jvp, varied, (zeros,), has_aux=True)
-    _, (Le, n, w), on = jax.vmap(lambda change: push((change,)), out_axes=(None, 0, None))(jnp.eye(1 + count))
+    _, (Le, n, w), on = jax.vmap(lambda change: push((change,)), out_axes=(None, 0, None))(jnp.eye(count))
     w = jnp.where(on.alive, w, 0)
     found = []
-    for s in range(slots.of_bsdfs):
-        if here is not None:
-            entries = places.of_bsdf(scene, paths, slots, s, here)
-            found.append(Slot(*entries, scale * n[1 + s], scale * w[1 + s], s >= slots.colors))
-    for s in range(slots.of_lights):
-        k = 1 + slots.of_bsdfs + s
+    for s, k in enumerate(of_bsdfs if here is not None else ()):
+        entries = places.of_bsdf(scene, paths, slots, s, here)
+        found.append(Slot(*entries, scale * n[k], scale * w[k], s >= slots.colors))
+    for s, k in enumerate(of_lights):
         entries = places.of_hit(scene, paths, slots, s, now.ray, hit, here)
         found.append(Slot(*entries, scale * Le[k], None))
         if choice is not None and here is not None:
             entries = places.of_light_sample(scene, choice, paths, slots, s, here, u)
             found.append(Slot(*entries, scale * n[k], None))
-    return on, Record(jnp.bool_(False), ~on.alive, Le[0] + n[0], w[0], found)
+    for s, k in enumerate(of_choices):
+        entries = places.of_choice(scene, paths, slots, s, here)
+        found.append(Slot(*entries, scale * n[k], scale * w[k], is_number=True))
+    record = Record(jnp.bool_(False), ~on.alive, Le[0] + n[0], w[0], found)
+    if not of_passed:
+        return on, record, jnp.bool_(True)
+
+    # Of what is passed nothing but its own derivatives.
+    passed, on = on.L.nudged, on._replace(L=on.L._replace(nudged=None))
+    itself = number >= passed.count
+    found = [jax.tree.map(lambda x: jnp.where(itself, x, 0).astype(x.dtype), slot) for slot in found]
+    for s, k in enumerate(of_passed):
+        entries = places.of_passed(scene, paths, slots, s, passed)
+        found.append(Slot(*entries, jnp.where(itself, 0, scale * n[k]), None, is_number=True))
+    gathered, weight = jnp.where(itself, record.gathered, 0), jnp.where(itself, record.weight, 1)
+    return on, Record(record.begins, record.ends & itself, gathered, weight, found), itself
 
 
 def columns_of(record: Record) -> list:
@@ -259,16 +286,17 @@ def pixel_sweep(work, scene: Scene, choice, memory: Memory, *, options, slots, p
     adjoint = adjoint / jnp.maximum(spp, 1).astype(adjoint.dtype)
 
     def step(state):
-        number, now, weight, memory = state
+        number, passed, now, weight, memory = state
         begins = ~now.alive
         now, weight = pixel.begun(scene, pixel_number, stream, number, now, weight, options)
         u = bounce_numbers(scene, stream, number, path.vertices(now), options.sampler)
-        now, record = extend(scene, choice, now, u, options, slots, paths, weight * adjoint)
-        record = record._replace(begins=begins)
-        memory = together(partial(remember, structure))(memory, columns_of(record))
-        return number + jnp.where(now.alive, 0, 1).astype(number.dtype), now, weight, memory
+        on, record, itself = extend(scene, choice, now, u, options, slots, paths, weight * adjoint, passed)
+        memory = together(partial(remember, structure))(memory, columns_of(record._replace(begins=begins)))
+        if slots.of_passed:
+            passed, on = jnp.where(itself, 0, passed + 1), jax.tree.map(partial(jnp.where, itself), on, now)
+        return number + jnp.where(on.alive, 0, 1).astype(number.dtype), passed, on, weight, memory
 
-    state = first_sample, *pixel.no_path(scene, options), memory
+    state = first_sample, jnp.int32(0), *pixel.no_path(scene, options), memory
     return persistent_loop(lambda state: state[0] != first_sample + spp, step, state)[-1]
 
 
@@ -298,7 +326,7 @@ def pullback(scene: Scene, adjoint, pixels, first_sample, spp, seed, *, paths, o
     def record(scene, choice, x):
         now, _ = pixel.camera_path(scene, jnp.int32(0), x, x, options)
         u = bounce_numbers(scene, x, x, path.vertices(now), options.sampler)
-        return extend(scene, choice, now, u, options, slots, paths, now.throughput)[1]
+        return extend(scene, choice, now, u, options, slots, paths, now.throughput, jnp.int32(0))[1]
 
     structure = jax.eval_shape(record, scene, choice, jnp.uint32(0))
     f = partial(pixel_sweep, options=options, slots=slots, paths=paths, structure=structure)

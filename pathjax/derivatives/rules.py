@@ -25,6 +25,9 @@ from pathjax.kinds.parameter import Parameter
 from pathjax.scene import parameters as named
 from pathjax.scene.scene import Scene
 
+# Of a step down to a leaf, the field that says where it goes.
+KEYS = {jax.tree_util.GetAttrKey: "name", jax.tree_util.SequenceKey: "idx", jax.tree_util.DictKey: "key"}
+
 
 @runtime_checkable
 class Estimator(Protocol):
@@ -91,6 +94,7 @@ def _estimate_jvp(static, primals, tangents):
 
 def _moved(estimator: MatrixFree, free: dict[str, Parameter], changes: dict[str, jax.Array], scene: Scene, work):
     """J v as a function whose transpose is J^T v."""
+
     def there(known, changes):
         scene, work = known
         return estimator.push(scene, free, changes, *work)
@@ -109,7 +113,7 @@ def _changes(parameters: Mapping[str, Parameter], scene_tangent, varied_tangent)
     for keys, leaf in leaves:
         if is_symbolic_zero(leaf):
             continue
-        place = tuple(key.name if isinstance(key, jax.tree_util.GetAttrKey) else key.idx for key in keys)
+        place = tuple(getattr(key, KEYS[type(key)]) for key in keys)
         held = {name: parameter for name, parameter in parameters.items() if parameter.path == place}
         if not held:
             raise InputError(

@@ -95,12 +95,13 @@ def build(
     made, boxes, light, number = [], [], np.full(len(shapes.shape), -1, np.int32), 0
     for kind, instances in (*inside.items(), *sorted(outside.items(), key=lambda item: item[0].distant)):
         place = (*path, len(made))
-        covers, codes, images = _textures(instances, dtype, (*place, "textures"), parameters)
+        covers, codes = _textures(instances, dtype, (*place, "textures"), parameters)
         table = kind.build(instances, dtype, (*place, "table"), parameters, codes.get)
         for key in kind.declared if codes else ():
             table = _with_means(table, key, [instance.values[key] for instance in instances])
-            names = [f"{each.name}.{key}" for each in instances if any(each.values[key] is image for image in images)]
-            parameters.refused.update({name: f"{name} is the image of a light, and no parameter" for name in names})
+            mean = *place, "table", "columns", kind.place(key), "values"
+            for row, instance in enumerate(instances):
+                _enter_mean(parameters, f"{instance.name}.{key}", instance.values[key], place, (mean, row))
         shining = [lamp for lamp in lamps if emitters[lamp.shape].kind is kind]  # of kinds outside of shapes: nothing
         for lamp in shining:
             light[lamp.primitive : lamp.primitive + lamp.count] = number
@@ -137,17 +138,29 @@ def _arranged(made: list[Lights], boxes: list[np.ndarray | None], dtype) -> tupl
     return (*placed, *made[len(near) :])
 
 
-def _textures(
-    instances: list[Instance], dtype, path: tuple, parameters: Parameters
-) -> tuple[Textures | None, dict, set[Instance]]:
-    """Those of lights, their codes, and those that are images. What is known by name has one place in a scene."""
+def _textures(instances: list[Instance], dtype, path: tuple, parameters: Parameters) -> tuple[Textures | None, dict]:
+    """Those of lights, and their codes. What is known by name has one place in a scene."""
     used = dict.fromkeys(v for each in instances for v in each.values.values() if isinstance(v, Instance))
     own = Parameters()
     made, codes = textures.build(list(used), dtype, path, own)
     for parameter in own.known.keys() & parameters.known.keys():
         raise InputError(f"{parameter} is of a texture of a bsdf and of a light; give each a texture of its own")
     parameters.known.update(own.known)
-    return made, codes, set(own.textures)
+    for image in own.textures.keys() - parameters.textures.keys():
+        parameters.textures[image] = own.textures[image]
+    return made, codes
+
+
+def _enter_mean(parameters: Parameters, name: str, image, lights: tuple, mean: tuple) -> None:
+    """Where the mean stands of an image that is a parameter. None is what a bsdf or other lights have, too."""
+    if not isinstance(image, Instance) or image not in parameters.textures:
+        return
+    if parameters.textures[image].path[: len(lights)] != lights:
+        parameters.refused[name] = f"{name} is an image that stands elsewhere, too; give the light one of its own"
+        return
+    first = parameters.names[image]
+    known = parameters.known[first]
+    parameters.known[first] = replace(known, means=(*known.means, mean))
 
 
 def _with_means(table: Table, key: str, values: list) -> Table:

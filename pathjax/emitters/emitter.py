@@ -38,6 +38,11 @@ class Emitter(Kind):
     dirac: ClassVar[bool] = False  # shines from one direction at each point
     single: ClassVar[bool] = False  # a scene takes one of the kind
 
+    @classmethod
+    def tells_entries(cls) -> bool:
+        """Whether `entries` of what it looks up in `Shared` arrays are known."""
+        return False
+
     @staticmethod
     @abstractmethod
     def power(p) -> Float[Array, " R"]:
@@ -85,6 +90,10 @@ class Background(Emitter):
         """
         return []
 
+    @classmethod
+    def tells_entries(cls):
+        return cls.entries is not Background.entries
+
     @staticmethod
     @abstractmethod
     def density(p: Row, d: Float[Array, "3"]) -> Float[Array, ""]:
@@ -112,3 +121,8 @@ class DiracEmitter(Emitter):
             direction towards the light; distance at which its shadow ray ends, inf if it is distant; and irradiance of
             a surface that faces it.
         """
+
+    @staticmethod
+    def uv(p: Row, d: Float[Array, "3"]) -> Float[Array, "2"]:
+        """Where its textures are looked up for what it throws in the direction -d; of kinds that may have some."""
+        raise NotImplementedError

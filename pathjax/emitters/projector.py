@@ -54,14 +54,25 @@ class Projector(DiracEmitter):
         squared = dot(to_light, to_light)
         distance = safe_sqrt(squared)
         d = to_light * safe_divide(1, distance)
-        x, y, z = -(d @ p.to_world)
+        z, uv = _screen(p, d)
         ahead = safe_divide(1, jnp.where(z > 0, z, 0))
-        uv = jnp.asarray(0.5, d.dtype) * (1 - jnp.stack([x / p.tan_x, y / p.tan_y]) * ahead)
         inside = (z > 0) & jnp.all((uv >= 0) & (uv <= 1))
         seen = p.on(jnp.where(inside, uv, 0)).irradiance * p.scale
         # A screen is met aslant by cos = z, and is further away by 1 / z.
         arriving = seen * (math.pi * ahead**3 * safe_divide(1, squared))
         return d, distance * REACH, jnp.where(inside, arriving, 0)
+
+    @staticmethod
+    def uv(p: Row, d: Float[Array, "3"]) -> Float[Array, "2"]:
+        _, uv = _screen(p, d)
+        return uv
+
+
+def _screen(p: Row, d: Float[Array, "3"]) -> tuple[Float[Array, ""], Float[Array, "2"]]:
+    """Cosine between the axis and -d, and where on the screen -d leads."""
+    x, y, z = -(d @ p.to_world)
+    ahead = safe_divide(1, jnp.where(z > 0, z, 0))
+    return z, jnp.asarray(0.5, d.dtype) * (1 - jnp.stack([x / p.tan_x, y / p.tan_y]) * ahead)
 
 
 def _extent(fov: float, fov_axis: str, irradiance) -> dict[str, float]:

@@ -80,8 +80,13 @@ class Spot(Point):
         angle = safe_atan2(safe_sqrt(dot(across, across)), -dot(axis, d)) * (180 / math.pi)
         falloff = jnp.where(angle < beam, 1, larger(safe_divide(cutoff - angle, cutoff - beam), 0))
         if p.to_world is not None:
-            x, y, z = -(d @ p.to_world)
-            # Beside the cone any texel will do.
-            scale = 0.5 * safe_divide(1, jnp.where(falloff > 0, z * jnp.tan(cutoff * (math.pi / 180)), 0))
-            irradiance = irradiance * p.on(jnp.stack([x, y]) * scale + jnp.asarray(0.5, d.dtype)).texture
+            irradiance = irradiance * p.on(Spot.uv(p, d)).texture
         return d, distance, irradiance * falloff
+
+    @staticmethod
+    def uv(p: Row, d: Float[Array, "3"]) -> Float[Array, "2"]:
+        """The square that the texture fills just holds the cone; beside that any texel will do."""
+        x, y, z = -(d @ p.to_world)
+        radius = jnp.tan(p.cutoff_angle * (math.pi / 180))
+        scale = 0.5 * safe_divide(1, jnp.where(x * x + y * y < 2 * (z * radius) ** 2, larger(z, 0) * radius, 0))
+        return jnp.stack([x, y]) * scale + jnp.asarray(0.5, d.dtype)

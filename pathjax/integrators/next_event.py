@@ -12,7 +12,7 @@ from pathjax.core.types import EmitterSample
 from pathjax.emitters import Choice
 from pathjax.integrators.options import Options
 from pathjax.integrators.random_numbers import Bounce
-from pathjax.integrators.shadow import transmitted
+from pathjax.integrators.shadow import Passed, none_passed, transmitted
 from pathjax.integrators.vertex import Vertex, evaluate, is_smooth
 from pathjax.scene.scene import Scene
 from pathjax.shapes import geometry
@@ -32,7 +32,7 @@ def light_sample(
     depth: Int[Array, ""],
     options: Options,
     medium: Int[Array, ""] | None = None,
-) -> tuple[Float[Array, "3"], Int[Array, ""] | None]:
+) -> tuple[Float[Array, "3"], Int[Array, ""] | None, Passed | None]:
     """One sample of what a vertex reflects of direct light: the integral over all lights of f Le |cos theta| V.
 
     Args:
@@ -41,7 +41,7 @@ def light_sample(
         depth: vertices so far.
         medium: in which the path came; None in scenes without media.
     Returns:
-        The sample, and how many vertices its light passed straight; None where there are no such.
+        The sample, how many vertices its light passed straight, None where there are no such, and one of these.
     """
     materials = scene.materials
     smooth = is_smooth(scene, vertex)
@@ -61,12 +61,14 @@ def light_sample(
             most, start = scene.max_depth - 1 - depth, medium
             if medium is not None:
                 start = media.beyond(scene.media, medium, vertex.hit.shape, vertex.surface.n, drawn.d)
-            share, passed = transmitted(scene, shadow_ray, drawn.primitive, most, options.derivative, start)
-            return jnp.where(useful, contribution * share, 0), passed if passes else None
+            found = transmitted(scene, shadow_ray, drawn.primitive, most, options.derivative, start)
+            share, passed, nudged = found
+            return jnp.where(useful, contribution * share, 0), passed if passes else None, nudged
         visible = useful & ~geometry.occluded(scene.geometry, shadow_ray, drawn.primitive)
-        return jnp.where(visible, contribution, 0), None
+        return jnp.where(visible, contribution, 0), None, None
 
-    return lax.cond(smooth, sample, lambda: (jnp.zeros_like(vertex.wi), jnp.int32(0) if passes else None))
+    nothing = jnp.int32(0) if passes else None, none_passed(scene)
+    return lax.cond(smooth, sample, lambda: (jnp.zeros_like(vertex.wi), *nothing))
 
 
 def _weight(drawn: EmitterSample, pdf_bsdf: Float[Array, ""], options: Options) -> Float[Array, ""] | int:

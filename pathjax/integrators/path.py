@@ -29,6 +29,7 @@ from pathjax.emitters import Choice
 from pathjax.integrators import next_event, roulette, splitting
 from pathjax.integrators.options import Options
 from pathjax.integrators.random_numbers import Bounce
+from pathjax.integrators.shadow import Passed
 from pathjax.integrators.vertex import Vertex, sample, vertex, within
 from pathjax.scene.scene import Scene
 from pathjax.shapes import geometry
@@ -40,6 +41,7 @@ class Gain(NamedTuple):
     emission: Float[Array, "3"]  # of the term T^depth Le, depth being that of the path before the vertex
     light: Float[Array, "3"]  # of the next one: the light sample
     passed: Int[Array, ""] | None = None  # and of so many further ones; None: nothing lets light pass
+    nudged: Passed | None = None  # on the way of the light sample; None: nothing asks for it
 
 
 class Path(NamedTuple):
@@ -209,8 +211,8 @@ def scatter(
         path = path._replace(throughput=path.throughput * here.weight)
     L = path.L
     if next_event.occurs(scene, choice, options):
-        light, passed = next_event.light_sample(scene, choice, here, u, goes_on, path.depth, options, path.medium)
-        L = _with_light(L, path.throughput * light, passed)
+        light, *passed = next_event.light_sample(scene, choice, here, u, goes_on, path.depth, options, path.medium)
+        L = _with_light(L, path.throughput * light, *passed)
     drawn, d = compute_once(sample(scene, here, u.bsdf))
     if path.pending is not None:
         splits = splitting.takes_place(scene, here, path)
@@ -235,9 +237,7 @@ def scatter(
     )
     if path.origin is not None:
         passes = bsdfs.has(scene.materials, here.kind, "passes")
-        on = on._replace(
-            pdf=jnp.where(passes, path.pdf, on.pdf), origin=jnp.where(passes, path.origin, here.surface.p)
-        )
+        on = on._replace(pdf=jnp.where(passes, path.pdf, on.pdf), origin=jnp.where(passes, path.origin, here.surface.p))
     if path.moving is not None:
         on = on._replace(moving=path.moving | bsdfs.moving_bit(scene.materials, here.kind, here.row))
     return on if path.pending is None else splitting.split(scene, here, u.bsdf, splits, path, on)
@@ -264,5 +264,5 @@ def _with_emission(L, emitted):
     return L._replace(emission=emitted, light=jnp.zeros_like(emitted)) if isinstance(L, Gain) else L + emitted
 
 
-def _with_light(L, light, passed):
-    return L._replace(light=light, passed=passed) if isinstance(L, Gain) else L + light
+def _with_light(L, light, passed, nudged):
+    return L._replace(light=light, passed=passed, nudged=nudged) if isinstance(L, Gain) else L + light

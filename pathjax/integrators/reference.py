@@ -73,7 +73,7 @@ def radiance(scene: Scene, choice: Choice | None, ray: Ray, numbers: Callable) -
             shadow_ray = spawn_ray(here.surface, light.d, hit.primitive)._replace(t_max=light.distance)
             lit = goes_on & is_smooth(scene, here) & (light.pdf > 0) & (pdf_bsdf > 0)
             start, most = beyond(scene, medium, here, light.d), scene.max_depth - 1 - depth
-            arrives, _ = transmitted(scene, shadow_ray, light.primitive, most, False, start)
+            arrives, *_ = transmitted(scene, shadow_ray, light.primitive, most, False, start)
             direct = f * light.Le / jnp.where(lit, light.pdf, 1) * share(jnp.where(lit, light.density, 1), pdf_bsdf)
             L = L + jnp.where(lit, throughput * arrives * direct, 0)
 

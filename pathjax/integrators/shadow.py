@@ -4,15 +4,25 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from pathjax import bsdfs, media
+from pathjax.bsdfs import tree
 from pathjax.core.math import dot, shading_frame, smaller, spawn_ray
-from pathjax.core.types import Ray
+from pathjax.core.types import Hit, Ray, Surface
 from pathjax.scene.scene import Scene
 from pathjax.shapes import geometry
+
+
+class Passed(NamedTuple):
+    """Of the surfaces that a shadow ray passes, the one that `Materials.nudged` names."""
+
+    count: Int[Array, ""]  # of all of them
+    surface: Surface
+    held: Int[Array, "held 2"]  # of `tree.on_the_way`
 
 
 class _Way(NamedTuple):
@@ -21,6 +31,7 @@ class _Way(NamedTuple):
     passes: Int[Array, ""]
     goes_on: Bool[Array, ""]
     medium: Int[Array, ""] | None
+    nudged: tuple[Surface, Int[Array, "held 2"]] | None
 
 
 def transmitted(
@@ -30,8 +41,8 @@ def transmitted(
     most: Int[Array, ""],
     differentiated: bool,
     medium: Int[Array, ""] | None = None,
-) -> tuple[Float[Array, ""] | Float[Array, "3"], Int[Array, ""]]:
-    """Share of light that a shadow ray finds, and how many vertices it takes to pass surfaces straight.
+) -> tuple[Float[Array, ""] | Float[Array, "3"], Int[Array, ""], Passed | None]:
+    """Share of light that a shadow ray finds, how many vertices it takes to pass surfaces straight, and one of these.
 
     The share is the probability that paths pass them all: what light samples and bsdf samples find is the same. In a
     scene with media it is one of each colour.
@@ -49,7 +60,7 @@ def transmitted(
 
     if not bsdfs.occurs(scene.materials, "passes"):
         visible = (ray.t_max >= 0) & ~geometry.occluded(scene.geometry, ray, target)
-        return dimmed(medium, visible.astype(ray.t_max.dtype), ray.t_max), jnp.int32(0)
+        return dimmed(medium, visible.astype(ray.t_max.dtype), ray.t_max), jnp.int32(0), None
     # A line meets no primitive more than twice: rounding that found one again and again comes to an end.
     ever = jnp.int32(2 * scene.geometry.shape.shape[0])
     most = ever if scene.free_passes else jnp.minimum(most, ever)
@@ -59,7 +70,16 @@ def transmitted(
         arrives = (hit.primitive < 0) | (hit.primitive == target)
         surface = geometry.surface(scene.geometry, way.ray, hit)
         front = dot(shading_frame(surface).n, way.ray.d) < 0
-        through = jnp.where(way.passes < most, bsdfs.passing(scene.materials, hit.shape, surface, front), 0)
+        nudges, nudged = None, way.nudged
+        if nudged is not None:
+            number, nudges = scene.materials.nudged
+            mine = way.passes == number
+            nudges = jnp.where(mine, nudges, 0)
+            code = bsdfs.select(scene.materials, hit.shape, front)
+            held = jnp.stack([jnp.stack(each) for each in tree.on_the_way(scene.materials, code, front)])
+            nudged = jax.tree.map(lambda new, old: jnp.where(mine & ~arrives, new, old), (surface, held), nudged)
+        free = bsdfs.passing(scene.materials, hit.shape, surface, front, nudges)
+        through = jnp.where(way.passes < most, free, 0)
         share = jnp.where(arrives, way.share, way.share * through)
         share = dimmed(way.medium, share, smaller(hit.t, way.ray.t_max))
         within = way.medium
@@ -68,8 +88,23 @@ def transmitted(
         beyond = spawn_ray(surface, way.ray.d, hit.primitive)._replace(t_max=way.ray.t_max - hit.t)
         maybe = bsdfs.is_tree(scene.materials, hit.shape, front) if differentiated else False
         on = ~arrives & (way.passes < most) & ((through > 0) | maybe)
-        return _Way(beyond, share, way.passes + on.astype(jnp.int32), on, within)
+        return _Way(beyond, share, way.passes + on.astype(jnp.int32), on, within, nudged)
 
-    one = jnp.ones_like(ray.t_max if medium is None else ray.o)
-    end = lax.while_loop(lambda way: way.goes_on, step, _Way(ray, one, jnp.int32(0), ray.t_max >= 0, medium))
-    return jnp.where(ray.t_max >= 0, end.share, 0), jnp.int32(0) if scene.free_passes else end.passes
+    one, nobody = jnp.ones_like(ray.t_max if medium is None else ray.o), none_passed(scene)
+    nudged = None if nobody is None else (nobody.surface, nobody.held)
+    start = _Way(ray, one, jnp.int32(0), ray.t_max >= 0, medium, nudged)
+    end = lax.while_loop(lambda way: way.goes_on, step, start)
+    passed = None if nobody is None else Passed(end.passes, *end.nudged)
+    return jnp.where(ray.t_max >= 0, end.share, 0), jnp.int32(0) if scene.free_passes else end.passes, passed
+
+
+def none_passed(scene: Scene) -> Passed | None:
+    """What stands where no shadow ray is; None where nothing asks for what they pass."""
+    if scene.materials.nudged is None:
+        return None
+
+    def seen(o):
+        return geometry.surface(scene.geometry, Ray(o, o, o[0], jnp.int32(-1)), Hit(o[0], jnp.int32(-1), jnp.int32(-1)))
+
+    surface = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(seen, scene.camera.origin))
+    return Passed(jnp.int32(0), surface, jnp.full((len(scene.materials.nudged[1]), 2), -1, jnp.int32))

@@ -26,6 +26,7 @@ class Vertex(NamedTuple):
     # Where bsdfs hold others, of `tree.Leaf`:
     weight: Float[Array, ""] | None = None
     turns: tuple[tree.Turn, ...] = ()
+    chosen: tuple[tree.Chosen, ...] = ()
     colors: bsdfs.Colors | None = None  # of the textures of the bsdf; None: there are none
     medium: Int[Array, ""] | None = None  # that scatters here, or media.NONE: a surface does. None: no medium scatters
 
@@ -35,9 +36,7 @@ class Vertex(NamedTuple):
         return jnp.bool_(False) if self.medium is None else self.medium != media.NONE
 
 
-def vertex(
-    scene: Scene, ray: Ray, hit: Hit, u: Float[Array, ""] | None = None, differentiated: bool = False
-) -> Vertex:
+def vertex(scene: Scene, ray: Ray, hit: Hit, u: Float[Array, ""] | None = None, differentiated: bool = False) -> Vertex:
     """What a ray meets at its hit; of a miss, some surface. The scene holds a shape.
 
     Reflectors see either side as their front, so their frame is turned towards the ray; glass tells its sides apart.
@@ -50,12 +49,12 @@ def vertex(
     frame = shading_frame(surface)
     wi = to_local(frame, -ray.d)
     leaf = bsdfs.leaf(scene.materials, hit.shape, surface, frame, wi, u, differentiated)
-    kind, row, frame, wi, weight, turns = leaf
+    kind, row, frame, wi, weight, turns, chosen = leaf
     side = jnp.where(bsdfs.has(scene.materials, kind, "sided") | (wi[2] > 0), 1, -1).astype(wi.dtype)
     frame, wi = frame._replace(n=frame.n * side), jnp.stack([wi[0], wi[1], wi[2] * side])
     turns = tuple(turn._replace(n=turn.n * side) for turn in turns)
     colors = bsdfs.colors(scene.materials, kind, row, surface)
-    return Vertex(hit, surface, frame, wi, kind, row, weight, turns, colors)
+    return Vertex(hit, surface, frame, wi, kind, row, weight, turns, chosen, colors)
 
 
 def within(here: Vertex, ray: Ray, medium: Int[Array, ""], distance: Float[Array, ""]) -> Vertex:
@@ -81,6 +80,7 @@ def within(here: Vertex, ray: Ray, medium: Int[Array, ""], distance: Float[Array
         kind=chosen(-1, here.kind),
         row=chosen(0, here.row),
         weight=None if here.weight is None else chosen(1, here.weight),
+        chosen=tuple(each._replace(by=chosen(0, each.by)) for each in here.chosen),
         medium=chosen(medium, media.NONE),
     )
 

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from dataclasses import dataclass, field, replace
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Shaped
+
+from pathjax.core.math import luminance
 
 
 @dataclass(frozen=True)
@@ -22,24 +26,39 @@ class Parameter:
     moves_paths: bool = False  # as the IOR of smooth glass does; others change what paths carry
     least: float = -math.inf  # smaller numbers count as this one, and images do not change with them
     rows: int | None = None  # of a texture: how many entries of the array, from the index on; None: the entry alone
+    # Paths to arrays, and rows of these, where the mean of a texture stands, by which lights are chosen.
+    means: tuple[tuple[tuple[str | int, ...], int], ...] = ()
+    # Of what the vertices or faces of a mesh carry, (rows, 3): which of them a corner has.
+    corners: np.ndarray | None = dataclasses.field(default=None, compare=False)
 
     @property
     def is_texture(self) -> bool:
         return self.rows is not None
 
     def get(self, values: Shaped[Array, "R ..."]) -> Shaped[Array, "..."]:
-        """Its value, of the array where it lives."""
+        """Its value, of the array where it lives; of a texture of numbers the luminance of its texels."""
         if not self.is_texture:
             return values[self.index]
         first = self.index[0]
-        return values[first : first + self.rows].reshape(self.shape)
+        mine = values[first : first + self.rows]
+        if self.corners is not None:
+            # What no corner has is 0.
+            corner_of = np.full(self.shape[0], self.corners.size)
+            corner_of[self.corners.ravel()] = np.arange(self.corners.size)
+            return jnp.concatenate([mine.reshape(-1, 3), jnp.zeros((1, 3), mine.dtype)])[corner_of]
+        if mine.size > math.prod(self.shape):
+            mine = jnp.where(jnp.ptp(mine, 1) > 0, luminance(mine), mine[:, 0])
+        return mine.reshape(self.shape)
 
     def put(self, values: Shaped[Array, "R ..."], value: Shaped[Array, "..."]) -> Shaped[Array, "R ..."]:
-        """The array with another value of the parameter."""
+        """The array with another value of the parameter; a number stands for all channels of a texel."""
         if not self.is_texture:
             return values.at[self.index].set(value)
-        first = self.index[0]
-        return values.at[first : first + self.rows].set(value.reshape(self.rows, *values.shape[1:]))
+        first, (_, *others) = self.index[0], values.shape
+        if self.corners is not None:
+            return values.at[first : first + self.rows].set(value[self.corners])
+        value = jnp.broadcast_to(value.reshape(self.rows, -1), (self.rows, math.prod(others)))
+        return values.at[first : first + self.rows].set(value.reshape(self.rows, *others))
 
     def transposed(self, values: Shaped[Array, "R ..."]) -> Shaped[Array, "..."]:
         """The transpose of `put` into zeros: of derivatives in the array, those in the parameter."""
@@ -48,9 +67,9 @@ class Parameter:
         return found
 
     @property
-    def table(self) -> tuple[str | int, ...]:
-        """Path to the table of its kind, which holds `columns[place].values`."""
-        return self.path[:-3]
+    def table(self) -> tuple[str | int, ...] | None:
+        """Path to the table of its kind, which holds `columns[place].values`; None of a mesh."""
+        return self.path[:-3] if self.corners is None else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,16 +83,23 @@ class Parameters:
     names: dict[object, str] = field(default_factory=dict)
 
     def enter_texture(self, name: str, texture, declared) -> None:
-        """Enter a texture that stands in the place of what is `declared`, and would be the parameter `name`."""
-        first, color = self.names.setdefault(texture, name), declared.listed and declared.shape == (3,)
+        """Enter a texture that stands in the place of what is `declared`, and would be the parameter `name`.
+
+        An image that stands in several places is named after the first one, and has the bounds of all. Where all want
+        numbers it is a parameter of numbers.
+        """
         if texture not in self.textures:
             self.refused.update(texture.kind.refused(name))
-        elif first != name:
+            return
+        first = self.names.setdefault(texture, name)
+        if first != name:
             self.refused[name] = f"{name} is the same image as {first}; set that, and both change"
-            if not color and first in self.known:
-                del self.known[first]
-                self.refused[first] = f"{first} is also {name}, and only images of colours are parameters"
-        elif color:
-            self.known[name] = replace(self.textures[texture], bounds=declared.bounds)
-        else:
-            self.refused[name] = f"{name} is an image, and only images of colours are parameters"
+        if not declared.listed:
+            self.known.pop(first, None)
+            self.refused[first] = f"{first} is an image that stands in {name}, too, which is no parameter"
+        elif first not in self.refused:
+            color = self.textures[texture]
+            shape = color.shape if declared.shape == (3,) else color.shape[:2]
+            now = self.known.get(first, replace(color, shape=shape, bounds=declared.bounds))
+            low, high = zip(now.bounds, declared.bounds, strict=True)
+            self.known[first] = replace(now, shape=max(now.shape, shape, key=len), bounds=(max(low), min(high)))

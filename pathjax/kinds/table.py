@@ -74,6 +74,10 @@ class Row:
         """The same, with textures looked up at uv."""
         return Row(self._table, self._row, SimpleNamespace(uv=uv), self._textures)
 
+    def nudged(self, nudges: Mapping[int, Array]) -> Row:
+        """The same of `Table.nudged`."""
+        return Row(self._table.nudged(nudges), self._row, self._surface, self._textures, self._colors)
+
     def __getattr__(self, name: str):
         kind = self._table.kind
         if name not in kind.declared:

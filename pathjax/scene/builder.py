@@ -34,7 +34,7 @@ def build(description: desc.Description, dtype=jnp.float32, split_rule: str = "s
     parameters = Parameters()
     materials = bsdfs.build([shape.bsdf for shape in description.shapes], dtype, ("materials",), parameters)
     asked = {"tangents": bsdfs.occurs(materials, "anisotropic"), "along": bsdfs.occurs(materials, "along_uv")}
-    geometry, lamps, trees = shapes.build(description.shapes, dtype, split_rule, **asked)
+    geometry, lamps, trees = shapes.build(description.shapes, dtype, split_rule, ("geometry",), parameters, **asked)
     given = [*(shape.emitter for shape in description.shapes), *description.emitters]
     lights, geometry = emitters.build(given, lamps, geometry, dtype, ("emitters",), parameters)
     within = None

@@ -57,9 +57,14 @@ def with_values(scene: Scene, values: Mapping[str, jax.Array], parameters: Mappi
     for name, value in values.items():
         parameter = parameters[name]
         scene = put(scene, parameter.path, parameter.put(get(scene, parameter.path), value))
+        for path, row in parameter.means:
+            # Known values as builders take them, to the last bit.
+            texels = lax.stop_gradient(value) if is_traced(value) else np.asarray(value, np.float64)
+            scene = put(scene, path, get(scene, path).at[row].set(texels.mean((0, 1))))
     changed: dict[tuple, list[str]] = {}
     for parameter in (parameters[name] for name in values):
-        changed.setdefault(parameter.table, []).append(parameter.field)
+        if parameter.table is not None:
+            changed.setdefault(parameter.table, []).append(parameter.field)
     for path, fields in changed.items():
         table = get(scene, path)
         scene = put(scene, path, table.kind.derived(table, fields))
@@ -127,7 +132,7 @@ def refuse_constant(scene: Scene, wanted: Mapping[str, Parameter]) -> None:
 def get(tree, path):
     """What `path` leads to."""
     for step in path:
-        tree = tree[step] if isinstance(step, int) else getattr(tree, step)
+        tree = tree[step] if isinstance(step, int) or isinstance(tree, Mapping) else getattr(tree, step)
     return tree
 
 
@@ -136,6 +141,8 @@ def put(tree, path, value):
     if not path:
         return value
     step, rest = path[0], path[1:]
+    if isinstance(tree, Mapping):
+        return {**tree, step: put(tree[step], rest, value)}
     if isinstance(step, int):
         return (*tree[:step], put(tree[step], rest, value), *tree[step + 1 :])
     return replace(tree, **{step: put(getattr(tree, step), rest, value)})

@@ -7,11 +7,13 @@ builders and kernels.
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
+from pathjax.kinds import Parameter, Parameters
 from pathjax.shapes import coincident
 from pathjax.shapes.accel.build import Tree
 from pathjax.shapes.cube import Cube
@@ -74,12 +76,19 @@ class _Part(NamedTuple):
 
 
 def build(
-    shapes, dtype, rule: str, tangents: bool = False, along: bool = False
+    shapes,
+    dtype,
+    rule: str,
+    path: tuple = (),
+    parameters: Parameters | None = None,
+    tangents: bool = False,
+    along: bool = False,
 ) -> tuple[Geometry, list[Lamp], dict[str, Tree]]:
     """Tables of primitives, which lack the numbers of their lights; what emits; hierarchies by `kind`, for reports.
 
     Args:
         shapes: of `description.Shape`; rule: of `accel.build`.
+        path: where the geometry will be in the scene; parameters: to enter the attributes that bsdfs ask for.
         tangents, along: whether a bsdf asks for those of `Surface`.
     """
     order = dict.fromkeys(kind.table for kind in KINDS.values())
@@ -103,6 +112,12 @@ def build(
     for table, parts in by_table.items():
         lamps += _lamps(parts, len(tables), len(shape_of))
         shape_of += [part.shape for part in parts for _ in part.primitives.areas]
+        if parameters is not None:
+            first = 0
+            for part in parts:
+                where = *path, "tables", len(tables), "attributes"
+                _enter_attributes(parameters, where, shapes[part.shape], part.primitives, first)
+                first += len(part.primitives.areas)
         primitives, lit = [part.primitives for part in parts], [part.lamp for part in parts]
         made, built = table.build(primitives, lit, dtype, rule, margins.get(table))
         tables.append(made)
@@ -110,6 +125,26 @@ def build(
     lamps.sort(key=lambda lamp: (shapes[lamp.shape].geometry.comes_last, lamp.shape))
     geometry = Geometry(tuple(tables), np.asarray(shape_of, np.int32), None, tangents, along)
     return geometry, lamps, {kind: tree for kind, tree in trees.items() if tree is not None}
+
+
+def _enter_attributes(parameters: Parameters, path: tuple, shape, primitives: Primitives, first: int) -> None:
+    """Those that the bsdf of a shape asks for. first: row of the shape's first primitive."""
+    for key, declared, texture in mesh_attribute.asked(shape.bsdf):
+        attribute, scale = texture.values["names"], texture.values["scale"]
+        name, values = f"{shape.name}.{attribute}", shape.geometry.attributes[attribute]
+        if not declared.listed:
+            parameters.refused[name] = f"{name} stands in {key} of its bsdf, which is no parameter"
+        if "." in shape.name:  # as loaders name them
+            parameters.refused[name] = f"{name} is of a mesh that an instance shows, as others may"
+        if name in parameters.refused:
+            parameters.known.pop(name, None)
+            continue
+        low, high = (bound / scale if scale else math.inf * np.sign(bound) for bound in declared.bounds)
+        known = parameters.known.get(name)
+        bounds = (low, high) if known is None else (max(low, known.bounds[0]), min(high, known.bounds[1]))
+        corners = primitives.entries[attribute]
+        where = (*path, attribute), (first,)
+        parameters.known[name] = Parameter(*where, values.shape, bounds, rows=len(corners), corners=corners)
 
 
 def lamp_table(lamps: list[Lamp], dtype) -> Lamps:

@@ -33,6 +33,7 @@ class Geometry:
     light: Int[Array, " P"] | None  # number of its light; -1: emits nothing. None: lights are not built yet
     tangents: bool = field(default=False, metadata={"static": True})  # whether `surface` tells them
     along: bool = field(default=False, metadata={"static": True})
+    corners: bool = field(default=False, metadata={"static": True})
 
 
 def firsts(geometry: Geometry) -> list[int]:
@@ -100,6 +101,8 @@ def surface(geometry: Geometry, ray: Ray, hit: Hit) -> Surface:
             seen = table.surface(row, ray.o, ray.d, hit.t)
             if geometry.tangents:
                 seen = seen._replace(tangent=_tangent(table.along_u(row, seen), seen.shading_n))
+            if geometry.corners:
+                seen = seen._replace(corners=table.corners(row, ray.o, ray.d))
             if names and seen.attributes is None:
                 seen = seen._replace(attributes=dict.fromkeys(names, jnp.zeros_like(seen.p)))
             if geometry.along:

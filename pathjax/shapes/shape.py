@@ -196,6 +196,10 @@ class Table(Searched):
         Differentiable in the ray o, d; t tells apart points, and is not differentiated.
         """
 
+    def corners(self, row: Int[Array, ""], o: Float[Array, "3"], d: Float[Array, "3"]):
+        """`Surface.corners`; of what has no `attributes`: any."""
+        return jnp.zeros_like(row), jnp.zeros_like(o)
+
     @abstractmethod
     def along_u(self, row: Int[Array, ""], surface: Surface) -> Float[Array, "3"]:
         """The way, of any length, in which u of `surface`, a point of this primitive, grows and v does not."""

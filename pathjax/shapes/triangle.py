@@ -31,6 +31,7 @@ class Facets(Primitives):
     normals: np.ndarray | None  # (F, 3, 3)
     uv: np.ndarray | None  # (F, 3, 2)
     attributes: Mapping[str, np.ndarray]  # (F, 3, 3) at the corners
+    entries: Mapping[str, np.ndarray] = field(default_factory=dict)  # (F, 3) of an attribute: which entry a corner has
 
     one_lamp = True
 
@@ -160,13 +161,7 @@ class Triangles(Table):
         """The point comes from barycentrics."""
         vertices = at(self.vertices, row)
         edge1, edge2 = vertices[1] - vertices[0], vertices[2] - vertices[0]
-        s = o - vertices[0]
-        q = cross(s, edge1)
-        h = cross(d, edge2)
-        scale = safe_divide(1, dot(edge1, h))
-        b1 = jnp.clip(dot(s, h) * scale, 0, 1)
-        b2 = jnp.clip(dot(d, q) * scale, 0, 1 - b1)
-        b0 = 1 - b1 - b2
+        b0, b1, b2 = _barycentrics(vertices[0], edge1, edge2, o, d)
         n = _normal(edge1, edge2)
 
         def interpolate(values):
@@ -181,6 +176,11 @@ class Triangles(Table):
             margin = margin + at(self.margins, row)
         attributes = {name: interpolate(at(values, row)) for name, values in self.attributes.items()} or None
         return Surface(interpolate(vertices), n, margin, shading_n, uv, attributes=attributes)
+
+    def corners(self, row, o, d):
+        vertices = at(self.vertices, row)
+        edge1, edge2 = vertices[1] - vertices[0], vertices[2] - vertices[0]
+        return 3 * row, jnp.stack(_barycentrics(vertices[0], edge1, edge2, o, d))
 
     def along_u(self, row, surface):
         """Nowhere, where the mesh has no uv or squeezes it to a line."""
@@ -289,11 +289,10 @@ class Mesh(Shape):
     def primitives(self, flip):
         faces = self.faces[:, ::-1] if flip else self.faces
         normals = None if self.normals is None else self.normals[faces] * (-1 if flip else 1)
-        carried = {
-            name: values[faces] if name.startswith("vertex_") else np.repeat(values[:, None], 3, axis=1)
-            for name, values in self.attributes.items()
-        }
-        return Facets(self.vertices[faces], normals, None if self.uv is None else self.uv[faces], carried)
+        own = np.repeat(np.arange(len(faces))[:, None], 3, axis=1)
+        entries = {name: faces if name.startswith("vertex_") else own for name in self.attributes}
+        carried = {name: values[entries[name]] for name, values in self.attributes.items()}
+        return Facets(self.vertices[faces], normals, None if self.uv is None else self.uv[faces], carried, entries)
 
 
 class SerializedMesh(Mesh):
@@ -330,6 +329,17 @@ def bounds(vertices):
     """(P, 3, 3) -> two (P, 3)."""
     a, b, c = np.moveaxis(vertices, 1, 0)  # NumPy reduces short axes slowly
     return np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)
+
+
+def _barycentrics(vertex, edge1, edge2, o, d):
+    """Of the point where a ray meets the plane of a triangle, or of one near it in the triangle."""
+    s = o - vertex
+    q = cross(s, edge1)
+    h = cross(d, edge2)
+    scale = safe_divide(1, dot(edge1, h))
+    b1 = jnp.clip(dot(s, h) * scale, 0, 1)
+    b2 = jnp.clip(dot(d, q) * scale, 0, 1 - b1)
+    return 1 - b1 - b2, b1, b2
 
 
 def _normal(edge1, edge2):

@@ -69,18 +69,19 @@ class Textures:
         return self._switch(code, [of(table) for table in self.tables])
 
     def entries(
-        self, code: Int[Array, "2"], surface: Surface, first: Mapping[tuple[int, int], int]
+        self, code: Int[Array, "2"], surface: Surface, first: Mapping[tuple[int, int | str], int]
     ) -> tuple[tuple[Int[Array, ""], Float[Array, "..."]], ...]:
         """Where the numbers that a colour is the sum of stand in a list of derivatives, and their shares.
 
-        first: by table and column, where its entries begin. Of columns that are not named there the share is 0.
+        first: by table and column, or the name of what meshes carry, where its entries begin. Of what is not there the
+            share is 0.
         """
 
         def of(number, table):
             def entries():
                 row = jnp.maximum(code[1], 0)
                 p, known = Row(table, row), {table.kind.place(name): name for name in table.kind.declared}
-                wanted = {known[column]: begins for (each, column), begins in first.items() if each == number}
+                wanted = {known.get(column, column): at for (each, column), at in first.items() if each == number}
                 parts = table.kind.entries(p, _uv(p, surface), surface) if wanted else ()
                 return tuple(
                     (wanted[name] + (row if entry is None else entry), share)

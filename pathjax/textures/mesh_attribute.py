@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from pathjax.core.math import at
 from pathjax.core.types import Surface
@@ -43,13 +43,31 @@ class MeshAttribute(Texture):
 
     @staticmethod
     def look_up(p: Row, uv: Float[Array, "2"], surface: Surface) -> Float[Array, "3"]:
-        values = [surface.attributes[name] for name in p.names.split()]
-        return (values[0] if len(values) == 1 else at(jnp.stack(values), p.number)) * p.scale
+        return _value(p, surface) * p.scale
+
+    @staticmethod
+    def entries(p: Row, uv: Float[Array, "2"], surface: Surface) -> list[tuple[str, Int[Array, ""] | None, Array]]:
+        names = p.names.split()
+        found = [("scale", None, _value(p, surface))]
+        for number, name in enumerate(names if surface.corners is not None else ()):
+            first, shares = surface.corners
+            scale = p.scale if len(names) == 1 else jnp.where(p.number == number, p.scale, 0)
+            found += [(name, first + k, shares[k] * scale) for k in range(3)]
+        return found
+
+    @classmethod
+    def attributes(cls, settings):
+        return settings["names"].split()
 
     @classmethod
     def span(cls, texture: Instance) -> tuple[float, float]:
         """Of no mesh yet: `fault` checks those that it is used on."""
         return 0.0, 0.0
+
+
+def _value(p: Row, surface: Surface) -> Float[Array, "3"]:
+    values = [surface.attributes[name] for name in p.names.split()]
+    return values[0] if len(values) == 1 else at(jnp.stack(values), p.number)
 
 
 def asked(instance: Instance) -> Iterator[tuple[str, Declared, Instance]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Mapping
 
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -32,6 +33,15 @@ class Texture(Kind):
         The entry is that in a `Shared` array; None: the row of the texture. A kind that says none is differentiated
         forwards alone.
         """
+        return []
+
+    @classmethod
+    def tells_entries(cls) -> bool:
+        return cls.entries is not Texture.entries
+
+    @classmethod
+    def attributes(cls, settings: Mapping[str, str]) -> list[str]:
+        """Names of what meshes carry that a table of these settings looks up; `entries` may name them, too."""
         return []
 
     @classmethod

@@ -10,12 +10,14 @@ import itertools
 import os
 import re
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
 from pathjax import description as d
+from pathjax.core.math import luminance
 from pathjax.description.elements import Document, Element
 from pathjax.errors import InputError
 from pathjax.images import write_exr
@@ -101,8 +103,10 @@ class _Writer:
         """The element with what has changed, and with files in the place of arrays."""
         made = self.made.get(element)
         geometry = getattr(made, "geometry", None)
-        if geometry is not None and geometry.triangles and element.attributes["type"] not in PLUGINS["shape"]:
-            return self.mesh(element, made)
+        if geometry is not None and geometry.triangles:
+            carried = self.carried(made)
+            if carried is not geometry.attributes or element.attributes["type"] not in PLUGINS["shape"]:
+                return self.mesh(element, replace(made, geometry=replace(geometry, attributes=carried)))
         if isinstance(made, Instance):
             values = {key: self.values[f"{made.name}.{key}"] for key in self.different(made)}
             element = self.with_values(element, made, values) if values else element
@@ -114,6 +118,13 @@ class _Writer:
             children = [self.image(child, element, name) for child in element.children]
             return Element(element.tag, element.attributes, element.file, element.line, children)
         return element
+
+    def carried(self, shape: d.Shape) -> Mapping[str, np.ndarray]:
+        """The attributes of a mesh; where none has changed, the very ones that were read."""
+        read = shape.geometry.attributes
+        new = {name: self.values.get(f"{shape.name}.{name}", values) for name, values in read.items()}
+        changed = any(not np.array_equal(values, read[name].astype(values.dtype)) for name, values in new.items())
+        return new if changed else read
 
     def different(self, made: Instance) -> list[str]:
         """Parameters whose values are not those that were read."""
@@ -213,8 +224,10 @@ def _changed_images(made: Iterable[object], values: Mapping[str, np.ndarray]) ->
     found = {}
     for image, name in images:
         if isinstance(image, Instance) and "texels" in image.values and name in values:
-            value = values[name]
-            if not np.array_equal(np.broadcast_to(image.values["texels"], value.shape).astype(value.dtype), value):
+            value, read = values[name], image.values["texels"].astype(values[name].dtype)
+            if value.ndim == 2:  # of numbers
+                value, read = np.stack([value] * 3, -1), np.stack([luminance(read)] * 3, -1)
+            if not np.array_equal(np.broadcast_to(read, value.shape), value):
                 found[image] = name, value
     return found
 
