@@ -43,6 +43,14 @@ def _work(program: ClosedJaxpr) -> int:
     return total
 
 
+def _read_by_any(branches) -> list[bool]:
+    """Of each operand."""
+    programs = [branch.jaxpr for branch in branches]
+    read = [variables_read_by(jaxpr.eqns) | variables(jaxpr.outvars) for jaxpr in programs]
+    by_branch = ([v in r for v in jaxpr.invars] for jaxpr, r in zip(programs, read, strict=True))
+    return list(map(any, zip(*by_branch, strict=True)))
+
+
 def in_runs(interpreter, which, branches: tuple[ClosedJaxpr, ...], operands: list) -> list:
     """Results of the branch that each lane takes; which: (W,) int32 its number."""
     width, size = interpreter.width, interpreter.width + WIDTH
@@ -59,24 +67,29 @@ def in_runs(interpreter, which, branches: tuple[ClosedJaxpr, ...], operands: lis
         ends.append(listed[0])
     _, order, place = listed
 
+    # What is read lies in that order, once for all branches: a run of lanes reads it from one place on.
+    def in_order(x, is_read):
+        if not differs(x) or not is_read:
+            return x
+        return as_components(x.shape, [gathered(item, order) if jnp.ndim(item) else item for item in x.flat])
+
+    operands = interpreter.materialize(list(map(in_order, operands, _read_by_any(branches))))
     outputs = branches[0].out_avals
     narrow = type(interpreter)(WIDTH, interpreter.never)
     results = [[jnp.zeros((size,), aval.dtype)] * math.prod(aval.shape) for aval in outputs]
     for branch, first, end in zip(branches, ends[:-1], ends[1:], strict=True):
-        read = variables_read_by(branch.jaxpr.eqns) | variables(branch.jaxpr.outvars)
 
-        def step(state, branch=branch, end=end, read=read):
+        def step(state, branch=branch, end=end):
             first, results = state
-            lanes = lax.dynamic_slice(order, (first,), (WIDTH,))
 
-            def mine(v, x):
-                if not differs(x) or v not in read:
+            def mine(x):
+                if not differs(x):
                     return x
-                return as_components(x.shape, [gathered(item, lanes) if jnp.ndim(item) else item for item in x.flat])
+                window = (lax.dynamic_slice(item, (first,), (WIDTH,)) if jnp.ndim(item) else item for item in x.flat)
+                return as_components(x.shape, window)
 
             narrow.active = jnp.arange(WIDTH) < end - first
-            inputs = narrow.materialize(list(map(mine, branch.jaxpr.invars, operands)))
-            found = narrow.pack(narrow.run(branch, inputs), [True] * len(outputs))
+            found = narrow.pack(narrow.run(branch, list(map(mine, operands))), [True] * len(outputs))
             # What is written beyond the run's end is written again by the next one.
             stored = [
                 [lax.dynamic_update_slice(whole, part, (first,)) for whole, part in zip(*columns, strict=True)]
