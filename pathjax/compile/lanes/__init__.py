@@ -11,7 +11,9 @@ README.md beside this file shows a function, its program and what lanes make of 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import contextlib
+import gc
+from collections.abc import Callable, Iterator
 
 import jax
 import jax.numpy as jnp
@@ -38,6 +40,7 @@ def lanes(f: Callable, width: int, memory=None) -> Callable:
     """
     memories = len(jax.tree.leaves(memory))
 
+    @_without_collections()
     def run(xs, *shared):
         shared = shared if memory is None else (*shared, memory)
         one = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), xs)
@@ -59,3 +62,15 @@ def lanes(f: Callable, width: int, memory=None) -> Callable:
         return jax.tree.unflatten(jax.tree.structure(out), outputs)
 
     return run
+
+
+@contextlib.contextmanager
+def _without_collections() -> Iterator[None]:
+    """Tracing makes many objects that stay, through all of which Python's collector would go time and again."""
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
