@@ -248,12 +248,14 @@ def sample(
     ref: Float[Array, "3"],
     u: Float[Array, "2"],
     u_part: Float[Array, ""],
+    backgrounds: bool = True,
 ) -> EmitterSample:
     """Choose a light and a direction towards it.
 
     Args:
         ref: the shaded point.
         u: uniform in [0, 1), whose first number also chooses the light; u_part: chooses within it.
+        backgrounds: else `with_background` is to say what comes from there.
     Returns:
         EmitterSample; pdf and Le are 0 where nothing arrives from there.
     """
@@ -276,7 +278,7 @@ def sample(
             elif not lights.kind.dirac:
                 d = lights.kind.sample(p, u, u_part)
                 distance, primitive = jnp.full_like(d[0], jnp.inf), jnp.int32(-1)
-                Le, pdf = background(emitters, chosen, d)
+                Le, pdf = background(emitters, chosen, d) if backgrounds else (jnp.zeros_like(d), jnp.zeros_like(d[0]))
             else:
                 d, distance, Le = lights.kind.sample(p, ref)
                 primitive, pdf = jnp.int32(-1), likely
@@ -286,6 +288,19 @@ def sample(
         return draw
 
     return geometry.switch_by_range(number, [first for _, first in sampled], [of(*each) for each in sampled])
+
+
+def samples_background(emitters: tuple[Lights, ...], chosen: Choice | None) -> bool:
+    """Whether `sample` draws directions of backgrounds."""
+    return chosen is not None and any(chosen.first[place] is not None for place in backgrounds(emitters))
+
+
+def with_background(drawn: EmitterSample, radiance: Float[Array, "3"], density: Float[Array, ""]) -> EmitterSample:
+    """What `sample` drew with `backgrounds=False`; radiance, density: of `background` in the direction drawn.d."""
+    from_there = jnp.isinf(drawn.distance)
+    if drawn.delta is not None:
+        from_there &= ~drawn.delta
+    return drawn._replace(Le=jnp.where(from_there, radiance, drawn.Le), pdf=jnp.where(from_there, density, drawn.pdf))
 
 
 def hit(

@@ -7,6 +7,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Real
 
 from pathjax import bsdfs, emitters, media
+from pathjax.compile import compute_once
 from pathjax.core.math import spawn_ray
 from pathjax.core.types import EmitterSample
 from pathjax.emitters import Choice
@@ -23,6 +24,23 @@ def occurs(scene: Scene, choice: Choice | None, options: Options) -> bool:
     return options.strategy != "bsdf" and choice is not None and scene.samples_lights
 
 
+def draws_background(scene: Scene, choice: Choice | None, options: Options) -> bool:
+    """Whether some of the light samples are of a background."""
+    return occurs(scene, choice, options) and emitters.samples_background(scene.emitters, choice)
+
+
+def draw_or_meet(
+    scene: Scene, choice: Choice, vertex: Vertex, met: Bool[Array, ""], u: Bounce, d: Float[Array, "3"]
+) -> tuple[EmitterSample, tuple[Float[Array, "3"], Float[Array, ""]]]:
+    """A light that is drawn if the path has met a vertex, and what comes from the direction d if it has not.
+
+    One look-up of the background does for both: lanes would make two at each vertex, of which one is of use.
+    """
+    drawn = emitters.sample(scene.emitters, scene.geometry, choice, vertex.surface.p, u.light, u.triangle, False)
+    sky = compute_once(emitters.background(scene.emitters, choice, jnp.where(met, drawn.d, d)))
+    return emitters.with_background(drawn, *sky), sky
+
+
 def light_sample(
     scene: Scene,
     choice: Choice,
@@ -32,6 +50,7 @@ def light_sample(
     depth: Int[Array, ""],
     options: Options,
     medium: Int[Array, ""] | None = None,
+    drawn: EmitterSample | None = None,
 ) -> tuple[Float[Array, "3"], Int[Array, ""] | None, Passed | None]:
     """One sample of what a vertex reflects of direct light: the integral over all lights of f Le |cos theta| V.
 
@@ -40,6 +59,7 @@ def light_sample(
         goes_on: else the sample is of no use, and its shadow ray not traced.
         depth: vertices so far.
         medium: in which the path came; None in scenes without media.
+        drawn: of `draw_or_meet`, where that is known.
     Returns:
         The sample, how many vertices its light passed straight, None where there are no such, and one of these.
     """
@@ -47,8 +67,9 @@ def light_sample(
     smooth = is_smooth(scene, vertex)
     passes = bsdfs.occurs(materials, "passes")
 
-    def sample():
-        drawn = emitters.sample(scene.emitters, scene.geometry, choice, vertex.surface.p, u.light, u.triangle)
+    def sample(drawn=drawn):
+        if drawn is None:
+            drawn = emitters.sample(scene.emitters, scene.geometry, choice, vertex.surface.p, u.light, u.triangle)
         f, pdf_bsdf = evaluate(scene, vertex, drawn.d)
         possible = (drawn.pdf > 0) & (pdf_bsdf > 0)
         scale = _weight(drawn, pdf_bsdf, options) / jnp.where(possible, drawn.pdf, 1)

@@ -24,7 +24,7 @@ from jaxtyping import Array, Bool, Float, Int
 from pathjax import bsdfs, emitters, media
 from pathjax.compile import compute_once
 from pathjax.core.math import dot, smaller, spawn_ray
-from pathjax.core.types import Hit, Ray
+from pathjax.core.types import EmitterSample, Hit, Ray
 from pathjax.emitters import Choice
 from pathjax.integrators import next_event, roulette, splitting
 from pathjax.integrators.options import Options
@@ -141,7 +141,10 @@ def onward(
         flown, scattered = smaller(hit.t, ray.t_max), here.scattered if scene.scatters else None
         weight = media.flight_weight(scene.media, path.medium, path.throughput, flown, scattered)
         path = path._replace(throughput=path.throughput * weight)
-    path = path._replace(L=_with_emission(path.L, emission(scene, choice, path, hit, here, options)))
+    light = sky = None
+    if here is not None and next_event.draws_background(scene, choice, options):
+        light, sky = next_event.draw_or_meet(scene, choice, here, _met(scene, hit, here), u, ray.d)
+    path = path._replace(L=_with_emission(path.L, emission(scene, choice, path, hit, here, options, sky)))
     if scene.free_passes:
         free = bsdfs.has(scene.materials, here.kind, "passes")
         path = path._replace(depth=path.depth + jnp.where(free, 0, 1), passed=path.passed + jnp.where(free, 1, 0))
@@ -158,7 +161,7 @@ def onward(
             lambda path: (path, goes_on),
             path,
         )
-    go_on = partial(scatter, scene, choice, here, u, goes_on, options)
+    go_on = partial(scatter, scene, choice, here, u, goes_on, options, light)
     if scene.hide_emitters:
         # What emits lets camera rays through, as in Mitsuba.
         beyond = spawn_ray(here.surface, ray.d, hit.primitive)._replace(t_max=ray.t_max - hit.t)
@@ -171,11 +174,11 @@ def onward(
 
 
 def emission(
-    scene: Scene, choice: Choice | None, path: Path, hit: Hit, here: Vertex | None, options: Options
+    scene: Scene, choice: Choice | None, path: Path, hit: Hit, here: Vertex | None, options: Options, sky=None
 ) -> Float[Array, "3"]:
     """Le of what a path ends on, times its throughput and the share of bsdf sampling in finding that light.
 
-    path: before the vertex `here`, which its ray meets at `hit`.
+    path: before the vertex `here`, which its ray meets at `hit`; sky: of `next_event.draw_or_meet`, if known.
     """
     shapes, found = scene.geometry, hit.primitive >= 0
 
@@ -187,7 +190,7 @@ def emission(
             return emitters.hit(scene.emitters, shapes, choice, ray, arrival, surface)
 
         def at_infinity():
-            return emitters.background(scene.emitters, choice, path.ray.d)
+            return emitters.background(scene.emitters, choice, path.ray.d) if sky is None else sky
 
         Le, pdf_light = at_infinity() if here is None else lax.cond(found, at_surface, at_infinity)
         share = next_event.share_of_bsdf_sampling(scene, choice, path.pdf, pdf_light, options)
@@ -204,15 +207,26 @@ def emission(
 
 
 def scatter(
-    scene: Scene, choice: Choice | None, here: Vertex, u: Bounce, goes_on: Bool[Array, ""], options: Options, path: Path
+    scene: Scene,
+    choice: Choice | None,
+    here: Vertex,
+    u: Bounce,
+    goes_on: Bool[Array, ""],
+    options: Options,
+    light: EmitterSample | None,
+    path: Path,
 ) -> Path:
-    """T L at a vertex: a light sample, and a direction in which the path goes on if roulette lets it."""
+    """T L at a vertex: a light sample, and a direction in which the path goes on if roulette lets it.
+
+    light: of `next_event.draw_or_meet`, where that is known.
+    """
     if here.weight is not None:
         path = path._replace(throughput=path.throughput * here.weight)
     L = path.L
     if next_event.occurs(scene, choice, options):
-        light, *passed = next_event.light_sample(scene, choice, here, u, goes_on, path.depth, options, path.medium)
-        L = _with_light(L, path.throughput * light, *passed)
+        medium, depth = path.medium, path.depth
+        direct, *passed = next_event.light_sample(scene, choice, here, u, goes_on, depth, options, medium, light)
+        L = _with_light(L, path.throughput * direct, *passed)
     drawn, d = compute_once(sample(scene, here, u.bsdf))
     if path.pending is not None:
         splits = splitting.takes_place(scene, here, path)
