@@ -91,7 +91,7 @@ class Principled(BSDF):
 class ClearPrincipled(Principled):
     """A principled bsdf of which `spec_trans` of what is no metal is glass: an interface, `eta` its IOR inside.
 
-    Inside there is the glass alone.
+    Inside there is the glass alone. From the derivative in `eta` an edge is missing, as of `RoughDielectric` with GGX.
     """
 
     transmissive = sided = lobes = True

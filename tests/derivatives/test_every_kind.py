@@ -99,7 +99,10 @@ CASES = {
         "principled",
         rgb("base_color"),
         numbers(roughness=0.4, anisotropic=0.5, metallic=0.4, specular=0.6, spec_tint=0.3, flatness=0.4),
-        SHEEN + numbers(clearcoat=0.8, clearcoat_gloss=0.3),
+        SHEEN,
+    ),
+    "principled, coated": on_ball(
+        "principled", rgb("base_color", "0.05"), numbers(roughness=0.9, specular=0.1, clearcoat=1, clearcoat_gloss=0.2)
     ),
     "principled, clear": on_ball(
         "principled", rgb("base_color"), numbers(roughness=0.5, spec_trans=0.7, eta=1.4, metallic=0.2), SHEEN
