@@ -248,13 +248,14 @@ class Mesh(Shape):
 
     @classmethod
     def read(cls, loader, fields: Fields):
-        return loader.read_mesh(
-            loader.find(fields, "filename"),
-            fields.type,
-            fields.transform("to_world"),
-            face_normals=fields.boolean("face_normals", False),
-            flip_tex_coords=fields.boolean("flip_tex_coords", None),
-        )
+        file, to_world = loader.find(fields, "filename"), fields.transform("to_world")
+        face_normals = fields.boolean("face_normals", False)
+        return loader.read_mesh(file, fields.type, to_world, face_normals=face_normals, **cls.choices(fields))
+
+    @staticmethod
+    def choices(fields: Fields) -> dict[str, object]:
+        """What files of this kind leave open, as `io.mesh.load` takes it."""
+        return {"flip_tex_coords": fields.boolean("flip_tex_coords", None)}
 
     @property
     def smooth(self):
@@ -298,15 +299,9 @@ class Mesh(Shape):
 class SerializedMesh(Mesh):
     """One mesh of a file that holds several."""
 
-    @classmethod
-    def read(cls, loader, fields: Fields):
-        return loader.read_mesh(
-            loader.find(fields, "filename"),
-            fields.type,
-            fields.transform("to_world"),
-            face_normals=fields.boolean("face_normals", False),
-            part=fields.integer("shape_index", 0, at_least=0),
-        )
+    @staticmethod
+    def choices(fields: Fields) -> dict[str, object]:
+        return {"part": fields.integer("shape_index", 0, at_least=0)}
 
 
 class ArrayMesh(Mesh):
