@@ -162,10 +162,18 @@ SPOT = spot(0, cone(30))
 SUN = emitter("directional", color("irradiance", *INTENSITY) + vector("direction", (0, -1, 0)))
 
 
-@pytest.mark.parametrize("light", [BULB, SPOT, SUN], ids=["point", "spot", "directional"])
-@pytest.mark.parametrize("kind", ["diffuse", "dielectric", "conductor"])
-def test_what_stands_in_the_way_casts_a_shadow(make_scene, light, kind):
+LAMPS, SMOOTH = {"point": BULB, "spot": SPOT, "directional": SUN}, ("dielectric", "conductor")
+SHADOWS = [
+    *((name, "diffuse") for name in LAMPS),
+    *(("point", kind) for kind in SMOOTH),
+    *(pytest.param(name, kind, marks=pytest.mark.slow) for name in ("spot", "directional") for kind in SMOOTH),
+]
+
+
+@pytest.mark.parametrize("name, kind", SHADOWS)
+def test_what_stands_in_the_way_casts_a_shadow(make_scene, name, kind):
     """Glass too: a light without size is seen through it from no direction that a bsdf draws, in Mitsuba as here."""
+    light = LAMPS[name]
     sheet = plate('<scale value="0.1"/>', '<translate y="0.5"/>', inside=f'<bsdf type="{kind}"/>')
     beside = sheet.replace('y="0.5"', 'x="0.3" y="0.5"')
     above = sheet.replace('y="0.5"', 'y="3"')

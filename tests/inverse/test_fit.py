@@ -193,7 +193,10 @@ def test_views_share_parameters_and_know_more_together(write_scene, room, target
 
 @pytest.mark.parametrize(
     "solver",
-    [optx.BFGS(rtol=1e-4, atol=1e-4), optx.Dogleg(rtol=1e-4, atol=1e-4), optx.GaussNewton(rtol=1e-4, atol=1e-4)],
+    [
+        optx.BFGS(rtol=1e-4, atol=1e-4),
+        *(pytest.param(each(rtol=1e-4, atol=1e-4), marks=pytest.mark.slow) for each in (optx.Dogleg, optx.GaussNewton)),
+    ],
     ids=lambda solver: type(solver).__name__,
 )
 def test_other_solvers_approach_the_same_answer(room, target, solver):
