@@ -60,12 +60,14 @@ def in_runs(interpreter, which, branches: tuple[ClosedJaxpr, ...], operands: lis
         listed, order, place = state
         return listed + 1, with_entry(order, lane, listed), with_entry(place, listed, lane)
 
-    listed = jnp.int32(0), jnp.zeros((size,), jnp.int32), jnp.zeros((width,), jnp.int32)
-    ends = [listed[0]]
-    for k in range(len(branches)):
+    def enlist_all(k, state):
+        listed, ends = state
         listed = flags.for_each_lane(flags.packed(active & (which == k)), enlist, listed)
-        ends.append(listed[0])
-    _, order, place = listed
+        return listed, with_entry(ends, listed[0], k + 1)
+
+    listed = jnp.int32(0), jnp.zeros((size,), jnp.int32), jnp.zeros((width,), jnp.int32)
+    ends = jnp.zeros((len(branches) + 1,), jnp.int32)
+    (_, order, place), ends = lax.fori_loop(0, len(branches), enlist_all, (listed, ends))
 
     # What is read lies in that order, once for all branches: a run of lanes reads it from one place on.
     def in_order(x, is_read):
@@ -77,7 +79,8 @@ def in_runs(interpreter, which, branches: tuple[ClosedJaxpr, ...], operands: lis
     outputs = branches[0].out_avals
     narrow = type(interpreter)(WIDTH, interpreter.never)
     results = [[jnp.zeros((size,), aval.dtype)] * math.prod(aval.shape) for aval in outputs]
-    for branch, first, end in zip(branches, ends[:-1], ends[1:], strict=True):
+    for k, branch in enumerate(branches):
+        first, end = ends[k], ends[k + 1]
 
         def step(state, branch=branch, end=end):
             first, results = state
