@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pathjax import bsdfs, emitters
+from pathjax import bsdfs, emitters, media
 from pathjax.cli import DONE
 from pathjax.cli.inputs import load
 from pathjax.kinds.parameter import Parameter
@@ -53,6 +53,7 @@ def scene_facts(scene: Scene) -> dict:
             "bsdfs": [bsdfs.name(scene.materials, kind) for kind in range(len(scene.materials.tables))],
             "light sampling": scene.samples_lights and emitters.sampled(scene.emitters),
             "emitters": [emitters.name(lights) for lights in scene.emitters],
+            "media": [] if scene.media is None else media.names(scene.media),
             "dtype": str(scene.camera.origin.dtype),
         },
         "trees": {
@@ -134,6 +135,7 @@ def text(facts: dict) -> str:
         f"sampler     {facts['sampler']['used']} (the file asks for {facts['sampler']['file']})",
         f"shapes      {facts['shapes']}: {_listed(f'{n} {kind}' for kind, n in facts['primitives'].items())}",
         f"compiled    {_listed([*compiled['shapes'], *compiled['bsdfs']])}; {compiled['dtype']}",
+        *([f"media       {_listed(compiled['media'])}"] if compiled["media"] else []),
         "lights      " + _listed(compiled["emitters"]) + ("" if compiled["light sampling"] else ", not sampled"),
     ]
     for kind, tree in facts["trees"].items():

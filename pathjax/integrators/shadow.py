@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from pathjax import bsdfs, media
 from pathjax.bsdfs import tree
-from pathjax.core.math import dot, shading_frame, smaller, spawn_ray
+from pathjax.core.math import dot, larger, shading_frame, smaller, spawn_ray
 from pathjax.core.types import Hit, Ray, Surface
 from pathjax.scene.scene import Scene
 from pathjax.shapes import geometry
@@ -60,7 +60,7 @@ def transmitted(
 
     if not bsdfs.occurs(scene.materials, "passes"):
         visible = (ray.t_max >= 0) & ~geometry.occluded(scene.geometry, ray, target)
-        return dimmed(medium, visible.astype(ray.t_max.dtype), ray.t_max), jnp.int32(0), None
+        return dimmed(medium, visible.astype(ray.t_max.dtype), larger(ray.t_max, 0)), jnp.int32(0), None
     # A line meets no primitive more than twice: rounding that found one again and again comes to an end.
     ever = jnp.int32(2 * scene.geometry.shape.shape[0])
     most = ever if scene.free_passes else jnp.minimum(most, ever)

@@ -98,6 +98,13 @@ def _absorbing(medium: Instance, parameters: Parameters) -> Instance:
     return Instance(medium.kind, medium.name, {**medium.values, "albedo": None})
 
 
+def names(media: Media) -> list[str]:
+    """What scene files call the kinds that are present, as `info` tells them."""
+    known = {kind: name for name, kind in (KINDS | PHASES).items()}
+    present = [media.table.kind, *(table.kind for table in media.phases)]
+    return [known[kind] for kind in present] + ([] if media.scatters else ["absorption alone"])
+
+
 # ---- at a vertex ----------------------------------------------------------------------------------------------------
 
 

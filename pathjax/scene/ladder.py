@@ -43,7 +43,12 @@ def padded(scene: Scene) -> Scene:
         sides=_rows(materials.sides, _few(len(materials.sides))),
         textures=textures,
     )
-    scene = replace(scene, geometry=_geometry(scene.geometry), materials=materials)
+    media = scene.media
+    if media is not None:
+        phases = tuple(map(_kind, media.phases))
+        phase, sides = (_rows(values, _few(len(values))) for values in (media.phase, media.sides))
+        media = replace(media, table=_kind(media.table), phases=phases, phase=phase, sides=sides)
+    scene = replace(scene, geometry=_geometry(scene.geometry), materials=materials, media=media)
     return jax.tree.map(jnp.asarray, scene)  # which each call of a kernel would do again
 
 

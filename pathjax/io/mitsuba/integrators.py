@@ -47,11 +47,18 @@ class PRB(Path):
     """Mitsuba's differentiable path tracer; its default is another depth."""
 
     default_depth = 6
+    same = "path"
 
     @classmethod
     def read(cls, loader, fields):
-        loader.note(fields.element, "is for derivatives; its image is that of path, which is used")
+        loader.note(fields.element, f"is for derivatives; its image is that of {cls.same}, which is used")
         return super().read(loader, fields)
+
+
+class PRBVolPath(PRB, VolPath):
+    """The same with participating media."""
+
+    same = "volpath"
 
 
 class Direct:
@@ -100,6 +107,7 @@ KINDS = {
     "volpath": VolPath,
     "volpathmis": VolPathMIS,
     "prb": PRB,
+    "prbvolpath": PRBVolPath,
     "aov": AOV,
     "moment": Moment,
     "stokes": Stokes,
