@@ -89,10 +89,11 @@ def scene_text(
     far=1e4,
     hide="false",
     film='<rfilter type="box"/>',
+    integrator="path",
 ):
     """A scene file: pinhole camera, square image, and the given shapes and emitters."""
     return f"""<scene version="3.0.0">
-<integrator type="path"><integer name="max_depth" value="{depth}"/><integer name="rr_depth" value="{rr_depth}"/>
+<integrator type="{integrator}"><integer name="max_depth" value="{depth}"/><integer name="rr_depth" value="{rr_depth}"/>
   <boolean name="hide_emitters" value="{hide}"/></integrator>
 <sensor type="perspective"><float name="fov" value="{fov}"/><float name="near_clip" value="{near}"/>
   <float name="far_clip" value="{far}"/>

