@@ -36,6 +36,8 @@ from pathjax.system import memory
 
 # The matrix is summed up in so many groups of pixels, whose differences tell its noise to 13 %.
 GROUPS = 32
+# Blocks whose sums are taken for independent. Of more, some far apart are one: the scatter is known to 2 % then.
+MOST_BLOCKS = 4096
 # Of the rows of J of one chunk.
 CHUNK_BYTES = 1 << 25
 
@@ -251,15 +253,16 @@ def _chunks(height: int, width: int, side: int, bytes_of_pixel: int) -> tuple[In
     pixels = np.full((down * side, right * side), -1, np.int32)
     pixels[:height, :width] = np.arange(height * width).reshape(height, width)
     blocks = pixels.reshape(down, side, right, side).swapaxes(1, 2).reshape(-1, side * side)
-    count = len(blocks)
     # By chance, so that groups differ as pixels do, and chunks cost the same.
-    blocks = blocks[np.random.default_rng(0).permutation(count)]
+    blocks = blocks[np.random.default_rng(0).permutation(len(blocks))]
+    together = -(-len(blocks) // MOST_BLOCKS)
+    count = -(-len(blocks) // together)
+    blocks = np.pad(blocks, [(0, count * together - len(blocks)), (0, 0)], constant_values=-1).reshape(count, -1)
     groups = min(GROUPS, count)
-    chunks = -(-count * side**2 * bytes_of_pixel // CHUNK_BYTES)
+    chunks = -(-blocks.size * bytes_of_pixel // CHUNK_BYTES)
     each = -(-count // (chunks * groups))
-    spare = chunks * each * groups - count
-    blocks = np.concatenate([blocks, np.full((spare, side * side), -1, np.int32)])
-    return blocks.reshape(chunks, each, groups, side * side), count
+    blocks = np.pad(blocks, [(0, chunks * each * groups - count), (0, 0)], constant_values=-1)
+    return blocks.reshape(chunks, each, groups, -1), count
 
 
 _compiled = jax.jit(sums, static_argnames=("vector", "side", "halves", "devices"))

@@ -153,6 +153,15 @@ def test_blocks_and_chunks_are_summed_up_alike_on_any_number_of_devices(
     agree(found.pulled, np.einsum("pci,pck->cik", dense[1].mean(0), EXTRA) * views.exposure)
 
 
+@pytest.mark.parametrize("height, width, side", [(1, 1, 1), (5, 3, 1), (7, 5, 3), (150, 90, 1), (150, 90, 5)])
+def test_every_pixel_is_in_one_block(height, width, side):
+    chunks, count = normal._chunks(height, width, side, normal.CHUNK_BYTES // 3000)
+    np.testing.assert_array_equal(np.sort(chunks[chunks >= 0]), np.arange(height * width))
+    blocks = chunks.reshape(-1, chunks.shape[-1])
+    assert (blocks >= 0).any(1).sum() == count <= normal.MOST_BLOCKS
+    assert len(chunks) == -(-count * blocks.shape[-1] // 3000) and chunks.shape[2] == min(normal.GROUPS, count)
+
+
 @pytest.mark.slow
 def test_views_add_up(scene, target, write_scene, without_kernel):
     """The first view twice, and another of another size."""
