@@ -7,6 +7,7 @@ takes differences (`ior_difference`). No general derivative exists here for movi
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -29,6 +30,7 @@ from pathjax.kinds.parameter import Parameter
 from pathjax.scene import parameters as named
 from pathjax.scene.scene import Scene
 from pathjax.sensors import film
+from pathjax.system import memory
 
 Slopes = dict[str, Float[Array, "..."]]
 METHODS = ("difference", "attached")
@@ -92,7 +94,7 @@ def jacobian(
         image and Jacobian.
     Raises:
         InputError: unknown name, method or strategy; spp, seed or step out of range; a name of a texture; a value that
-            counts as a larger one, as a roughness of 0 does.
+            counts as a larger one, as a roughness of 0 does; more derivatives than fit into memory.
     """
     if isinstance(names, str):
         raise InputError(f"names is a list of names; write [{names!r}]")
@@ -105,6 +107,9 @@ def jacobian(
     options.check_strategy(scene)
     wanted = {name: named.find(scene, name) for name in names}
     named.refuse_constant(scene, wanted)
+    count = sum(math.prod(parameter.shape) for parameter in wanted.values())
+    needed = 3 * count * math.prod(film.image_shape(scene.film)) * scene.camera.origin.dtype.itemsize
+    memory.check(needed, f"the derivatives of all pixels in {count} numbers", "normal_equations keeps none of them")
     pixels, scene = film.pixels(scene.film), named.nameless(named.attached(scene))
     image, derivatives, bias, used = pixel_jacobians(
         scene, wanted, pixels, 0, spp, seed, options, method=method, step=step

@@ -199,6 +199,9 @@ def test_more_than_fits_into_memory_is_refused_before_it_is_begun(scene, target,
     for call in (pj.normal_equations, lambda *args: pj.fit(args[0], args[2], args[1])):
         with pytest.raises(pj.InputError, match=r"8 numbers take .* GiB of memory.*fewer"):
             call(scene, NAMES, target)
+    monkeypatch.setattr(memory, "limit", lambda: 8 * 3 * 4 * RES * RES - 1)
+    with pytest.raises(pj.InputError, match="8 numbers take .*normal_equations keeps none"):
+        pj.jacobian(scene, NAMES)
 
 
 def test_what_no_image_changes_with_is_named(scene, target, no_kernel):
