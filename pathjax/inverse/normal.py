@@ -157,6 +157,7 @@ def sums(
         devices: of `native_map`; sums are bitwise the same for every number of them.
     """
     by_name, by_column = vector.unpack(values), vector.by_column(scale)
+    count = min(GROUPS, *(len(_blocks(*views.targets.shape[1:3], side)) for views in groups))
     parts, first = [], 0
     for views in groups:
         here = slice(first, first + views.targets.size // 3)
@@ -166,7 +167,7 @@ def sums(
         given += [] if images is None else [images[here].reshape(*shape, -1)]
         seeds = jnp.stack([views.seeds(seed, draw, half) for half in range(halves)])
         rows = partial(_rows, views, by_name, vector, by_column, spp, seeds, devices)
-        parts.append(_of_views(rows, given, vector, side, halves))
+        parts.append(_of_views(rows, given, vector, side, count, halves))
     residuals, totals = zip(*parts, strict=True)
     total = jax.tree.map(lambda *x: sum(x[1:], x[0]), *totals)
     column, seen = vector.entries
@@ -195,18 +196,23 @@ def _rows(views: Views, by_name, vector, scale, spp, seeds, devices, pixels, the
 
 
 def _of_views(
-    rows: Callable, given: list[Float[Array, "V H W ..."]], vector: ParameterVector, side: int, halves: int
+    rows: Callable,
+    given: list[Float[Array, "V H W ..."]],
+    vector: ParameterVector,
+    side: int,
+    groups: int,
+    halves: int,
 ) -> tuple[Float[Array, "R N 3"], dict]:
     """Residuals of the N pixels of views of one size, and sums over them.
 
     rows: (pixels (n,), bool (n,), False where the row does not matter) -> images and rows of J.
-    given: target, weights, and images if any, of each view.
+    given: target, weights, and images if any, of each view. groups: of `_chunks`.
     """
     views, height, width, *_ = given[0].shape
     given = [x.reshape(views, height * width, *x.shape[3:]) for x in given]
     dtype, (column, _) = given[0].dtype, vector.entries
     columns, components = int(column[-1]) + 1, len(column)
-    chunks, blocks = _chunks(height, width, side, 3 * columns * dtype.itemsize * halves * views)
+    chunks = _chunks(_blocks(height, width, side), groups, 3 * columns * dtype.itemsize * halves * views)
     product = partial(jnp.einsum, precision=lax.Precision.HIGHEST)
 
     def add(total, pixels):
@@ -221,15 +227,15 @@ def _of_views(
         scores = (Ja * (w * rb)[..., None, :] + Jb * (w * ra)[..., None, :]) / 2
         scores = vector.by_component(scores).reshape(-1, pixels.shape[-1], components).sum(1)
         a, b = (x.reshape(views, *pixels.shape, *x.shape[2:]) for x in (Ja, w[..., None, :] * Jb))
-        sums = {
+        new = {
             "matrices": product("vbgsqc,vbgsrc->gcqr", a, b),
             "gradient": scores.sum(0),
             "squares": product("bi,bj->ij", scores, scores),
             "loss": (w * ra * rb).sum() / 2,
         }
         if images:
-            sums["pulled"] = product("vnqc,vnck->cqk", (Ja + Jb) / 2 * w[..., None, :], images[0])
-        return jax.tree.map(jnp.add, total, sums), r
+            new["pulled"] = product("vnqc,vnck->cqk", (Ja + Jb) / 2 * w[..., None, :], images[0])
+        return jax.tree.map(jnp.add, total, new), r
 
     shapes = {
         "matrices": (chunks.shape[2], 3, columns, columns),
@@ -244,11 +250,11 @@ def _of_views(
     # (chunks, R, V, n, 3), to the order of pixels.
     place = np.argsort(np.where(chunks < 0, chunks.size, chunks).ravel())[: height * width]
     residuals = jnp.moveaxis(residuals, 0, 2).reshape(*residuals.shape[1:3], -1, 3)[:, :, place]
-    return residuals.reshape(residuals.shape[0], -1, 3), {**total, "blocks": views * blocks}
+    return residuals.reshape(residuals.shape[0], -1, 3), {**total, "blocks": views * len(_blocks(height, width, side))}
 
 
-def _chunks(height: int, width: int, side: int, bytes_of_pixel: int) -> tuple[Int[np.ndarray, "C B G S"], int]:
-    """Pixels of chunks, -1 beyond the image, and the number of blocks: B blocks of S pixels of each of G groups."""
+def _blocks(height: int, width: int, side: int) -> Int[np.ndarray, "B S"]:
+    """Pixels of blocks that are independent of each other, -1 beyond the image."""
     down, right = -(-height // side), -(-width // side)
     pixels = np.full((down * side, right * side), -1, np.int32)
     pixels[:height, :width] = np.arange(height * width).reshape(height, width)
@@ -257,12 +263,18 @@ def _chunks(height: int, width: int, side: int, bytes_of_pixel: int) -> tuple[In
     blocks = blocks[np.random.default_rng(0).permutation(len(blocks))]
     together = -(-len(blocks) // MOST_BLOCKS)
     count = -(-len(blocks) // together)
-    blocks = np.pad(blocks, [(0, count * together - len(blocks)), (0, 0)], constant_values=-1).reshape(count, -1)
-    groups = min(GROUPS, count)
+    return _padded(blocks, count * together).reshape(count, -1)
+
+
+def _chunks(blocks: Int[np.ndarray, "B S"], groups: int, bytes_of_pixel: int) -> Int[np.ndarray, "C each G S"]:
+    """The blocks of each group in each chunk."""
     chunks = -(-blocks.size * bytes_of_pixel // CHUNK_BYTES)
-    each = -(-count // (chunks * groups))
-    blocks = np.pad(blocks, [(0, chunks * each * groups - count), (0, 0)], constant_values=-1)
-    return blocks.reshape(chunks, each, groups, -1), count
+    each = -(-len(blocks) // (chunks * groups))
+    return _padded(blocks, chunks * each * groups).reshape(chunks, each, groups, -1)
+
+
+def _padded(blocks: Int[np.ndarray, "B S"], count: int) -> Int[np.ndarray, "count S"]:
+    return np.pad(blocks, [(0, count - len(blocks)), (0, 0)], constant_values=-1)
 
 
 _compiled = jax.jit(sums, static_argnames=("vector", "side", "halves", "devices"))

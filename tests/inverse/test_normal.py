@@ -137,7 +137,7 @@ def test_blocks_and_chunks_are_summed_up_alike_on_any_number_of_devices(
     """Blocks of 2 x 2 pixels, some of them beyond the image, in two chunks."""
     views = problem.build(scene, target, NAMES, {})
     monkeypatch.setattr(normal, "CHUNK_BYTES", 2 * 4 * 3 * 4 * 50)
-    assert normal._chunks(RES, RES, 2, 2 * 4 * 3 * 4)[0].shape == (2, 1, 25, 4)
+    assert normal._chunks(normal._blocks(RES, RES, 2), 25, 2 * 4 * 3 * 4).shape == (2, 1, 25, 4)
     found, on_one = (
         normal._compiled(*arguments(views, EXTRA), vector=views.vector, side=2, devices=n) for n in (None, 1)
     )
@@ -155,23 +155,24 @@ def test_blocks_and_chunks_are_summed_up_alike_on_any_number_of_devices(
 
 @pytest.mark.parametrize("height, width, side", [(1, 1, 1), (5, 3, 1), (7, 5, 3), (150, 90, 1), (150, 90, 5)])
 def test_every_pixel_is_in_one_block(height, width, side):
-    chunks, count = normal._chunks(height, width, side, normal.CHUNK_BYTES // 3000)
+    blocks = normal._blocks(height, width, side)
+    assert len(blocks) <= normal.MOST_BLOCKS and (blocks >= 0).any(1).all()
+    chunks = normal._chunks(blocks, min(len(blocks), 32), normal.CHUNK_BYTES // 3000)
     np.testing.assert_array_equal(np.sort(chunks[chunks >= 0]), np.arange(height * width))
-    blocks = chunks.reshape(-1, chunks.shape[-1])
-    assert (blocks >= 0).any(1).sum() == count <= normal.MOST_BLOCKS
-    assert len(chunks) == -(-count * blocks.shape[-1] // 3000) and chunks.shape[2] == min(normal.GROUPS, count)
+    found = chunks.reshape(-1, chunks.shape[-1])
+    assert (found >= 0).any(1).sum() == len(blocks) and len(chunks) == -(-blocks.size // 3000)
 
 
 @pytest.mark.slow
 def test_views_add_up(scene, target, write_scene, without_kernel):
     """The first view twice, and another of another size."""
-    other = pj.load_scene(write_scene(BODY, res=6, depth=3))
+    other = pj.load_scene(write_scene(BODY, res=4, depth=3))
     names = NAMES[1:]
     seen = pj.normal_equations([scene, scene], names, [target] * 2, [WEIGHTS, 0 * WEIGHTS], SPP)
-    alone = pj.normal_equations([scene, other], names, [target, np.ones((6, 6, 3))], [WEIGHTS, np.zeros(3)], SPP)
+    alone = pj.normal_equations([scene, other], names, [target, np.ones((4, 4, 3))], [WEIGHTS, np.zeros(3)], SPP)
     agree(seen.gradient, alone.gradient)
     agree(seen.matrix, alone.matrix)
-    assert seen.residuals.shape == (2, 2 * RES * RES, 3) and alone.residuals.shape == (2, RES * RES + 36, 3)
+    assert seen.residuals.shape == (2, 2 * RES * RES, 3) and alone.residuals.shape == (2, RES * RES + 16, 3)
 
 
 @pytest.mark.parametrize(
