@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float, Int, Real
+from jaxtyping import Array, Float, Int
 
 from pathjax.compile import usual_promotion
 from pathjax.derivatives.jacobian import pixel_jacobians
@@ -72,8 +72,8 @@ class NormalEquations:
 def normal_equations(
     scene: Scene | Sequence[Scene],
     names: Sequence[str],
-    target: Target | Real[ArrayLike, "H W 3"] | Sequence,
-    weights: Real[ArrayLike, "#H #W #3"] | Sequence | None = None,
+    target: Target | ArrayLike | Sequence[Target | ArrayLike],
+    weights: ArrayLike | Sequence[ArrayLike] | None = None,
     spp: int = 64,
     seed: int = 0,
 ) -> NormalEquations:
@@ -89,8 +89,7 @@ def normal_equations(
         weights: of the values of the target, 1/variance; or a list of them; None: 1. Values that are clipped or not
             measured weigh nothing.
         spp: samples per pixel of each of the two renders.
-        seed: other seeds give independent numbers; the same seed gives the same, bit for bit, on any number of CPU
-            devices.
+        seed: other seeds give independent numbers. Sums have a fixed order, whatever the number of devices.
     Raises:
         InputError: as for `fit`; weights that are negative, not finite or nothing but 0; more numbers than fit into
             memory.
@@ -154,7 +153,7 @@ def sums(
         spp: of each render. seed, draw: of `Views.seeds`.
         side: of squares of pixels beyond which the noise of a target is independent.
         halves: 2, or 1: a single render, whose noise is in all that is quadratic.
-        devices: of `native_map`; sums are bitwise the same for every number of them.
+        devices: of `native_map`; of the same rows, sums are bitwise the same for every number of them.
     """
     by_name, by_column = vector.unpack(values), vector.by_column(scale)
     count = min(GROUPS, *(len(_blocks(*views.targets.shape[1:3], side)) for views in groups))
