@@ -152,6 +152,10 @@ CASES = {
     + '<shape type="sphere"><point name="center" value="1, 1, 1"/><float name="radius" value="0.5"/>'
     f'<bsdf type="diffuse" id="around-lamp"/><emitter type="area" id="it">{rgb("radiance", "4, 3, 2")}</emitter>'
     "</shape>",
+    "area, with a picture": BALL.format(GREY)
+    + PANE.format(
+        f'<bsdf type="diffuse" id="around-lamp"/><emitter type="area" id="it">{PICTURE.format("radiance")}</emitter>'
+    ),
     "constant": BALL.format(GREY) + f'<emitter type="constant" id="it">{rgb("radiance")}</emitter>',
     "envmap": BALL.format(GREY) + '<emitter type="envmap" id="it"><string name="filename" value="textures/marks.png"/>'
     '<float name="scale" value="0.7"/></emitter>',
@@ -161,6 +165,9 @@ CASES = {
     "spot": lit(f'<emitter type="spot" id="it">{rgb("intensity", "9, 8, 7")}{AIMED}</emitter>'),
     "spot, covered": lit(
         f'<emitter type="spot" id="it">{rgb("intensity", "9, 8, 7")}{AIMED}{rgb("texture", "0.3, 0.6, 0.9")}</emitter>'
+    ),
+    "spot, with a picture": lit(
+        f'<emitter type="spot" id="it">{rgb("intensity", "9, 8, 7")}{AIMED}{PICTURE.format("texture")}</emitter>'
     ),
     "directional": lit(f'<emitter type="directional" id="it">{rgb("irradiance")}{AIMED}</emitter>'),
     "projector": lit(
