@@ -16,6 +16,7 @@ SMALL = {
     "three_views": ["--res", "24", "--target-spp", "128", "--spp", "16"],
     "identifiability": ["--res", "16", "--target-spp", "256", "--spp", "32"],
     "radiosity": ["--res", "32", "--spp", "16", "--patches", "60", "200"],
+    "texture": ["--size", "16", "--res", "48", "--target-spp", "256", "--spp", "16"],
     "own_loss": ["--res", "16", "--spp", "8", "--steps", "5"],
     "choices": ["--res", "16", "--spp", "4,16", "--seeds", "2", "--reference-spp", "256"],
     "rough_metal": ["--res", "24", "--target-spp", "256", "--spp", "32"],

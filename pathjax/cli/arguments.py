@@ -42,8 +42,11 @@ def parser() -> argparse.ArgumentParser:
     param = "a parameter to recover; may be repeated"
     fit.add_argument("--param", dest="params", action="append", required=True, metavar="NAME[=START]", help=param)
     fit.add_argument("--spp", type=_positive, default=128, metavar="N", help="of each of the last two renders")
+    smooth = "how much neighbouring texels of textures are expected to differ; auto: found out"
+    fit.add_argument("--smoothness", type=_smoothness, metavar="S|auto", help=smooth)
     fit.add_argument("--seed", type=_seed, default=0, metavar="K")
-    fit.add_argument("-o", "--output", default="fit", metavar="PREFIX", help="writes PREFIX.json and PREFIX.png")
+    wrote = "writes PREFIX.json and PREFIX.png; of a texture also PREFIX.NAME.exr and the scene, PREFIX.xml"
+    fit.add_argument("-o", "--output", default="fit", metavar="PREFIX", help=wrote)
     fit.add_argument("--json", action="store_true", help="print one JSON object on stdout")
 
     info = subparsers.add_parser("info", help="what a scene holds and what is compiled for it")
@@ -110,6 +113,10 @@ def _add_scene(parser: argparse.ArgumentParser) -> None:
     )
     sensor = "which of several sensors of the file: its number, from 0, or its id"
     parser.add_argument("--sensor", default="0", metavar="WHICH", help=sensor)
+
+
+def _smoothness(text: str) -> float | str:
+    return text if text == "auto" else _real(text)
 
 
 def _pair(text: str) -> tuple[str, str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 from rich.console import Console
 from rich.markup import escape
 
@@ -12,6 +13,8 @@ from pathjax.cli import DONE, FAILED
 from pathjax.cli.inputs import load, numbers
 from pathjax.inverse import report
 from pathjax.inverse.fitting import step_text
+from pathjax.io.load import save_scene
+from pathjax.scene.parameters import parameters
 from pathjax.system.files import check_writable, write_text
 from pathjax.system.interrupts import Interrupts
 from pathjax.system.json_text import json_text
@@ -30,17 +33,31 @@ def run(options, output: Output) -> int:
             start[name] = numbers("--param", name, value)
     target = inverse.read_target(options.target)
     scene = load(options)
+    if any(np.ndim(value) == 3 for name, value in parameters(scene).items() if name in names):
+        check_writable(Path(f"{options.output}.xml"), [options.target, options.scene])
     with Interrupts():
         with Console(stderr=True).status("compiling") as status:
 
             def show(entry):
                 status.update(escape(step_text(entry)))
 
-            fit = inverse.fit(scene, target, names, start=start, spp=options.spp, seed=options.seed, progress=show)
+            how = dict(spp=options.spp, seed=options.seed, smoothness=options.smoothness)
+            fit = inverse.fit(scene, target, names, start=start, progress=show, **how)
         facts = {"scene": str(options.scene), "target": str(options.target), "spp": options.spp, "seed": options.seed}
         facts |= report.facts(fit)
         output.file(table, lambda path: write_text(path, json_text(facts, indent=1) + "\n"))
         if fit.images:
             output.file(picture, lambda path: images.write_png(path, report.picture(fit, [target.image])))
+        for name in report.textures(fit):
+            layers = {f"{layer}{c}": x[..., i] for layer, x in _layers(fit, name) for i, c in enumerate("RGB")}
+            path = Path(f"{options.output}.{name}.exr")
+            output.file(path, lambda path, layers=layers: images.write_exr(path, layers, {}))
+        if report.textures(fit):
+            output.file(Path(f"{options.output}.xml"), lambda path: save_scene(fit.scene, path))
         output.text(json_text(facts) if options.json else report.text(fit))
     return DONE if fit.converged else FAILED
+
+
+def _layers(fit: inverse.Fit, name: str):
+    """Of an image file: the texels, and their standard errors."""
+    return [("", fit.values[name]), ("error.", fit.standard_errors[name])]

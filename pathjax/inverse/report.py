@@ -17,17 +17,48 @@ _FACTS = (
 _FULL_SCALE = 3
 
 
+def textures(fit: Fit) -> list[str]:
+    """Names of the parameters that are images."""
+    return [name for name, value in fit.values.items() if value.ndim == 3]
+
+
 def facts(fit: Fit) -> dict:
-    """What `json_text` writes of a fit."""
-    return {name: getattr(fit, name) for name in _FACTS}
+    """What `json_text` writes of a fit. Of textures it is a summary: their texels belong into image files."""
+    found = {name: getattr(fit, name) for name in _FACTS}
+    images = textures(fit)
+    if images:
+        for each in ("values", "standard_errors"):
+            found[each] = {name: value for name, value in found[each].items() if name not in images}
+        for each in ("components", "at_bound"):
+            found[each] = [label for label in found[each] if label.partition("[")[0] not in images]
+        found["textures"] = {name: _summary(fit, name) for name in images}
+    return found
+
+
+def _summary(fit: Fit, name: str) -> dict:
+    value, error, seen = fit.values[name], fit.standard_errors[name], fit.seen[name]
+    return {
+        "shape": value.shape,
+        "mean": value.mean((0, 1)),
+        "seen": float(seen.mean()),
+        "median_standard_error": float(np.median(error[seen])) if seen.any() else math.inf,
+    }
 
 
 def text(fit: Fit) -> str:
-    values = np.concatenate([np.ravel(v) for v in fit.values.values()])
-    errors = np.concatenate([np.ravel(e) for e in fit.standard_errors.values()])
-    width = max(map(len, fit.components))
-    lines = []
-    for label, value, error in zip(fit.components, values, errors, strict=True):
+    images = textures(fit)
+    listed = [label for label in fit.components if label.partition("[")[0] not in images]
+    values, errors = (
+        [x for name, array in arrays.items() if name not in images for x in np.ravel(array)]
+        for arrays in (fit.values, fit.standard_errors)
+    )
+    width, lines = max(map(len, [*listed, *images])), []
+    for name in images:
+        known = _summary(fit, name)
+        size = " x ".join(map(str, known["shape"][:2]))
+        typical = f"+- {known['median_standard_error']:.3g} in the median" if known["seen"] else "not determined"
+        lines.append(f"{name:<{width}}  {size} texels, {known['seen']:.0%} of them seen, {typical}")
+    for label, value, error in zip(listed, values, errors, strict=True):
         digits = 6 if not 0 < error < math.inf else min(max(1 - math.floor(math.log10(error)), 0), 8)
         stated = f"+- {error:.{digits}f}" if math.isfinite(error) else "not determined" if error > 0 else "unknown"
         note = "  (at its bound)" if label in fit.at_bound else ""

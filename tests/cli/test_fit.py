@@ -9,7 +9,7 @@ import pytest
 
 import pathjax as pj
 from pathjax import inverse
-from pathjax.images import write_exr, write_png
+from pathjax.images import read_exr, write_exr, write_png
 
 FURNACE = "scenes/furnace.xml"
 SMALL = ("-D", "res=8")
@@ -115,3 +115,27 @@ def test_fit_without_a_target_or_a_folder(refused, target, tmp_path):
     absent = tmp_path / "none.exr"
     refused("fit", FURNACE, absent, *SMALL, *param, "-o", tmp_path / "f", says=["none.exr", "no such file"])
     refused("fit", FURNACE, target, *SMALL, *param, "-o", tmp_path / "none" / "f", says=["there is no folder"])
+
+
+@pytest.mark.slow
+def test_a_fitted_texture_becomes_an_image_beside_its_report(run, root, tmp_path):
+    texels = np.random.default_rng(0).uniform(0.3, 0.7, (3, 2, 2)).astype(np.float32)
+    write_exr(tmp_path / "texels.exr", dict(zip("RGB", texels, strict=True)), {})
+    text = (root / FURNACE).read_text()
+    before, _, after = text.partition("<rgb name=\"reflectance\"")
+    bitmap = '<texture type="bitmap" name="reflectance"><string name="filename" value="texels.exr"/>'
+    bitmap += '<boolean name="raw" value="true"/></texture>'
+    (tmp_path / "scene.xml").write_text(before + bitmap + after.partition("/>")[2])
+    scene = pj.load_scene(tmp_path / "scene.xml", res=16)
+    image = np.moveaxis(np.asarray(pj.render(scene, 64, seed=1)), -1, 0)
+    write_exr(tmp_path / "target.exr", dict(zip("RGB", image, strict=True)), {})
+    arguments = "-D", "res=16", "--param", "wall.reflectance=0.5", "--smoothness", "auto", "--spp", "16"
+    status, out, _ = run("fit", tmp_path / "scene.xml", tmp_path / "target.exr", *arguments, "-o", tmp_path / "f")
+    assert status == 0 and "2 x 2 texels, 100% of them seen" in out, out
+    facts = json.loads((tmp_path / "f.json").read_text())
+    assert not facts["values"] and facts["textures"]["wall.reflectance"]["seen"] == 1
+    found, _ = read_exr(tmp_path / "f.wall.reflectance.exr")
+    fitted = pj.parameters(pj.load_scene(tmp_path / "f.xml"))["wall.reflectance"]
+    for i, c in enumerate("RGB"):
+        np.testing.assert_allclose(found[c], fitted[..., i], atol=1e-6)
+        assert np.abs(found[c] - texels[i]).max() < 0.05 and (found[f"error.{c}"] < 0.05).all()
