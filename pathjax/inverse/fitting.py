@@ -134,12 +134,14 @@ def fit(
     would keep the darker ones. Which these are is told by renders and the noise around, never by the pixel itself.
     """
     check_counts(spp, seed)
-    solver = solver or optx.LevenbergMarquardt(rtol=1e-4, atol=1e-4)
+    chosen, solver = solver, solver or optx.LevenbergMarquardt(rtol=1e-4, atol=1e-4)
     if not isinstance(solver, optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser):
         raise InputError(f"solver is a {type(solver).__name__}; use a least-squares solver or minimiser of optimistix")
     tell = _print_step if progress is True else progress or None
     views = problem.build(scene, target, names, start or {})
     if problem.is_many(views.vector):
+        if chosen is not None:
+            raise InputError("solver is of fits of few numbers; textures have one of their own, so leave it out")
         return _fit_many(views, spp, seed, smoothness, tell)
     if smoothness is not None:
         raise InputError("smoothness is about the texels of textures, and none is fitted")

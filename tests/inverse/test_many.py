@@ -1,6 +1,7 @@
 """Textures from images: recovery within stated errors, texels that no pixel sees, what is supposed, bad input."""
 
 import numpy as np
+import optimistix as optx
 import pytest
 
 import pathjax as pj
@@ -98,6 +99,7 @@ def test_interrupted_fits_give_what_they_have(wall, truth, target):
         (np.zeros((8, 8, 3)), {}, [NAME, "16, 16, 3", "8 x 8 x 3"]),
         (0.5, {"smoothness": -1}, ["smoothness = -1", "auto"]),
         (0.5, {"smoothness": "much"}, ["smoothness = 'much'"]),
+        (0.5, {"solver": optx.BFGS(1e-3, 1e-3)}, ["solver", "leave it out"]),
     ],
 )
 def test_bad_input_is_refused(wall, target, start, how, says):
