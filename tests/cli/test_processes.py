@@ -62,10 +62,10 @@ def compile(*arguments, plain=passes.compile):
     return plain(*arguments)
 
 def extend(*arguments, plain=passes.extend):
-    for number, _ in enumerate(plain(*arguments)):
+    for number, goes_on in enumerate(plain(*arguments)):
         if number == 20:
             tell("kernel ran")
-        yield
+        yield goes_on
 
 def render_bounces(*arguments, plain=bounces.render_bounces):
     tell("bounces begin")

@@ -174,10 +174,10 @@ def after_calls(monkeypatch):
         count = iter(range(number))
 
         def extend(*arguments):
-            for _ in plain(*arguments):
+            for goes_on in plain(*arguments):
                 if next(count, None) is None:
                     act()
-                yield
+                yield goes_on
 
         monkeypatch.setattr(passes, "extend", extend)
 
@@ -194,7 +194,8 @@ def test_signals_end_a_render_with_what_is_done(cornell, after_calls, number):
     finally:
         signal.signal(number, earlier)
     assert result.reason == "interrupted"
-    assert result.spp == 448  # portions of 64, 192 and 192, each by one call of every thread
+    # Portions of 64, 192 and 192, each by one call of every thread, and of those of 192 that follow what has begun.
+    assert 448 <= result.spp <= 640
 
 
 def test_interrupt_before_the_first_samples(cornell, monkeypatch):
