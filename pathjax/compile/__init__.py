@@ -1,7 +1,7 @@
 """How a function of one ray becomes a native kernel over millions, and what its code may say of that.
 
 - `native_map` runs a function of one item over all items, on all devices; `lanes/` is how, on CPUs. `native_fold` is
-  the same for items that leave something in memory that they share.
+  the same for items that leave something in memory that they share, `native_rows` where each has rows of its own there.
 - `compute_once`, `one_by_one` and `persistent_loop` stand in code of one item. They change nothing of its results, only
   what is computed when. `together` changes the memory of a `native_fold`.
 - `linear` is a linear function with a transpose of its own.
@@ -16,7 +16,7 @@ from __future__ import annotations
 from pathjax.compile.cache import keep_kernels
 from pathjax.compile.jax_compat import is_symbolic_zero, is_traced
 from pathjax.compile.linear import linear
-from pathjax.compile.mapping import MANY_ITEMS, native_fold, native_map, split_map
+from pathjax.compile.mapping import MANY_ITEMS, native_fold, native_map, native_rows, split_map
 from pathjax.compile.primitives import compute_once, one_by_one, persistent_loop, together
 from pathjax.compile.promotion import usual_promotion
 from pathjax.compile.threads import calls_at_once, concurrently, devices_of_a_call
@@ -35,6 +35,7 @@ __all__ = [
     "native",
     "native_fold",
     "native_map",
+    "native_rows",
     "one_by_one",
     "persistent_loop",
     "setup",

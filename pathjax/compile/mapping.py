@@ -89,40 +89,90 @@ def native_fold(f: Callable, xs, *shared, start: Callable, finish: Callable, dev
         finish: memory after the last item of a part -> pytree of arrays, which are added up.
         devices: how many local devices to use; None: all.
     """
+    nbytes = sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(jax.eval_shape(lambda: finish(start(_LANES)))))
+
+    def part(xs, width, shared):
+        (memory,) = lanes(lambda *args: (f(*args),), width, memory=start(width))(xs, *shared)
+        return finish(memory)
+
+    sums = _by_parts(part, xs, shared, devices, max(1, MOST_BYTES // nbytes))
+    return jax.tree.map(lambda x: reduce(jnp.add, list(x)), sums)
+
+
+@usual_promotion
+def native_rows(f: Callable, xs, *shared, start: Callable, finish: Callable, devices: int | None = None):
+    """What every item leaves in rows of memory that are its own, as `native_fold` has it, and what it gives.
+
+    Args:
+        f: (x, number of the item, *shared, memory) -> (y, memory); items of a part are numbered from 0.
+        start: (number of lanes, number of items, *shared) -> memory before the first item.
+        finish: memory after the last item of a part -> pytree of arrays (items, ...).
+        xs, shared, devices: of `native_fold`.
+    Returns:
+        y and the rows of all items, pytrees of arrays (N, ...). Under `jax.vmap` one call follows another.
+    """
+    count = jax.tree.leaves(xs)[0].shape[0]
+
+    @custom_vmap
+    def run(xs, *shared):
+        def part(xs, width, shared):
+            items = len(jax.tree.leaves(xs)[0])
+            of_part = lanes(lambda x, *args: f(*x, *args), width, memory=start(width, items, *shared))
+            ys, memory = of_part((xs, jnp.arange(items, dtype=jnp.int32)), *shared)
+            return ys, finish(memory)
+
+        results = _by_parts(part, xs, shared, devices)
+        return jax.tree.map(lambda x: x.swapaxes(0, 1).reshape(-1, *x.shape[2:])[:count], results)
+
+    @run.def_vmap
+    @usual_promotion
+    def _(size, batched, *args):
+        def one(b):
+            def pick(leaf, is_batched):
+                return lax.dynamic_index_in_dim(leaf, b, keepdims=False) if is_batched else leaf
+
+            return run(*jax.tree.map(pick, args, tuple(batched)))
+
+        results = lax.map(one, jnp.arange(size))
+        return results, jax.tree.map(lambda _: True, results)
+
+    return run(xs, *shared)
+
+
+def _by_parts(part: Callable, xs, shared, devices: int | None, most: int = MOST_PARTS):
+    """part(items, lanes, shared) of all parts, one after another: pytree of arrays (parts, ...).
+
+    Item i belongs to part i % parts. Each device does some parts; how many there are depends on the items alone.
+    """
     count = jax.tree.leaves(xs)[0].shape[0]
     used = jax.local_devices()[:devices]
-    nbytes = sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(jax.eval_shape(lambda: finish(start(_LANES)))))
-    parts = min(MOST_PARTS, -(-count // ITEMS_OF_A_PART), max(1, MOST_BYTES // nbytes))
+    parts = min(MOST_PARTS, -(-count // ITEMS_OF_A_PART), most)
     rounds = -(-parts // len(used))
     each = -(-count // parts)
     width = _LANES if each >= MANY_ITEMS else _FEW_LANES
 
     def deal(x):
-        """(N, ...) -> (devices, rounds, items, ...): item i belongs to part i % parts."""
+        """(N, ...) -> (devices, rounds, items, ...)"""
         x = jnp.pad(x, [(0, each * parts - count), *[(0, 0)] * (x.ndim - 1)])
         x = x.reshape(each, parts, *x.shape[1:]).swapaxes(0, 1)
         x = jnp.pad(x, [(0, rounds * len(used) - parts), *[(0, 0)] * (x.ndim - 1)])
         return x.reshape(len(used), rounds, *x.shape[1:])
 
-    def part(xs, shared):
-        (memory,) = lanes(lambda *args: (f(*args),), width, memory=start(width))(xs, *shared)
-        return finish(memory)
-
     def on_one_device(xs, *shared):
-        return lax.map(lambda xs: part(xs, shared), jax.tree.map(lambda x: x[0], xs))
+        return lax.map(lambda xs: part(xs, width, shared), jax.tree.map(lambda x: x[0], xs))
 
     if len(used) == 1:
-        sums = on_one_device(jax.tree.map(deal, xs), *shared)
+        results = on_one_device(jax.tree.map(deal, xs), *shared)
     else:
         spec = PartitionSpec("device")
-        sums = jax.shard_map(
+        results = jax.shard_map(
             on_one_device,
             mesh=Mesh(np.array(used), ("device",)),
             in_specs=(spec, *(PartitionSpec() for _ in shared)),
             out_specs=spec,
             check_vma=False,
         )(jax.tree.map(deal, xs), *shared)
-    return jax.tree.map(lambda x: reduce(jnp.add, [x[k] for k in range(parts)]), sums)
+    return jax.tree.map(lambda x: x[:parts], results)
 
 
 def _map(f, xs, shared, form, devices):

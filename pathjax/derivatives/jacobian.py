@@ -1,8 +1,9 @@
 """Image and Jacobian: how every pixel changes with the parameters of materials and lights.
 
 Colours (reflectances, radiances, a metal's eta and k) change what paths carry, not where they go: the derivative is
-that of the weights (detached sampling), unbiased (`tangents`). The IOR of smooth glass moves the path itself, which
-takes differences (`ior_difference`). No general derivative exists here for moving geometry or cameras.
+that of the weights (detached sampling), unbiased (`tangents`; of many colours `record`). The IOR of smooth glass moves
+the path itself, which takes differences (`ior_difference`). No general derivative exists here for moving geometry or
+cameras.
 """
 
 from __future__ import annotations
@@ -19,9 +20,9 @@ from jaxtyping import Array, Float, Int
 
 from pathjax import emitters
 from pathjax.bsdfs import dielectric
-from pathjax.compile import is_traced, usual_promotion
+from pathjax.compile import is_traced, native, usual_promotion
 from pathjax.core.types import Number
-from pathjax.derivatives import ior, ior_difference, ior_step, rules, tangents
+from pathjax.derivatives import ior, ior_difference, ior_step, places, record, rules, tangents
 from pathjax.errors import InputError
 from pathjax.integrators import pixel
 from pathjax.integrators.options import Counts, Options
@@ -34,6 +35,8 @@ from pathjax.system import memory
 
 Slopes = dict[str, Float[Array, "..."]]
 METHODS = ("difference", "attached")
+# Up to so many colours tangents are the cheaper way, and may be differentiated again.
+MOST_TANGENTS = 8
 
 
 @jax.tree_util.register_dataclass
@@ -154,14 +157,16 @@ def pixel_jacobians(
         scene = choosing_by_present_iors(scene, rows)
     steps = ior_step.steps(scene, glass, step)
     numbers = pixel.numbers(pixels, first_sample, spp, seed)
-    places = tangents.places(wanted[name] for name in colors)
+    if not rows and takes_sweep(scene, wanted.values(), options, **how):
+        return *_swept(scene, wanted, pixels, numbers, options, **how), {}, {}
+    held = tangents.places(wanted[name] for name in colors)
 
-    def of(places, first):
+    def of(held, first):
         here = slice(first, first + ior_difference.MOST_GLASS)
-        static = Wanted(places, glass[here])
+        static = Wanted(held, glass[here])
         return _jacobians(scene, pixels, *numbers, steps[here], wanted=static, options=options, **how)
 
-    image, by_color, *by_glass = of(places, 0)
+    image, by_color, *by_glass = of(held, 0)
     more = [of((), first)[2:] for first in range(ior_difference.MOST_GLASS, len(glass), ior_difference.MOST_GLASS)]
     by_ior, bias = (jnp.concatenate(parts, axis=1) for parts in zip(by_glass, *more, strict=True))
 
@@ -175,6 +180,33 @@ def pixel_jacobians(
             derivatives[name], biases[name] = by_ior[:, place] * scale, bias[:, place] * scale
             used[name] = steps[place]
     return image, derivatives, biases, used
+
+
+def takes_sweep(scene: Scene, parameters, options: Options, form: str | None = None, devices: int | None = None):
+    """Whether a recorded sweep finds all derivatives, of more colours than it takes tangents to cost as much.
+
+    It knows of pixels that draw their own samples alone, of colours, and of native kernels.
+    """
+    lanes = form == "lanes" or (form is None and native())
+    if not lanes or options.shared or len(parameters) <= MOST_TANGENTS:
+        return False
+    paths = {parameter.path for parameter in parameters}
+    if not paths <= places.paths(scene) or any(parameter.shape != (3,) for parameter in parameters):
+        return False
+    slots = places.slots(scene, tuple(paths))
+    # What also stands for a number has a derivative across channels.
+    return slots.of_bsdfs == slots.colors and not slots.of_choices and not slots.of_passed
+
+
+def _swept(scene, wanted, pixels, numbers, options, form=None, devices=None):
+    """Means and derivatives, by name."""
+    scene = rules.differentiated_once(scene, f"an image in more than {MOST_TANGENTS} colours at once")
+    options = replace(options, derivative=True, by_vertex=True)
+    paths = tuple(dict.fromkeys(parameter.path for parameter in wanted.values()))
+    first, _ = places.firsts(scene, paths)
+    image, found = record.rows(scene, pixels, *numbers, paths=paths, options=options, devices=devices)
+    columns = {name: first[parameter.path] + parameter.index[0] for name, parameter in wanted.items()}
+    return image, {name: tangents.by_channel(found[:, column]) for name, column in columns.items()}
 
 
 def choosing_by_present_iors(scene: Scene, rows: tuple[int, ...]) -> Scene:

@@ -1,21 +1,18 @@
 """J v and J^T v of the means of pixels, without J: each at the price of about one image, whatever the size of v.
 
-J v is the tangent of a pixel's mean (`tangents`), J^T v comes by a recorded sweep (`record`).
+J v goes along with paths (`forward`), J^T v comes by a recorded sweep when they have ended (`record`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import partial
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from pathjax import emitters
-from pathjax.compile import native_map, usual_promotion
-from pathjax.derivatives import places, record, tangents
+from pathjax.compile import usual_promotion
+from pathjax.derivatives import forward, places, record
 from pathjax.integrators import pixel
 from pathjax.integrators.options import Counts, Options
 from pathjax.kinds.parameter import Parameter
@@ -41,7 +38,8 @@ def push(
         place = paths.index(wanted[name].path)
         moved[place] = moved[place] + wanted[name].put(jnp.zeros_like(moved[place]), change)
     numbers = pixel.numbers(pixels, first_sample, spp, seed)
-    return _pushed(scene, moved, pixels, *numbers, paths=paths, options=options, **how)
+    options = replace(options, derivative=True, by_vertex=True)
+    return forward.push(scene, moved, pixels, *numbers, paths=paths, options=options, **how)
 
 
 @usual_promotion
@@ -68,19 +66,3 @@ def pull(
 
 def _paths(wanted):
     return tuple(dict.fromkeys(parameter.path for parameter in wanted.values()))
-
-
-@partial(jax.jit, static_argnames=("paths", "options", "form", "devices"))
-def _pushed(scene, moved, pixels, first_sample, spp, seed, *, paths, options, form=None, devices=None):
-    scene = options.applied(scene)
-    choice = emitters.choice(scene.emitters, options.strategy)
-    options = replace(options, derivative=True)
-
-    def one_pixel(work, scene, choice, moved):
-        def mean(scene):
-            return pixel.mean(work, scene, choice, options=options)
-
-        return tangents.along(mean, scene, paths, moved)
-
-    work = pixels, first_sample, spp, seed
-    return native_map(one_pixel, work, scene, choice, moved, form=form, devices=devices)

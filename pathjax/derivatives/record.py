@@ -1,4 +1,4 @@
-"""Reverse mode at the price of about one image, whatever the number of parameters: J^T v by a recorded sweep.
+"""J^T v, and J in many colours, at the price of about one image, whatever the number of parameters: a recorded sweep.
 
 A path's derivative has entries at the parameters of the vertices that it meets, and nowhere else. So each vertex is
 recorded as it is met, and when the path has ended its vertices are gone through again, the last one first:
@@ -9,7 +9,8 @@ recorded as it is met, and when the path has ended its vertices are gone through
 with Le what the path ends on and n the light sample, each with its share, w the weight of the bsdf sample over the
 survival of roulette, and beta the throughput before the vertex. Nothing is divided by a reflectance, so what is black
 keeps its derivative. Times the adjoint of the pixel these are added to a list of derivatives, at the entries that the
-vertex looked up (`places`). What directions and probabilities depend on is detached, as in all of pathjax.
+vertex looked up (`places`): one list for all pixels, or, without an adjoint, one for each. What directions and
+probabilities depend on is detached, as in all of pathjax.
 
 All lanes record at once, in one row of a ring of buffers, and are swept at once, every WINDOW trips: back from the last
 end of a path that they have recorded to the first vertex of a path that was swept before.
@@ -17,7 +18,7 @@ end of a path that they have recorded to the first vertex of a path that was swe
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import NamedTuple
 
@@ -27,7 +28,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from pathjax import emitters
-from pathjax.compile import native_fold, persistent_loop, together
+from pathjax.compile import compute_once, native_fold, native_rows, persistent_loop, together
 from pathjax.compile.lanes import flags
 from pathjax.core import sampler
 from pathjax.core.math import LUMINANCE, at
@@ -40,9 +41,9 @@ from pathjax.integrators.shadow import none_passed
 from pathjax.scene import parameters as named
 from pathjax.scene.scene import Scene
 
-# Trips of the ring, a power of 2, and those between two sweeps. A path of more than the difference is not recorded
-# whole, and makes the derivatives NaN: one in 1e20, if roulette ends paths.
-RING, WINDOW = 1024, 32
+# Trips between two sweeps, and those that the ring holds at most, a power of 2. A path of more than the difference is
+# not recorded whole, and makes the derivatives NaN: one in 1e20, if roulette ends paths.
+WINDOW, RING = 32, 1024
 # Entries of a list that every lane sums up by itself.
 FEW = 8
 
@@ -93,7 +94,7 @@ def extend(
 
     Args:
         options: by vertex.
-        scale: what derivatives are multiplied by.
+        scale: what derivatives are multiplied by, beside the throughput.
         number: of the Record among those of the vertex.
     """
     scene = places.prepared(scene, slots, number)
@@ -159,6 +160,7 @@ class Memory(NamedTuple):
     clock: Int[Array, ""]  # trips
     swept: Int[Array, ""]  # trips before the last sweep
     lost: Int[Array, ""]  # 1: a path was longer than the ring
+    size: Int[Array, ""]  # trips that are used of the ring: few stay in near caches
     ring: list  # of each number of a Record, (RING, W)
 
 
@@ -178,9 +180,19 @@ def start(scene: Scene, record: Record, entries: int, lanes: int) -> Memory:
     dtype = scene.camera.origin.dtype
     few = entries <= FEW
     total = [jnp.zeros((lanes,), dtype)] * (3 * entries) if few else jnp.zeros((entries, 3), dtype)
-    numbers = jax.eval_shape(columns_of, record)
+    # No trip is read that was not written.
+    ring = [lax.empty((RING, lanes), x.dtype) for x in jax.eval_shape(columns_of, record)]
     zero = jnp.int32(0)
-    return Memory(total, zero, zero, zero, [jnp.zeros((RING, lanes), x.dtype) for x in numbers])
+    return Memory(total, zero, zero, zero, ring_size(scene), ring)
+
+
+def ring_size(scene: Scene) -> Int[Array, ""]:
+    """Power of 2 that holds the longest path and a window, as far as that is known; RING at most."""
+    if scene.free_passes or scene.hide_emitters:  # what does not count into depth has no bound
+        return jnp.int32(RING)
+    sizes = [1 << k for k in range(RING.bit_length())]
+    wanted = jnp.minimum(scene.max_depth, RING) + WINDOW
+    return jnp.min(jnp.where(jnp.array(sizes) >= wanted, jnp.array(sizes), RING)).astype(jnp.int32)
 
 
 def remember(structure: Record, memory: Memory, here: Bool[Array, " W"], columns: list) -> Memory:
@@ -188,14 +200,20 @@ def remember(structure: Record, memory: Memory, here: Bool[Array, " W"], columns
     bits, *numbers = columns
     # A lane without an item records nothing that is whole.
     columns = [jnp.where(here, bits | HOLDS, BEGINS | ENDS), *numbers]
-    row = memory.clock & (RING - 1)
+    ring = _with_row(memory.ring, memory.clock & (memory.size - 1), columns)
+    memory = memory._replace(clock=memory.clock + 1, ring=ring)
+    return sweep(structure, memory, memory.clock - memory.swept >= WINDOW)
 
-    def with_row(buffer, x):
+
+def _with_row(ring: list, row: Int[Array, ""], columns: list) -> list:
+    def put(buffer, x):
         return lax.dynamic_update_slice(buffer, x[None], (row, jnp.int32(0)), allow_negative_indices=False)
 
-    memory = memory._replace(clock=memory.clock + 1, ring=list(map(with_row, memory.ring, columns)))
-    due = memory.clock - memory.swept >= WINDOW
-    return sweep(structure, memory, due)
+    return list(map(put, ring, columns))
+
+
+def _row(ring: list, row: Int[Array, ""]) -> list:
+    return [lax.dynamic_index_in_dim(x, row, keepdims=False, allow_negative_indices=False) for x in ring]
 
 
 def sweep(structure: Record, memory: Memory, due: Bool[Array, ""]) -> Memory:
@@ -203,10 +221,7 @@ def sweep(structure: Record, memory: Memory, due: Bool[Array, ""]) -> Memory:
     window = jnp.where(due, memory.clock - memory.swept, 0)
 
     def step(state: Sweep) -> Sweep:
-        row = (memory.clock - 1 - state.back) & (RING - 1)
-        bits, *numbers = [
-            lax.dynamic_index_in_dim(x, row, keepdims=False, allow_negative_indices=False) for x in memory.ring
-        ]
+        bits, *numbers = _row(memory.ring, (memory.clock - 1 - state.back) & (memory.size - 1))
         record = unflattened(structure, numbers)
         begins, ends, holds = (bits & bit != 0 for bit in (BEGINS, ENDS, HOLDS))
         complete = (state.complete != 0) | ends
@@ -224,7 +239,7 @@ def sweep(structure: Record, memory: Memory, due: Bool[Array, ""]) -> Memory:
         R = [n + w * x for n, w, x in zip(record.gathered, record.weight, R, strict=True)]
         back = state.back + 1
         stopped = (state.stopped != 0) | ((back >= window) & (begins | ~complete))
-        goes_on = (back < window) | ((back < RING) & ~all_set(stopped))
+        goes_on = (back < window) | ((back < memory.size) & ~all_set(stopped))
         return Sweep(back, goes_on, complete.astype(jnp.int32), stopped.astype(jnp.int32), R, total)
 
     nothing = jnp.zeros((memory.ring[0].shape[1],), jnp.int32)
@@ -279,25 +294,48 @@ def all_set(of_lanes: Bool[Array, " W"]) -> Bool[Array, ""]:
 # ---- pixels ---------------------------------------------------------------------------------------------------------
 
 
-def pixel_sweep(work, scene: Scene, choice, memory: Memory, *, options, slots, paths, structure) -> Memory:
-    """Add what the samples of a pixel give. work: the adjoint (3,) of its mean, and `pixel.Work`."""
-    adjoint, (pixel_number, first_sample, spp, seed) = work
+def pixel_sweep(
+    work: pixel.Work,
+    scene: Scene,
+    choice: Choice | None,
+    scale: Float[Array, "3"],
+    first: Int[Array, ""] | int,
+    memory: Memory,
+    *,
+    options: Options,
+    slots: places.Slots,
+    paths: places.Paths,
+    structure: Record,
+) -> tuple[Float[Array, "3"], Memory]:
+    """Add what the samples of a pixel give, and their mean.
+
+    scale: of the derivatives of the mean; first: where the list begins in the total.
+    """
+    pixel_number, first_sample, spp, seed = work
     stream = sampler.pixel_stream(seed, pixel_number)
-    adjoint = adjoint / jnp.maximum(spp, 1).astype(adjoint.dtype)
+    share = 1 / jnp.maximum(spp, 1).astype(scale.dtype)
 
     def step(state):
-        number, passed, now, weight, memory = state
+        number, passed, now, weight, sums, memory = state
         begins = ~now.alive
         now, weight = pixel.begun(scene, pixel_number, stream, number, now, weight, options)
         u = bounce_numbers(scene, stream, number, path.vertices(now), options.sampler)
-        on, record, itself = extend(scene, choice, now, u, options, slots, paths, weight * adjoint, passed)
-        memory = together(partial(remember, structure))(memory, columns_of(record._replace(begins=begins)))
+        of_sample = weight * (share * scale)
+        on, record, itself = extend(scene, choice, now, u, options, slots, paths, of_sample, passed)
+        there = [replace(slot, places=tuple(first + place for place in slot.places)) for slot in record.slots]
+        record = record._replace(begins=begins, slots=there)
+        memory = together(partial(remember, structure))(memory, columns_of(record))
+        gain = weight * (on.L.emission + on.L.light)
         if slots.of_passed:
+            gain = jnp.where(itself, gain, 0)
             passed, on = jnp.where(itself, 0, passed + 1), jax.tree.map(partial(jnp.where, itself), on, now)
-        return number + jnp.where(on.alive, 0, 1).astype(number.dtype), passed, on, weight, memory
+        sums = pixel.add_compensated(sums, compute_once(gain))
+        return number + jnp.where(on.alive, 0, 1).astype(number.dtype), passed, on, weight, sums, memory
 
-    state = first_sample, jnp.int32(0), *pixel.no_path(scene, options), memory
-    return persistent_loop(lambda state: state[0] != first_sample + spp, step, state)[-1]
+    zero = jnp.zeros((3,), scale.dtype)
+    state = first_sample, jnp.int32(0), *pixel.no_path(scene, options), (zero, zero), memory
+    *_, (total, _), memory = persistent_loop(lambda state: state[0] != first_sample + spp, step, state)
+    return share * total, memory
 
 
 def finish(structure: Record, memory: Memory) -> Float[Array, "M 3"]:
@@ -306,6 +344,19 @@ def finish(structure: Record, memory: Memory) -> Float[Array, "M 3"]:
     if isinstance(total, list):
         total = jnp.stack([jnp.sum(x) for x in total]).reshape(-1, 3)
     return jnp.where(memory.lost != 0, jnp.nan, total)
+
+
+def _structure(
+    scene: Scene, choice: Choice | None, slots: places.Slots, paths: places.Paths, options: Options
+) -> Record:
+    """Of a Record, shapes and dtypes."""
+
+    def record(scene, choice, x):
+        now, _ = pixel.camera_path(scene, jnp.int32(0), x, x, options)
+        u = bounce_numbers(scene, x, x, path.vertices(now), options.sampler)
+        return extend(scene, choice, now, u, options, slots, paths, now.throughput, jnp.int32(0))[1]
+
+    return jax.eval_shape(record, scene, choice, jnp.uint32(0))
 
 
 @partial(jax.jit, static_argnames=("paths", "options", "devices"))
@@ -322,17 +373,16 @@ def pullback(scene: Scene, adjoint, pixels, first_sample, spp, seed, *, paths, o
     choice = emitters.choice(scene.emitters, options.strategy)
     slots = places.slots(scene, paths)
     first, entries = places.firsts(scene, paths)
+    structure = _structure(scene, choice, slots, paths, options)
+    sweep_of = partial(pixel_sweep, options=options, slots=slots, paths=paths, structure=structure)
 
-    def record(scene, choice, x):
-        now, _ = pixel.camera_path(scene, jnp.int32(0), x, x, options)
-        u = bounce_numbers(scene, x, x, path.vertices(now), options.sampler)
-        return extend(scene, choice, now, u, options, slots, paths, now.throughput, jnp.int32(0))[1]
+    def of_pixel(work, scene, choice, memory):
+        adjoint, work = work
+        return sweep_of(work, scene, choice, adjoint, 0, memory)[1]
 
-    structure = jax.eval_shape(record, scene, choice, jnp.uint32(0))
-    f = partial(pixel_sweep, options=options, slots=slots, paths=paths, structure=structure)
     begin, end = partial(start, scene, structure, entries), partial(finish, structure)
     work = adjoint, (pixels, first_sample, spp, seed)
-    total = native_fold(f, work, scene, choice, start=begin, finish=end, devices=devices)
+    total = native_fold(of_pixel, work, scene, choice, start=begin, finish=end, devices=devices)
 
     def of_array(path):
         rows = total[first[path] : first[path] + places.count(scene, path)]
@@ -340,3 +390,31 @@ def pullback(scene: Scene, adjoint, pixels, first_sample, spp, seed, *, paths, o
         return rows.reshape(named.get(scene, path).shape)
 
     return [of_array(path) for path in paths]
+
+
+@partial(jax.jit, static_argnames=("paths", "options", "devices"))
+def rows(
+    scene: Scene, pixels, first_sample, spp, seed, *, paths, options: Options, devices=None
+) -> tuple[Float[Array, "N 3"], Float[Array, "N M 3"]]:
+    """Means of pixels, and their derivatives in each of the list of colours: of each channel in its own.
+
+    Arguments as for `pullback`; the arrays hold colours alone.
+    """
+    scene = options.applied(scene)
+    choice = emitters.choice(scene.emitters, options.strategy)
+    slots = places.slots(scene, paths)
+    _, entries = places.firsts(scene, paths)
+    structure = _structure(scene, choice, slots, paths, options)
+    sweep_of = partial(pixel_sweep, options=options, slots=slots, paths=paths, structure=structure)
+
+    def of_pixel(work, number, scene, choice, memory):
+        return sweep_of(work, scene, choice, jnp.ones_like(scene.camera.origin), number * entries, memory)
+
+    def begin(lanes, pixels, scene, choice):
+        return start(scene, structure, pixels * entries, lanes)
+
+    def end(memory):
+        return finish(structure, memory).reshape(-1, entries, 3)
+
+    work = pixels, first_sample, spp, seed
+    return native_rows(of_pixel, work, scene, choice, start=begin, finish=end, devices=devices)

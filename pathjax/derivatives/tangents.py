@@ -76,18 +76,6 @@ def by_tangent(
     return jax.vmap(push, out_axes=(None, 0, None))(tangents)
 
 
-def along(of: Callable, scene: Scene, paths: tuple, moved: list[Float[Array, "..."]]) -> Float[Array, "*shape"]:
-    """The derivative of `of(scene)` along a change of the arrays at these paths."""
-
-    def varied(arrays):
-        changed = scene
-        for path, array in zip(paths, arrays, strict=True):
-            changed = named.put(changed, path, array)
-        return of(changed)
-
-    return jax.jvp(varied, ([named.get(scene, path) for path in paths],), (moved,))[1]
-
-
 def _tables(colors: Places):
     """Paths of the tables that hold the colours, each once."""
     return list(dict.fromkeys(table_path for table_path, _ in colors))

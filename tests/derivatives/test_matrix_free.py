@@ -10,7 +10,7 @@ import pytest
 
 import pathjax as pj
 from pathjax.compile import mapping
-from pathjax.derivatives import matrix_free, record
+from pathjax.derivatives import jacobian, matrix_free, record
 from pathjax.images import write_exr
 from pathjax.integrators.options import Options
 from pathjax.scene import parameters as named
@@ -149,6 +149,45 @@ def test_the_jacobian_is_the_same(room):
         terms = np.asarray(J[name]).reshape(-1, 3, 3) * np.asarray(v)[..., None]
         gap = np.abs(pulled[name] - terms.sum((0, 1)))
         assert (gap <= ROUNDING * np.abs(terms).sum((0, 1))).all(), name
+
+
+def patches(count, res):
+    """A wall of squares, each of a material of its own, and a lamp before it."""
+    wall = "".join(
+        f'<shape type="rectangle"><transform name="to_world"><scale value="0.1"/>'
+        f'<translate x="{0.2 * (i % 3) - 0.2}" y="{0.2 * (i // 3) - 0.3}"/></transform>'
+        f"{diffuse(f'p{i}', rgb('reflectance', f'{i / count}, 0.5, 1'))}</shape>"
+        for i in range(count)
+    )
+    lamp = f'<emitter type="area" id="lamp">{rgb("radiance", "3, 2, 1")}</emitter>'
+    before = '<rotate x="1" angle="90"/><scale value="0.3"/><translate y="0.5" z="0.4"/>'
+    return wall + f'<shape type="rectangle"><transform name="to_world">{before}</transform>{lamp}</shape>', res
+
+
+@pytest.mark.slow
+def test_a_jacobian_in_many_colours_is_that_by_tangents(make_scene, monkeypatch):
+    """A recorded sweep gives it; so on every number of devices, and under vmap one call after another."""
+    inside, res = patches(jacobian.MOST_TANGENTS + 3, 23)  # more pixels than two groups of lanes
+    scene = limited(make_scene(inside, res=res, origin="0, 0, 2", fov=30), 6, 2)
+    names = list(pj.parameters(scene))
+    swept = pj.jacobian(scene, names, SPP, 3)
+    pair = jax.vmap(lambda seed: pj.jacobian(scene, names, SPP, seed))(jnp.array([5, 3]))
+    for one, of_two in zip(jax.tree.leaves(swept), jax.tree.leaves(pair), strict=True):
+        np.testing.assert_array_equal(one, of_two[1])
+    alone = jacobian.pixel_jacobians(
+        named.nameless(scene),
+        scene.about.parameters,
+        jnp.arange(res * res, dtype=jnp.int32),
+        *(0, SPP, 3, Options()),
+        devices=1,
+    )
+    np.testing.assert_array_equal(swept[0].reshape(-1, 3), alone[0])
+    np.testing.assert_array_equal(swept[1][names[0]].reshape(-1, 3, 3), alone[1][names[0]])
+    monkeypatch.setattr(jacobian, "MOST_TANGENTS", len(names))
+    by_tangents = pj.jacobian(scene, names, SPP, 3)
+    for one, other in zip(jax.tree.leaves(swept), jax.tree.leaves(by_tangents), strict=True):
+        # Of float32 sums of some tens of numbers of one sign.
+        np.testing.assert_allclose(one, other, rtol=3e-6, atol=3e-6 * np.abs(other).max())
 
 
 @pytest.mark.slow

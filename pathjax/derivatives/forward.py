@@ -1,0 +1,103 @@
+"""Forward mode at the price of about one image, whatever the number of parameters: J v by the records of `record`.
+
+What v does to a path's throughput, b, goes along with it from vertex to vertex:
+
+    dI = sum_k  b_k (Le_k + n_k) + beta_k (dLe_k + dn_k) v,        b_{k+1} = b_k w_k + beta_k dw_k v,        b_0 = 0
+
+with the names of `record`. The numbers of v that a vertex needs are looked up as the parameters themselves are.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from pathjax import emitters
+from pathjax.compile import compute_once, native_map, persistent_loop
+from pathjax.core import sampler
+from pathjax.core.math import at, luminance
+from pathjax.derivatives import places
+from pathjax.derivatives.record import Record, extend
+from pathjax.emitters import Choice
+from pathjax.integrators import path, pixel
+from pathjax.integrators.options import Options
+from pathjax.integrators.random_numbers import bounce_numbers
+from pathjax.scene.scene import Scene
+
+
+def changes(record: Record, v: Float[Array, "M 3"]) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
+    """What v does to Le + n and to w of a vertex. v: the list of changes, as `places` orders it."""
+    now = later = jnp.zeros_like(record.weight)
+    for slot in record.slots:
+        shares = slot.shares or (1,)
+        change = sum(share * at(v, place) for place, share in zip(slot.places, shares, strict=True))
+        change = luminance(change) if slot.is_number else change
+        now = now + slot.now * change
+        if slot.later is not None:
+            later = later + slot.later * change
+    return now, later
+
+
+def pixel_change(
+    work: pixel.Work,
+    scene: Scene,
+    choice: Choice | None,
+    v: Float[Array, "M 3"],
+    *,
+    options: Options,
+    slots: places.Slots,
+    paths: places.Paths,
+) -> Float[Array, "3"]:
+    """What v does to the mean of a pixel."""
+    pixel_number, first_sample, spp, seed = work
+    stream = sampler.pixel_stream(seed, pixel_number)
+    zero = jnp.zeros((3,), scene.camera.origin.dtype)
+
+    def step(state):
+        number, passed, now, weight, b, sums = state
+        b = jnp.where(now.alive, b, 0)
+        now, weight = pixel.begun(scene, pixel_number, stream, number, now, weight, options)
+        u = bounce_numbers(scene, stream, number, path.vertices(now), options.sampler)
+        on, record, itself = extend(scene, choice, now, u, options, slots, paths, jnp.ones_like(zero), passed)
+        gain, later = changes(record, v)
+        sums = pixel.add_compensated(sums, compute_once(weight * (b * record.gathered + gain)))
+        b = b * record.weight + later
+        if slots.of_passed:
+            passed, on = jnp.where(itself, 0, passed + 1), jax.tree.map(partial(jnp.where, itself), on, now)
+        return number + jnp.where(on.alive, 0, 1).astype(number.dtype), passed, on, weight, b, sums
+
+    state = first_sample, jnp.int32(0), *pixel.no_path(scene, options), zero, (zero, zero)
+    *_, (total, _) = persistent_loop(lambda state: state[0] != first_sample + spp, step, state)
+    return total / jnp.maximum(spp, 1).astype(total.dtype)
+
+
+@partial(jax.jit, static_argnames=("paths", "options", "form", "devices"))
+def push(
+    scene: Scene, changed, pixels, first_sample, spp, seed, *, paths, options: Options, form=None, devices=None
+) -> Float[Array, "N 3"]:
+    """J v of the means of pixels.
+
+    Args:
+        scene: without names.
+        changed: v, of each of the arrays, of its shape.
+        pixels, first_sample, spp, seed: (N,) each.
+        paths: of the arrays, which `places` knows.
+        form, devices: of `native_map`.
+    """
+    scene = options.applied(scene)
+    choice = emitters.choice(scene.emitters, options.strategy)
+    slots = places.slots(scene, paths)
+
+    def entries(path, array):
+        array = array.reshape(places.count(scene, path), -1)
+        return jnp.broadcast_to(array, (len(array), 3))
+
+    rows = list(map(entries, paths, changed))
+    # Of one array alone no copy is made, as it may be large.
+    v = rows[0] if len(rows) == 1 else jnp.concatenate(rows)
+    of_pixel = partial(pixel_change, options=options, slots=slots, paths=paths)
+    work = pixels, first_sample, spp, seed
+    return native_map(of_pixel, work, scene, choice, v, form=form, devices=devices)
