@@ -27,7 +27,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from pathjax import emitters
+from pathjax import bsdfs, emitters
 from pathjax.compile import compute_once, native_fold, native_rows, persistent_loop, together
 from pathjax.compile.lanes import flags
 from pathjax.core import sampler
@@ -188,8 +188,9 @@ def start(scene: Scene, record: Record, entries: int, lanes: int) -> Memory:
 
 def ring_size(scene: Scene) -> Int[Array, ""]:
     """Power of 2 that holds the longest path and a window, as far as that is known; RING at most."""
-    if scene.free_passes or scene.hide_emitters:  # what does not count into depth has no bound
-        return jnp.int32(RING)
+    passes = scene.media is not None or bsdfs.occurs(scene.materials, "passes")
+    if passes or scene.free_passes or scene.hide_emitters:
+        return jnp.int32(RING)  # what is passed has records too, and does not count into depth
     sizes = [1 << k for k in range(RING.bit_length())]
     wanted = jnp.minimum(scene.max_depth, RING) + WINDOW
     return jnp.min(jnp.where(jnp.array(sizes) >= wanted, jnp.array(sizes), RING)).astype(jnp.int32)
