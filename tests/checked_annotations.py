@@ -86,7 +86,7 @@ def trace(pj, file: Path) -> None:
     scene = pj.load_scene(file, res=4)
     jax.eval_shape(lambda scene: pj.render(scene, spp=1), scene)
     # A Jacobian has no textures.
-    names = [name for name, values in pj.parameters(scene).items() if values.ndim < 3]
+    names = [name for name, parameter in scene.about.parameters.items() if not parameter.is_texture]
     jax.eval_shape(lambda scene: tuple(pj.jacobian(scene, names, spp=1)), scene)
     jax.eval_shape(lambda scene: pj.render_bounces(scene, depth=2, spp=4), scene)
     jax.eval_shape(lambda scene: pj.closest_hit(scene, jnp.zeros((2, 3)), jnp.ones((2, 3))), scene)
