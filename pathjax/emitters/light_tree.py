@@ -28,7 +28,7 @@ FEWEST = 9
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class LightTree:
-    nodes: Float[Array, "2L 5"]  # middle, squared radius, power; children of k are 2 k and 2 k + 1; the first is unused
+    nodes: Float[Array, "N 5"]  # middle, squared radius, power; children of k are 2 k and 2 k + 1; the first is unused
     leaf: Int[Array, " K"]  # of each light, from 0
     light: Int[Array, " L"]  # of each leaf; -1: none
     levels: int = field(metadata={"static": True})
