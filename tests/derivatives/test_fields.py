@@ -12,6 +12,8 @@ from pathjax.scene import parameters as named
 from pathjax.sensors.film import pixel_count
 
 SPP, SEED = 4, 3
+# Of pictures that shine on little of what is seen.
+MANY = 64
 
 
 def place(*steps):
@@ -142,7 +144,7 @@ def test_a_sweep_is_the_transpose_of_tangents(x64, things, strategy):
             wanted = each.about.parameters
             assert all(matrix_free.is_swept(each, parameter) for parameter in wanted.values())
             pixels, bare, random = jnp.arange(pixel_count(each.film)), named.nameless(each), np.random.default_rng(0)
-            work = pixels.astype(jnp.int32), 0, SPP, SEED, Options(strategy)
+            work = pixels.astype(jnp.int32), 0, MANY, SEED, Options(strategy)
             v = random.normal(size=(len(pixels), 3))
             pulled = matrix_free.pull(bare, wanted, jnp.asarray(v), *work)
             for name, parameter in wanted.items():
