@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Real
 
-from pathjax import bsdfs, emitters, media
+from pathjax import bsdfs, emitters
 from pathjax.compile import compute_once
 from pathjax.core.math import spawn_ray
 from pathjax.core.types import EmitterSample
@@ -14,7 +14,7 @@ from pathjax.emitters import Choice
 from pathjax.integrators.options import Options
 from pathjax.integrators.random_numbers import Bounce
 from pathjax.integrators.shadow import Passed, none_passed, transmitted
-from pathjax.integrators.vertex import Vertex, evaluate, is_smooth
+from pathjax.integrators.vertex import Vertex, evaluate, is_smooth, leaving
 from pathjax.scene.scene import Scene
 from pathjax.shapes import geometry
 
@@ -79,9 +79,7 @@ def light_sample(
         reach = jnp.where(useful, drawn.distance, -1)
         shadow_ray = spawn_ray(vertex.surface, drawn.d, vertex.hit.primitive)._replace(t_max=reach)
         if passes or medium is not None:
-            most, start = scene.max_depth - 1 - depth, medium
-            if medium is not None:
-                start = media.beyond(scene.media, medium, vertex.hit.shape, vertex.surface.n, drawn.d)
+            most, start = scene.max_depth - 1 - depth, leaving(scene, vertex, medium, drawn.d)
             found = transmitted(scene, shadow_ray, drawn.primitive, most, options.derivative, start)
             share, passed, nudged = found
             return jnp.where(useful, contribution * share, 0), passed if passes else None, nudged

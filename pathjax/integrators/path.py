@@ -30,7 +30,7 @@ from pathjax.integrators import next_event, roulette, splitting
 from pathjax.integrators.options import Options
 from pathjax.integrators.random_numbers import Bounce
 from pathjax.integrators.shadow import Passed
-from pathjax.integrators.vertex import Vertex, sample, vertex, within
+from pathjax.integrators.vertex import Vertex, leaving, sample, vertex, within
 from pathjax.scene.scene import Scene
 from pathjax.shapes import geometry
 
@@ -165,7 +165,7 @@ def onward(
     if scene.hide_emitters:
         # What emits lets camera rays through, as in Mitsuba.
         beyond = spawn_ray(here.surface, ray.d, hit.primitive)._replace(t_max=ray.t_max - hit.t)
-        through = path._replace(ray=beyond, depth=jnp.int32(0), medium=_beyond(scene, path, here, ray.d))
+        through = path._replace(ray=beyond, depth=jnp.int32(0), medium=leaving(scene, here, path.medium, ray.d))
         hidden = first & geometry.emits(scene.geometry, hit)
         path = lax.cond(hidden, lambda path: through, lambda path: lax.cond(goes_on, go_on, _ended, path), path)
     else:
@@ -247,7 +247,7 @@ def scatter(
         pdf=jnp.where(drawn.delta, jnp.inf, drawn.pdf),
         alive=carries & (u.roulette < survival),
         passive=passive,
-        medium=_beyond(scene, path, here, d),
+        medium=leaving(scene, here, path.medium, d),
     )
     if path.origin is not None:
         passes = bsdfs.has(scene.materials, here.kind, "passes")
@@ -261,13 +261,6 @@ def _met(scene, hit, here):
     """Whether the path has a vertex."""
     found = hit.primitive >= 0
     return found | here.scattered if scene.scatters else found
-
-
-def _beyond(scene, path, here, d):
-    """The medium in which a path goes on that leaves the vertex in the direction d."""
-    if path.medium is None:
-        return None
-    return media.beyond(scene.media, path.medium, here.hit.shape, here.surface.n, d)
 
 
 def _ended(path: Path) -> Path:

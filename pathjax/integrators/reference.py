@@ -30,7 +30,7 @@ from pathjax.emitters import Choice
 from pathjax.integrators.pixel import camera_ray
 from pathjax.integrators.random_numbers import Bounce, bounce_numbers
 from pathjax.integrators.shadow import transmitted
-from pathjax.integrators.vertex import Vertex, evaluate, is_smooth, sample, vertex, within
+from pathjax.integrators.vertex import Vertex, evaluate, is_smooth, leaving, sample, vertex, within
 from pathjax.scene.scene import Scene
 from pathjax.sensors import film
 from pathjax.shapes import geometry
@@ -72,7 +72,7 @@ def radiance(scene: Scene, choice: Choice | None, ray: Ray, numbers: Callable) -
             f, pdf_bsdf = evaluate(scene, here, light.d)
             shadow_ray = spawn_ray(here.surface, light.d, hit.primitive)._replace(t_max=light.distance)
             lit = goes_on & is_smooth(scene, here) & (light.pdf > 0) & (pdf_bsdf > 0)
-            start, most = beyond(scene, medium, here, light.d), scene.max_depth - 1 - depth
+            start, most = leaving(scene, here, medium, light.d), scene.max_depth - 1 - depth
             arrives, *_ = transmitted(scene, shadow_ray, light.primitive, most, False, start)
             direct = f * light.Le / jnp.where(lit, light.pdf, 1) * share(jnp.where(lit, light.density, 1), pdf_bsdf)
             L = L + jnp.where(lit, throughput * arrives * direct, 0)
@@ -87,7 +87,7 @@ def radiance(scene: Scene, choice: Choice | None, ray: Ray, numbers: Callable) -
         # What goes straight on comes from where it came from.
         pdf = jnp.where(passes, pdf, jnp.where(drawn.delta, jnp.inf, drawn.pdf))
         origin = jnp.where(passes, origin, here.surface.p)
-        ray, medium = spawn_ray(here.surface, d, hit.primitive), beyond(scene, medium, here, d)
+        ray, medium = spawn_ray(here.surface, d, hit.primitive), leaving(scene, here, medium, d)
         return ray, L, throughput / survival, pdf, origin, passive, medium, depth, passed, alive
 
     zero, one, none = jnp.zeros_like(ray.o), jnp.ones_like(ray.t_max), jnp.int32(0)
@@ -111,13 +111,6 @@ def meet(
         return here, jnp.ones_like(throughput)
     way, scattered = jnp.minimum(here.hit.t, ray.t_max), here.scattered if scene.scatters else None
     return here, media.flight_weight(scene.media, medium, throughput, way, scattered)
-
-
-def beyond(scene: Scene, medium: Int[Array, ""] | None, here: Vertex, d: Float[Array, "3"]) -> Int[Array, ""] | None:
-    """The medium in which a ray leaves a vertex in the direction d; None in scenes without media."""
-    if medium is None:
-        return None
-    return media.beyond(scene.media, medium, here.hit.shape, here.surface.n, d)
 
 
 def share(pdf: Float[Array, ""], other_pdf: Float[Array, ""]) -> Float[Array, ""]:

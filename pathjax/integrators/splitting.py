@@ -12,9 +12,9 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from pathjax import bsdfs, media
+from pathjax import bsdfs
 from pathjax.core.math import at, spawn_ray
-from pathjax.integrators.vertex import Vertex, sample
+from pathjax.integrators.vertex import Vertex, leaving, sample
 from pathjax.scene.scene import Scene
 
 
@@ -44,10 +44,8 @@ def split(scene: Scene, here: Vertex, u: Float[Array, " numbers"], splits: Bool[
             throughput=path.throughput * other.weight * other.pdf,  # roulette comes at the next vertex
             passive=path.passive * other.passive,
             alive=other.pdf > 0,
+            medium=leaving(scene, here, path.medium, d),
         )
-        if path.medium is not None:
-            shape, n = here.hit.shape, here.surface.n
-            branch = branch._replace(medium=media.beyond(scene.media, path.medium, shape, n, d))
         return _push(on, branch)
 
     on = on._replace(splits=path.splits - splits.astype(jnp.int32))

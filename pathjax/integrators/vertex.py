@@ -85,6 +85,18 @@ def within(here: Vertex, ray: Ray, medium: Int[Array, ""], distance: Float[Array
     )
 
 
+def leaving(
+    scene: Scene, here: Vertex, medium: Int[Array, ""] | None, d: Float[Array, "3"]
+) -> Int[Array, ""] | None:
+    """The medium in which light goes on that came in `medium` and leaves a vertex in the direction d.
+
+    None in scenes without media.
+    """
+    if medium is None:
+        return None
+    return media.beyond(scene.media, medium, here.hit.shape, here.surface.n, d)
+
+
 def is_smooth(scene: Scene, here: Vertex) -> Bool[Array, ""]:
     """Whether what scatters at a vertex has a density."""
     smooth = bsdfs.has(scene.materials, here.kind, "smooth")
