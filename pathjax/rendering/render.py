@@ -13,7 +13,7 @@ from pathjax import emitters
 from pathjax.compile import usual_promotion
 from pathjax.core.types import Number
 from pathjax.derivatives import matrix_free
-from pathjax.derivatives.jacobian import pixel_jacobians
+from pathjax.derivatives.jacobian import MOST_TANGENTS, pixel_jacobians
 from pathjax.derivatives.rules import estimate
 from pathjax.errors import InputError
 from pathjax.integrators import pixel
@@ -21,9 +21,6 @@ from pathjax.integrators.options import DEFAULTS, Options
 from pathjax.integrators.reconstruction import map_pixels
 from pathjax.scene.scene import Scene
 from pathjax.sensors import film
-
-# Up to so many colours derivatives go through the Jacobian, which is made in one pass with the image.
-MOST_TANGENTS = 8
 
 
 @usual_promotion
