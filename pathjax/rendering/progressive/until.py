@@ -128,10 +128,10 @@ class Render:
     def _agree(self) -> None:
         """Begin where the first process does, who alone needs to see the checkpoint."""
         state = self.state
-        facts = np.array([state.spp, state.seconds], np.float32)
-        facts, state.means = distributed.of_first((facts, state.means))
+        facts = np.int32(state.spp), np.float32(state.seconds)
+        (spp, seconds), state.means = distributed.of_first((facts, state.means))
         state.take(distributed.of_first(state.arrays()))
-        state.spp, state.seconds = int(facts[0]), float(facts[1])
+        state.spp, state.seconds = int(spp), float(seconds)
 
     def compile(self) -> None:
         started = time.perf_counter()
