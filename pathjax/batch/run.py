@@ -49,7 +49,7 @@ def render_batch(
     part: tuple[int, int] = (0, 1),
     progress: bool | Callable[[Outcome], None] = False,
 ) -> list[Outcome]:
-    """Render many scenes to image files; those of one structure share a kernel, whatever they hold how many of.
+    """Render many scenes to image files. Those of one structure share a kernel, however many triangles each has.
 
     Images are those that `render_until` gives with the limits of the job, bit for bit. An output that exists is kept,
     and its job skipped, so that a batch which was stopped, or killed, goes on when it is called again; outputs appear

@@ -53,11 +53,11 @@ class Products:
         self.draws += 1
         return jnp.uint32(self.draws)
 
-    def images(self, values: np.ndarray, spp: int, draw, half: int = 0) -> np.ndarray:
+    def images(self, values: np.ndarray, spp: int, draw) -> np.ndarray:
         """(N, 3), exposed."""
         found = np.zeros((self.count + 1, 3))
         for views, pixels, places in self.parts:
-            found[places] = self._run(_image, values, views, pixels, spp, draw, half)
+            found[places] = self._run(_image, values, views, pixels, spp, draw)
         return found[:-1]
 
     def push(self, values: np.ndarray, change: np.ndarray, spp: int, draw) -> np.ndarray:
@@ -65,7 +65,7 @@ class Products:
         found = np.zeros((self.count + 1, 3))
         change = jnp.asarray(change, self.dtype)
         for views, pixels, places in self.parts:
-            found[places] = self._run(_push, values, views, pixels, spp, draw, 0, change)
+            found[places] = self._run(_push, values, views, pixels, spp, draw, change)
         return found[:-1]
 
     def pull(self, values: np.ndarray, adjoint: np.ndarray, spp: int, draw) -> np.ndarray:
@@ -74,15 +74,15 @@ class Products:
         total = np.zeros(len(values))
         for views, pixels, places in self.parts:
             mine = jnp.asarray(padded[places], self.dtype)
-            total += self._run(_pull, values, views, pixels, spp, draw, 0, mine)
+            total += self._run(_pull, values, views, pixels, spp, draw, mine)
         return total
 
-    def spread(self, kept: np.ndarray, other: float = 0.0) -> list[np.ndarray]:
-        """(N, C) of the kept pixels to (H, W, C) of each view, with `other` elsewhere."""
+    def spread(self, kept: np.ndarray) -> list[np.ndarray]:
+        """(N, C) of the kept pixels to (H, W, C) of each view, with 0 elsewhere."""
         parts = np.split(kept, np.cumsum([int(mask.sum()) for mask in self.masks])[:-1])
         images = []
         for mask, part in zip(self.masks, parts, strict=True):
-            image = np.full((*mask.shape, kept.shape[1]), other)
+            image = np.zeros((*mask.shape, kept.shape[1]))
             image[mask] = part
             images.append(image)
         return images
@@ -91,9 +91,9 @@ class Products:
         """The inverse of `spread`."""
         return np.concatenate([image[mask] for image, mask in zip(by_view, self.masks, strict=True)])
 
-    def _run(self, function: Callable, values, views: Views, pixels, spp: int, draw, half: int, *more):
+    def _run(self, function: Callable, values, views: Views, pixels, spp: int, draw, *more):
         values = jnp.asarray(values, self.dtype)
-        arguments = values, views, pixels, jnp.uint32(spp), views.seeds(self.seed, draw, half), *more
+        arguments = values, views, pixels, jnp.uint32(spp), views.seeds(self.seed, draw, 0), *more
         bound = partial(function, vector=self.vector)
         program, seconds = compiled((function, self.vector), lambda *a: jax.jit(bound).lower(*a).compile(), *arguments)
         self.compile_seconds += seconds
