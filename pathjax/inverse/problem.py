@@ -116,7 +116,7 @@ def build(scene, target, names, start) -> Problem:
         raise InputError(f"{next(n for n in names if names.count(n) > 1)} is named twice")
     values, found = {}, {}
     for name in names:
-        holder = next((s for s in scenes if name in named.about(s).parameters), scenes[0])
+        holder = next((s for s in scenes if name in s.described.parameters), scenes[0])
         found[name] = named.find(holder, name)
         values[name] = named.parameters(holder)[name]
     for name, value in start.items():
@@ -125,7 +125,7 @@ def build(scene, target, names, start) -> Problem:
         dtype = scenes[0].camera.origin.dtype
         values[name] = named.checked(f"start of {name}:", value, found[name], dtype)
     for each in scenes:
-        held = {name: parameter for name, parameter in found.items() if name in named.about(each).parameters}
+        held = {name: parameter for name, parameter in found.items() if name in each.described.parameters}
         named.refuse_constant(Problem.with_values(each, values), held)
     targets = [_target(s, t, i, len(scenes)) for i, (s, t) in enumerate(zip(scenes, targets, strict=True))]
     vector = ParameterVector(tuple(found.items()))

@@ -17,7 +17,6 @@ from pathjax.compile import is_traced
 from pathjax.errors import InputError, InputWarning
 from pathjax.io.mitsuba import loader, writer
 from pathjax.scene.builder import build, seen
-from pathjax.scene.parameters import about
 from pathjax.scene.parameters import parameters as parameters_of
 from pathjax.scene.scene import Scene
 
@@ -88,7 +87,7 @@ def save_scene(scene: Scene, file: str | os.PathLike) -> list[Path]:
     values = parameters_of(scene)
     if any(is_traced(value) for value in values.values()):
         raise InputError(f"{file}: the scene's parameters are traced; save it outside of jit and derivatives")
-    known = about(scene).description
+    known = scene.described.description
     if known.document is None:
         raise InputError(f"{file}: the scene was built from records; what load_scene and load_dict return can be saved")
     for name, value in seen(known, scene.camera.origin.dtype).items():

@@ -16,7 +16,6 @@ from jax.typing import ArrayLike
 from pathjax.compile import is_traced, usual_promotion
 from pathjax.errors import InputError
 from pathjax.kinds.parameter import Parameter
-from pathjax.scene.metadata import About
 from pathjax.scene.scene import Scene
 
 
@@ -24,7 +23,7 @@ from pathjax.scene.scene import Scene
 def parameters(scene: Scene) -> dict[str, jax.Array]:
     """Return all parameters of the scene by name, `ID.field`."""
     scene = attached(scene)
-    return {name: p.get(get(scene, p.path)) for name, p in about(scene).parameters.items()}
+    return {name: p.get(get(scene, p.path)) for name, p in scene.described.parameters.items()}
 
 
 @usual_promotion
@@ -43,13 +42,13 @@ def with_parameters(scene: Scene, values: Mapping[str, ArrayLike | Sequence[floa
         varied.pop(name, None)
         if is_traced(value):
             varied[name] = value
-        scene = with_values(scene, {name: lax.stop_gradient(value)}, about(scene).parameters)
+        scene = with_values(scene, {name: lax.stop_gradient(value)}, scene.described.parameters)
     return replace(scene, varied=varied)
 
 
 def attached(scene: Scene) -> Scene:
     """The scene whose tables carry the derivatives of `varied`: for what is differentiated by way of the tables."""
-    return with_values(scene, scene.varied, about(scene).parameters) if scene.varied else scene
+    return with_values(scene, scene.varied, scene.described.parameters) if scene.varied else scene
 
 
 def with_values(scene: Scene, values: Mapping[str, jax.Array], parameters: Mapping[str, Parameter]) -> Scene:
@@ -76,12 +75,8 @@ def nameless(scene: Scene) -> Scene:
     return replace(scene, about=None, varied={})
 
 
-def about(scene: Scene) -> About:
-    return scene.described
-
-
 def find(scene: Scene, name: str) -> Parameter:
-    known = about(scene)
+    known = scene.described
     if name in known.parameters:
         return known.parameters[name]
     if name in known.refused:
