@@ -16,7 +16,7 @@ from pathjax.compile import native
 from pathjax.compile.lanes import lanes
 from pathjax.compile.lanes.interpreter import Interpreter
 from pathjax.compile.lanes.scheduling import from_queue
-from pathjax.derivatives import ior_step, jacobian, record, tangents
+from pathjax.derivatives import backward, ior_step, jacobian, tangents
 from pathjax.integrators import pixel
 from pathjax.integrators.options import DEFAULTS, Options
 from pathjax.rendering import aovs, bounces, query
@@ -148,7 +148,7 @@ def test_a_sweep_is_native(shipped):
     paths = tuple({parameter.path for parameter in scene.about.parameters.values()})
     options = Options(derivative=True, by_vertex=True)
     work = jnp.ones((len(pixels), 3)), pixels, *pixel.numbers(pixels, 0, 4, 1)
-    text = record.pullback.lower(named.nameless(scene), *work, paths=paths, options=options).compile().as_text()
+    text = backward.pullback.lower(named.nameless(scene), *work, paths=paths, options=options).compile().as_text()
     entry = text[text.index("\nENTRY ") :]
     assert entry.count("xla_cpu_small_call") == 2 and " while(" not in entry
 

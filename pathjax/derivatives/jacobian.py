@@ -1,9 +1,9 @@
 """Image and Jacobian: how every pixel changes with the parameters of materials and lights.
 
 Colours (reflectances, radiances, a metal's eta and k) change what paths carry, not where they go: the derivative is
-that of the weights (detached sampling), unbiased (`tangents`; of many colours `record`). The IOR of smooth glass moves
-the path itself, which takes differences (`ior_difference`). No general derivative exists here for moving geometry or
-cameras.
+that of the weights (detached sampling), unbiased (`tangents`; of many colours `backward`). The IOR of smooth glass
+moves the path itself, which takes differences (`ior_difference`). No general derivative exists here for moving geometry
+or cameras.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from pathjax import emitters
 from pathjax.bsdfs import dielectric
 from pathjax.compile import is_traced, native, usual_promotion
 from pathjax.core.types import Number
-from pathjax.derivatives import ior, ior_difference, ior_step, places, record, rules, tangents
+from pathjax.derivatives import backward, ior, ior_difference, ior_step, places, rules, tangents
 from pathjax.errors import InputError
 from pathjax.integrators import pixel
 from pathjax.integrators.options import Counts, Options
@@ -204,7 +204,7 @@ def _swept(scene, wanted, pixels, numbers, options, form=None, devices=None):
     options = replace(options, derivative=True, by_vertex=True)
     paths = tuple(dict.fromkeys(parameter.path for parameter in wanted.values()))
     first, _ = places.firsts(scene, paths)
-    image, found = record.rows(scene, pixels, *numbers, paths=paths, options=options, devices=devices)
+    image, found = backward.rows(scene, pixels, *numbers, paths=paths, options=options, devices=devices)
     columns = {name: first[parameter.path] + parameter.index[0] for name, parameter in wanted.items()}
     return image, {name: tangents.by_channel(found[:, column]) for name, column in columns.items()}
 

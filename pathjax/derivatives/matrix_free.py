@@ -1,6 +1,6 @@
 """J v and J^T v of the means of pixels, without J: each at the price of about one image, whatever the size of v.
 
-J v goes along with paths (`forward`), J^T v comes by a recorded sweep when they have ended (`record`).
+J v goes along with paths (`forward`), J^T v comes by a recorded sweep when they have ended (`backward`).
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from pathjax.compile import usual_promotion
-from pathjax.derivatives import forward, places, record
+from pathjax.derivatives import backward, forward, places
 from pathjax.integrators import pixel
 from pathjax.integrators.options import Counts, Options
 from pathjax.kinds.parameter import Parameter
@@ -59,7 +59,7 @@ def pull(
     paths = _paths(wanted)
     numbers = pixel.numbers(pixels, first_sample, spp, seed)
     options = replace(options, derivative=True, by_vertex=True)
-    arrays = record.pullback(scene, adjoint, pixels, *numbers, paths=paths, options=options, devices=devices)
+    arrays = backward.pullback(scene, adjoint, pixels, *numbers, paths=paths, options=options, devices=devices)
     by_path = dict(zip(paths, arrays, strict=True))
     return {name: parameter.transposed(by_path[parameter.path]) for name, parameter in wanted.items()}
 

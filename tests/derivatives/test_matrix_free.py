@@ -10,7 +10,7 @@ import pytest
 
 import pathjax as pj
 from pathjax.compile import mapping
-from pathjax.derivatives import jacobian, matrix_free, record
+from pathjax.derivatives import backward, jacobian, matrix_free
 from pathjax.images import write_exr
 from pathjax.integrators.options import Options
 from pathjax.scene import parameters as named
@@ -195,7 +195,7 @@ def test_a_jacobian_in_many_colours_is_that_by_tangents(make_scene, monkeypatch)
 def test_sums_are_bitwise_the_same_on_any_number_of_devices(room, monkeypatch):
     monkeypatch.setattr(mapping, "ITEMS_OF_A_PART", 24)  # three parts of an image
     scene, v = limited(room(), 6, 3), jnp.ones((RES * RES, 3))
-    record.pullback.clear_cache()  # of other parts
+    backward.pullback.clear_cache()  # of other parts
     one, many = (parts(scene, devices=devices)[2](v) for devices in (1, None))
     for name in one:
         np.testing.assert_array_equal(one[name], many[name])
@@ -257,11 +257,11 @@ def test_what_takes_a_derivative_of_each_number_refuses_textures(screen):
 def test_a_path_longer_than_the_ring_is_told(screen, monkeypatch, ring, lost):
     """Rather nan than a derivative that lacks something. Paths have two vertices, and each trip is swept."""
     texels, image = pj.parameters(screen)[NAME], image_of(limited(screen, 5, NO_LIMIT))
-    monkeypatch.setattr(record, "RING", ring)
-    monkeypatch.setattr(record, "WINDOW", 1)
-    record.pullback.clear_cache()
+    monkeypatch.setattr(backward, "RING", ring)
+    monkeypatch.setattr(backward, "WINDOW", 1)
+    backward.pullback.clear_cache()
     try:
         found = np.isnan(jax.grad(lambda x: image(x).sum())(texels))
     finally:
-        record.pullback.clear_cache()
+        backward.pullback.clear_cache()
     assert found.all() if lost else not found.any()

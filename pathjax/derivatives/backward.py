@@ -1,0 +1,325 @@
+"""J^T v, and J in many colours, at the price of about one image, whatever the number of parameters: a recorded sweep.
+
+A path's derivative has entries at the parameters of the vertices that it meets, and nowhere else. So each vertex is
+recorded as it is met (`record`, which has the equations), and when the path has ended its vertices are gone through
+again, the last one first. Times the adjoint of the pixel these are added to a list of derivatives, at the entries that
+the vertex looked up (`places`): one list for all pixels, or, without an adjoint, one for each.
+
+All lanes record at once, in one row of a ring of buffers, and are swept at once, every WINDOW trips: back from the last
+end of a path that they have recorded to the first vertex of a path that was swept before.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from pathjax import bsdfs, emitters
+from pathjax.compile import compute_once, native_fold, native_rows, persistent_loop, together
+from pathjax.compile.lanes import flags
+from pathjax.core import sampler
+from pathjax.core.math import LUMINANCE, at
+from pathjax.derivatives import places
+from pathjax.derivatives.record import Record, Slot, extend
+from pathjax.emitters import Choice
+from pathjax.integrators import path, pixel
+from pathjax.integrators.options import Options
+from pathjax.integrators.random_numbers import bounce_numbers
+from pathjax.scene import parameters as named
+from pathjax.scene.scene import Scene
+
+# Trips between two sweeps, and those that the ring holds at most, a power of 2. A path of more than the difference is
+# not recorded whole, and makes the derivatives NaN: one in 1e20, if roulette ends paths.
+WINDOW, RING = 32, 1024
+# Entries of a list that every lane sums up by itself.
+FEW = 8
+
+# Bits of what a lane records.
+BEGINS, ENDS, HOLDS = 1, 2, 4
+
+
+def columns_of(record: Record) -> list:
+    """Its numbers, one after another, the two flags in one."""
+    bits = jnp.where(record.begins, BEGINS, 0) | jnp.where(record.ends, ENDS, 0)
+    numbers = [x for leaf in jax.tree.leaves(record._replace(begins=None, ends=None)) for x in jnp.ravel(leaf)]
+    return [bits, *numbers]
+
+
+# ---- the memory that lanes share ------------------------------------------------------------------------------------
+
+
+class Memory(NamedTuple):
+    total: list[Float[Array, " W"]] | Float[Array, "M 3"]  # of few entries, a column for each; or the list
+    clock: Int[Array, ""]  # trips
+    swept: Int[Array, ""]  # trips before the last sweep
+    lost: Int[Array, ""]  # 1: a path was longer than the ring
+    size: Int[Array, ""]  # trips that are used of the ring: few stay in near caches
+    ring: list  # of each number of a Record, (RING, W)
+
+
+class Sweep(NamedTuple):
+    """What goes back through the ring, of each lane."""
+
+    back: Int[Array, ""]  # trips so far
+    goes_on: Bool[Array, ""]
+    complete: Int[Array, " W"]  # 1: has met the end of a path, so that it knows what arrives
+    stopped: Int[Array, " W"]  # 1: all that is older has been swept before
+    R: list[Float[Array, " W"]]
+    total: list[Float[Array, " W"]] | Float[Array, "M 3"]
+
+
+def start(scene: Scene, record: Record, entries: int, lanes: int) -> Memory:
+    """record: of shapes and dtypes."""
+    dtype = scene.camera.origin.dtype
+    few = entries <= FEW
+    total = [jnp.zeros((lanes,), dtype)] * (3 * entries) if few else jnp.zeros((entries, 3), dtype)
+    # No trip is read that was not written.
+    ring = [lax.empty((RING, lanes), x.dtype) for x in jax.eval_shape(columns_of, record)]
+    zero = jnp.int32(0)
+    return Memory(total, zero, zero, zero, ring_size(scene), ring)
+
+
+def ring_size(scene: Scene) -> Int[Array, ""]:
+    """Power of 2 that holds the longest path and a window, as far as that is known; RING at most."""
+    passes = scene.media is not None or bsdfs.occurs(scene.materials, "passes")
+    if passes or scene.free_passes or scene.hide_emitters:
+        return jnp.int32(RING)  # what is passed has records too, and does not count into depth
+    sizes = [1 << k for k in range(RING.bit_length())]
+    wanted = jnp.minimum(scene.max_depth, RING) + WINDOW
+    return jnp.min(jnp.where(jnp.array(sizes) >= wanted, jnp.array(sizes), RING)).astype(jnp.int32)
+
+
+def remember(structure: Record, memory: Memory, here: Bool[Array, " W"], columns: list) -> Memory:
+    """Record a vertex of every lane; now and then, sweep."""
+    bits, *numbers = columns
+    # A lane without an item records nothing that is whole.
+    columns = [jnp.where(here, bits | HOLDS, BEGINS | ENDS), *numbers]
+    ring = _with_row(memory.ring, memory.clock & (memory.size - 1), columns)
+    memory = memory._replace(clock=memory.clock + 1, ring=ring)
+    return sweep(structure, memory, memory.clock - memory.swept >= WINDOW)
+
+
+def _with_row(ring: list, row: Int[Array, ""], columns: list) -> list:
+    def put(buffer, x):
+        return lax.dynamic_update_slice(buffer, x[None], (row, jnp.int32(0)), allow_negative_indices=False)
+
+    return list(map(put, ring, columns))
+
+
+def _row(ring: list, row: Int[Array, ""]) -> list:
+    return [lax.dynamic_index_in_dim(x, row, keepdims=False, allow_negative_indices=False) for x in ring]
+
+
+def sweep(structure: Record, memory: Memory, due: Bool[Array, ""]) -> Memory:
+    """Add what all paths give that have ended since the last sweep, if it is due."""
+    window = jnp.where(due, memory.clock - memory.swept, 0)
+
+    def step(state: Sweep) -> Sweep:
+        bits, *numbers = _row(memory.ring, (memory.clock - 1 - state.back) & (memory.size - 1))
+        record = unflattened(structure, numbers)
+        begins, ends, holds = (bits & bit != 0 for bit in (BEGINS, ENDS, HOLDS))
+        complete = (state.complete != 0) | ends
+        here = complete & (state.stopped == 0) & holds
+        # What is not finite in one path stays out of the one before.
+        R = [jnp.where(ends, 0, x) for x in state.R]
+        total = state.total
+        for slot in record.slots:
+            change = slot.now
+            if slot.later is not None:
+                change = [a + b * x for a, b, x in zip(slot.now, slot.later, R, strict=True)]
+            if slot.is_number:
+                change = [sum(change) * share for share in LUMINANCE]
+            total = add(total, slot, [jnp.where(here, x, 0) for x in change])
+        R = [n + w * x for n, w, x in zip(record.gathered, record.weight, R, strict=True)]
+        back = state.back + 1
+        stopped = (state.stopped != 0) | ((back >= window) & (begins | ~complete))
+        goes_on = (back < window) | ((back < memory.size) & ~all_set(stopped))
+        return Sweep(back, goes_on, complete.astype(jnp.int32), stopped.astype(jnp.int32), R, total)
+
+    nothing = jnp.zeros((memory.ring[0].shape[1],), jnp.int32)
+    zeros = [jnp.zeros(nothing.shape, structure.weight.dtype)] * 3
+    first = Sweep(jnp.int32(0), window > 0, nothing, nothing, zeros, memory.total)
+    last = lax.while_loop(lambda state: state.goes_on, step, first)
+    # At the end there may be nothing left to sweep.
+    lost = memory.lost | jnp.where((window > 0) & ~all_set(last.stopped != 0), 1, 0)
+    return memory._replace(total=last.total, swept=jnp.where(due, memory.clock, memory.swept), lost=lost)
+
+
+def unflattened(structure: Record, numbers: list) -> Record:
+    """The Record whose numbers these are, each vector as a list."""
+    following = iter(numbers)
+
+    def taken(leaf):
+        return [next(following) for _ in range(leaf.size)] if leaf.shape else next(following)
+
+    return jax.tree.map(taken, structure._replace(begins=None, ends=None))
+
+
+def add(total, slot: Slot, change: list[Float[Array, " W"]]):
+    """The total to which each lane's change (3) is added."""
+    if isinstance(total, list):
+        for place, share in zip(slot.places, slot.shares or [None], strict=True):
+            total = [t + jnp.where(place == k // 3, _part(change, share)[k % 3], 0) for k, t in enumerate(total)]
+        return total
+
+    # XLA's own scatter would break the native kernel; a lane that adds nothing adds 0.
+    def one(lane, total):
+        of_lane = partial(jax.tree.map, lambda column: at(column, lane))
+        x = of_lane(change)
+        for place, share in of_lane(list(zip(slot.places, slot.shares or [None], strict=True))):
+            new = at(total, place) + jnp.stack(_part(x, share))
+            total = lax.dynamic_update_slice(total, new[None], (place, jnp.int32(0)), allow_negative_indices=False)
+        return total
+
+    return lax.fori_loop(0, len(change[0]), one, total)
+
+
+def _part(change, share):
+    """Of three numbers the share, which is one, or one of each; None: all."""
+    if share is None:
+        return change
+    return [s * x for s, x in zip(share if isinstance(share, list) else [share] * 3, change, strict=True)]
+
+
+def all_set(of_lanes: Bool[Array, " W"]) -> Bool[Array, ""]:
+    return ~flags.any_set(flags.packed(~of_lanes))
+
+
+# ---- pixels ---------------------------------------------------------------------------------------------------------
+
+
+def pixel_sweep(
+    work: pixel.Work,
+    scene: Scene,
+    choice: Choice | None,
+    scale: Float[Array, "3"],
+    first: Int[Array, ""] | int,
+    memory: Memory,
+    *,
+    options: Options,
+    slots: places.Slots,
+    paths: places.Paths,
+    structure: Record,
+) -> tuple[Float[Array, "3"], Memory]:
+    """Add what the samples of a pixel give, and their mean.
+
+    scale: of the derivatives of the mean; first: where the list begins in the total.
+    """
+    pixel_number, first_sample, spp, seed = work
+    stream = sampler.pixel_stream(seed, pixel_number)
+    share = 1 / jnp.maximum(spp, 1).astype(scale.dtype)
+
+    def step(state):
+        number, passed, now, weight, sums, memory = state
+        begins = ~now.alive
+        now, weight = pixel.begun(scene, pixel_number, stream, number, now, weight, options)
+        u = bounce_numbers(scene, stream, number, path.vertices(now), options.sampler)
+        of_sample = weight * (share * scale)
+        on, record, itself = extend(scene, choice, now, u, options, slots, paths, of_sample, passed)
+        there = [replace(slot, places=tuple(first + place for place in slot.places)) for slot in record.slots]
+        record = record._replace(begins=begins, slots=there)
+        memory = together(partial(remember, structure))(memory, columns_of(record))
+        gain = weight * (on.L.emission + on.L.light)
+        if slots.of_passed:
+            gain = jnp.where(itself, gain, 0)
+            passed, on = jnp.where(itself, 0, passed + 1), jax.tree.map(partial(jnp.where, itself), on, now)
+        sums = pixel.add_compensated(sums, compute_once(gain))
+        return number + jnp.where(on.alive, 0, 1).astype(number.dtype), passed, on, weight, sums, memory
+
+    zero = jnp.zeros((3,), scale.dtype)
+    state = first_sample, jnp.int32(0), *pixel.no_path(scene, options), (zero, zero), memory
+    *_, (total, _), memory = persistent_loop(lambda state: state[0] != first_sample + spp, step, state)
+    return share * total, memory
+
+
+def finish(structure: Record, memory: Memory) -> Float[Array, "M 3"]:
+    memory = sweep(structure, memory, jnp.bool_(True))
+    total = memory.total
+    if isinstance(total, list):
+        total = jnp.stack([jnp.sum(x) for x in total]).reshape(-1, 3)
+    return jnp.where(memory.lost != 0, jnp.nan, total)
+
+
+class _Kernel(NamedTuple):
+    """What kernels of some arrays have in common."""
+
+    scene: Scene
+    choice: Choice | None
+    structure: Record  # of shapes and dtypes
+    entries: int  # of the list
+    of_pixel: Callable  # `pixel_sweep`
+
+
+def _kernel(scene: Scene, paths: places.Paths, options: Options) -> _Kernel:
+    scene = options.applied(scene)
+    choice = emitters.choice(scene.emitters, options.strategy)
+    slots = places.slots(scene, paths)
+    _, entries = places.firsts(scene, paths)
+
+    def record(scene, choice, x):
+        now, _ = pixel.camera_path(scene, jnp.int32(0), x, x, options)
+        u = bounce_numbers(scene, x, x, path.vertices(now), options.sampler)
+        return extend(scene, choice, now, u, options, slots, paths, now.throughput, jnp.int32(0))[1]
+
+    structure = jax.eval_shape(record, scene, choice, jnp.uint32(0))
+    of_pixel = partial(pixel_sweep, options=options, slots=slots, paths=paths, structure=structure)
+    return _Kernel(scene, choice, structure, entries, of_pixel)
+
+
+@partial(jax.jit, static_argnames=("paths", "options", "devices"))
+def pullback(scene: Scene, adjoint, pixels, first_sample, spp, seed, *, paths, options: Options, devices=None):
+    """J^T adjoint: of each of the arrays, its shape.
+
+    Args:
+        scene: without names.
+        adjoint: (N, 3) of the means of the pixels.
+        pixels, first_sample, spp, seed: (N,) each.
+        paths: of the arrays, which `places` knows.
+    """
+    scene, choice, structure, entries, sweep_of = _kernel(scene, paths, options)
+    first, _ = places.firsts(scene, paths)
+
+    def of_pixel(work, scene, choice, memory):
+        adjoint, work = work
+        return sweep_of(work, scene, choice, adjoint, 0, memory)[1]
+
+    begin, end = partial(start, scene, structure, entries), partial(finish, structure)
+    work = adjoint, (pixels, first_sample, spp, seed)
+    total = native_fold(of_pixel, work, scene, choice, start=begin, finish=end, devices=devices)
+
+    def of_array(path):
+        rows = total[first[path] : first[path] + places.count(scene, path)]
+        rows = rows if places.of_colors(scene, path) else rows.sum(1)
+        return rows.reshape(named.get(scene, path).shape)
+
+    return [of_array(path) for path in paths]
+
+
+@partial(jax.jit, static_argnames=("paths", "options", "devices"))
+def rows(
+    scene: Scene, pixels, first_sample, spp, seed, *, paths, options: Options, devices=None
+) -> tuple[Float[Array, "N 3"], Float[Array, "N M 3"]]:
+    """Means of pixels, and their derivatives in each of the list of colours: of each channel in its own.
+
+    Arguments as for `pullback`; the arrays hold colours alone.
+    """
+    scene, choice, structure, entries, sweep_of = _kernel(scene, paths, options)
+
+    def of_pixel(work, number, scene, choice, memory):
+        return sweep_of(work, scene, choice, jnp.ones_like(scene.camera.origin), number * entries, memory)
+
+    def begin(lanes, pixels, scene, choice):
+        return start(scene, structure, pixels * entries, lanes)
+
+    def end(memory):
+        return finish(structure, memory).reshape(-1, entries, 3)
+
+    work = pixels, first_sample, spp, seed
+    return native_rows(of_pixel, work, scene, choice, start=begin, finish=end, devices=devices)
