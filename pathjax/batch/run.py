@@ -51,7 +51,8 @@ def render_batch(
 ) -> list[Outcome]:
     """Render many scenes to image files. Those of one structure share a kernel, however many triangles each has.
 
-    Images are those that `render_until` gives with the limits of the job, bit for bit. An output that exists is kept,
+    Images are those that `render_until` gives with the limits of the job, up to rounding, and the same bits each time
+    (of the scenes that pathjax ships and is tested with all but one are the same bits). An output that exists is kept,
     and its job skipped, so that a batch which was stopped, or killed, goes on when it is called again; outputs appear
     whole or not at all. A job that fails does not end the others; but an output that cannot be written does, as the
     rest would be lost too.

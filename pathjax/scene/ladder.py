@@ -3,7 +3,7 @@
 A kernel is compiled for the sizes of a scene's arrays. What is counted in thousands (triangles, nodes and leaves of
 hierarchies, texels) and what is counted in pieces (shapes, bsdfs, textures) is padded up to rungs of a coarse ladder
 here. Whatever is read is found by number, and nothing holds the number of a padded entry: no ray searches it, no light
-is chosen there, and images are those of the scene itself, bit for bit.
+is chosen there, and images are those of the scene itself. Their last bits may differ, as the kernel is another program.
 
 What stays as it is, and so tells kernels apart: lights, shapes of a kind of which there are so few that rays test them
 all, and environment maps.
