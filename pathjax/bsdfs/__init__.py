@@ -11,7 +11,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from functools import partial
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -37,6 +36,7 @@ from pathjax.bsdfs.roughplastic import RoughPlastic
 from pathjax.bsdfs.thindielectric import ThinDielectric
 from pathjax.bsdfs.twosided import TwoSided
 from pathjax.bsdfs.wrapper import Wrapper
+from pathjax.compile import register_dataclass
 from pathjax.core.math import at
 from pathjax.core.types import BSDFSample, Frame, Surface
 from pathjax.kinds import Column, Instance, Parameters, Row, Table, ordered
@@ -97,7 +97,7 @@ def register(name: str):
     return register_kind(KINDS, BSDF, name, "bsdfs")
 
 
-@jax.tree_util.register_dataclass
+@register_dataclass
 @dataclass(frozen=True)
 class Materials:
     tables: tuple[Table, ...]  # one for each kind of bsdf present

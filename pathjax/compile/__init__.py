@@ -5,6 +5,7 @@
 - `compute_once`, `one_by_one` and `persistent_loop` stand in code of one item. They change nothing of its results, only
   what is computed when. `together` changes the memory of a `native_fold`.
 - `linear` is a linear function with a transpose of its own.
+- `register_dataclass` makes a dataclass a pytree, where JAX's own may give it the kernel of another.
 - `concurrently` calls one kernel several times at once.
 - `setup` prepares XLA. It runs here, so that importing pathjax is enough; `keep_kernels` is for programs.
 
@@ -14,7 +15,7 @@ Whatever of JAX is not public is imported by `jax_compat` alone.
 from __future__ import annotations
 
 from pathjax.compile.cache import keep_kernels
-from pathjax.compile.jax_compat import is_symbolic_zero, is_traced
+from pathjax.compile.jax_compat import is_symbolic_zero, is_traced, register_dataclass
 from pathjax.compile.linear import linear
 from pathjax.compile.mapping import MANY_ITEMS, native_fold, native_map, native_rows, split_map
 from pathjax.compile.primitives import compute_once, one_by_one, persistent_loop, together
@@ -38,6 +39,7 @@ __all__ = [
     "native_rows",
     "one_by_one",
     "persistent_loop",
+    "register_dataclass",
     "setup",
     "split_map",
     "together",

@@ -20,7 +20,7 @@ from jaxtyping import Array, Float, Int
 
 from pathjax import emitters
 from pathjax.bsdfs import dielectric
-from pathjax.compile import is_traced, native, usual_promotion
+from pathjax.compile import is_traced, native, register_dataclass, usual_promotion
 from pathjax.core.types import Number
 from pathjax.derivatives import backward, ior, ior_difference, ior_step, places, rules, tangents
 from pathjax.errors import InputError
@@ -39,7 +39,7 @@ METHODS = ("difference", "attached")
 MOST_TANGENTS = 8
 
 
-@jax.tree_util.register_dataclass
+@register_dataclass
 @dataclass(frozen=True, eq=False)
 class Jacobian(Mapping[str, Array]):
     """Derivatives of an image by the names of parameters: `J[name]` is (H, W, 3, *shape of the parameter).

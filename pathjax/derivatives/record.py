@@ -20,6 +20,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from pathjax.compile import register_dataclass
 from pathjax.derivatives import places
 from pathjax.emitters import Choice
 from pathjax.integrators import path
@@ -29,7 +30,7 @@ from pathjax.integrators.shadow import none_passed
 from pathjax.scene.scene import Scene
 
 
-@jax.tree_util.register_dataclass
+@register_dataclass
 @dataclass(frozen=True)
 class Slot:
     """What a vertex adds to the derivatives in one number that it looked up, times the adjoint and the throughput."""

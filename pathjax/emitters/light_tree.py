@@ -12,12 +12,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
+from pathjax.compile import register_dataclass
 from pathjax.core.math import at, dot, larger, safe_divide
 
 # Fewer lights are chosen by power alone, at less cost; the six faces of a cube are lights of their own. From here on
@@ -25,7 +25,7 @@ from pathjax.core.math import at, dot, larger, safe_divide
 FEWEST = 9
 
 
-@jax.tree_util.register_dataclass
+@register_dataclass
 @dataclass(frozen=True)
 class LightTree:
     nodes: Float[Array, "N 5"]  # middle, squared radius, power; children of k are 2 k and 2 k + 1; the first is unused

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
+from pathjax.compile import register_dataclass
 from pathjax.core.math import at
 from pathjax.core.types import Number, Surface
 from pathjax.emitters import light_tree
@@ -20,7 +20,7 @@ from pathjax.shapes import Lamps
 from pathjax.textures import Textures
 
 
-@jax.tree_util.register_dataclass
+@register_dataclass
 @dataclass(frozen=True)
 class Lights:
     """All lights of one kind."""
@@ -77,7 +77,7 @@ class AllRows:
         return None if column is None else column.values
 
 
-@jax.tree_util.register_dataclass
+@register_dataclass
 @dataclass(frozen=True)
 class Choice:
     """Probability of each light, numbered through the tables that are sampled; made once per render."""

@@ -22,7 +22,7 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
-from pathjax.compile import usual_promotion
+from pathjax.compile import register_dataclass, usual_promotion
 from pathjax.derivatives.jacobian import pixel_jacobians
 from pathjax.errors import InputError
 from pathjax.integrators.options import Counts, Options, check_counts
@@ -42,7 +42,7 @@ MOST_BLOCKS = 4096
 CHUNK_BYTES = 1 << 25
 
 
-@jax.tree_util.register_dataclass
+@register_dataclass
 @dataclass(frozen=True, eq=False)
 class NormalEquations:
     """What images say of P numbers, near the values that these have.

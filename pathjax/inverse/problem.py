@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from pathjax.compile import register_dataclass
 from pathjax.errors import InputError
 from pathjax.images.metrics import ROUNDING
 from pathjax.inverse.parameter_vector import ParameterVector
@@ -21,7 +22,7 @@ from pathjax.sensors import film
 MOST_COLUMNS = 300
 
 
-@jax.tree_util.register_dataclass
+@register_dataclass
 @dataclass(frozen=True)
 class Views:
     """Views of one structure, stacked where they differ."""

@@ -11,11 +11,12 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int, Shaped
 
+from pathjax.compile import register_dataclass
 from pathjax.core.math import at, luminance
 from pathjax.core.types import Number, Surface
 
 
-@jax.tree_util.register_dataclass
+@register_dataclass
 @dataclass(frozen=True)
 class Column:
     values: Shaped[Array, "R ..."]  # of a row with a texture: not read
@@ -24,7 +25,7 @@ class Column:
     nudge: Float[Array, ""] | Float[Array, " R"] | None = None
 
 
-@jax.tree_util.register_dataclass
+@register_dataclass
 @dataclass(frozen=True)
 class Table:
     """All rows of one kind."""

@@ -13,12 +13,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from pathjax.compile import register_dataclass
 from pathjax.core.math import at, dot, safe_divide
 from pathjax.core.types import BSDFSample
 from pathjax.kinds import Instance, Parameters, Row, Table, ordered
@@ -44,7 +44,7 @@ def register(name: str):
     return register_kind(PHASES, Phase, name, "media")
 
 
-@jax.tree_util.register_dataclass
+@register_dataclass
 @dataclass(frozen=True)
 class Media:
     table: Table  # of what is homogeneous; without albedo where nothing scatters

@@ -12,7 +12,7 @@ from jax import lax
 from jaxtyping import Array, Integer
 
 from pathjax import emitters
-from pathjax.compile import is_traced, usual_promotion
+from pathjax.compile import is_traced, register_dataclass, usual_promotion
 from pathjax.core.types import Number
 from pathjax.derivatives import rules, tangents
 from pathjax.errors import InputError
@@ -32,7 +32,7 @@ _PORTION = 1 << 12
 PILOT_TERMS, PILOT_PIXELS, PILOT_SPP = 12, 1 << 12, 64
 
 
-@jax.tree_util.register_dataclass
+@register_dataclass
 @dataclass(frozen=True, eq=False)
 class Bounces:
     """Terms of the series: `terms[k]` is T^k Le, light that was reflected or refracted k times."""

@@ -9,7 +9,7 @@ from jaxtyping import Array, Int
 
 from pathjax import bsdfs
 from pathjax.bsdfs import Materials
-from pathjax.compile import usual_promotion
+from pathjax.compile import register_dataclass, usual_promotion
 from pathjax.emitters import Lights
 from pathjax.errors import InputError
 from pathjax.media import Media
@@ -22,7 +22,7 @@ from pathjax.shapes import Geometry
 UNBOUNDED = 1 << 30
 
 
-@jax.tree_util.register_dataclass
+@register_dataclass
 @dataclass(frozen=True)
 class Scene:
     """Arrays of a scene. Scenes of the same structure and array shapes share one compiled kernel."""

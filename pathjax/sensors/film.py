@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Real
 
+from pathjax.compile import register_dataclass
 from pathjax.core.math import at
 from pathjax.description.fields import Fields
 from pathjax.kinds import Unused
@@ -28,7 +29,7 @@ _POINTS = 256
 PIXEL_FORMATS = ("rgb", "rgba", "luminance", "luminance_alpha", "xyz", "xyza")
 
 
-@jax.tree_util.register_dataclass
+@register_dataclass
 @dataclass(frozen=True)
 class Film:
     filter: Filter

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from pathjax.compile import register_dataclass
 from pathjax.core.types import Ray
 from pathjax.description.fields import Fields
 from pathjax.kinds import Unused
@@ -16,7 +16,7 @@ from pathjax.sensors.film import HDRFilm
 from pathjax.sensors.sensor import Camera, Sensor
 
 
-@jax.tree_util.register_dataclass
+@register_dataclass
 @dataclass(frozen=True)
 class OrthographicCamera(Camera):
     """`origin` is where rays of the film's upper left corner start, on the near clip plane."""

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from pathjax.compile import compute_once
+from pathjax.compile import compute_once, register_dataclass
 from pathjax.core.math import dot
 from pathjax.core.types import Ray
 from pathjax.description.fields import Fields
@@ -19,7 +18,7 @@ from pathjax.sensors.film import HDRFilm
 from pathjax.sensors.sensor import Camera, Sensor
 
 
-@jax.tree_util.register_dataclass
+@register_dataclass
 @dataclass(frozen=True)
 class PerspectiveCamera(Camera):
     axes: Float[Array, "3 3"]  # rows: unit right, up, forward in world space

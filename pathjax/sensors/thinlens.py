@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from pathjax.compile import compute_once
+from pathjax.compile import compute_once, register_dataclass
 from pathjax.core.warp import square_to_disk
 from pathjax.description.fields import Fields
 from pathjax.sensors.film import HDRFilm
@@ -17,7 +16,7 @@ from pathjax.sensors.perspective import Perspective, PerspectiveCamera
 from pathjax.sensors.sensor import Sensor
 
 
-@jax.tree_util.register_dataclass
+@register_dataclass
 @dataclass(frozen=True)
 class ThinLensCamera(PerspectiveCamera):
     aperture_radius: Float[Array, ""]

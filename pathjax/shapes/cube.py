@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pathjax.compile import compute_once
+from pathjax.compile import compute_once, register_dataclass
 from pathjax.core.math import at, dot, larger, smaller
 from pathjax.kinds import Unused
 from pathjax.shapes.accel.leaves import numbers_of, pack, rows_of
@@ -36,7 +36,7 @@ _CUBE = np.array(
 )
 
 
-@jax.tree_util.register_dataclass
+@register_dataclass
 @dataclass(frozen=True)
 class Cubes(Searched):
     """The face of a cube where its coordinate `axis` is -1 or 1 is its rectangle number 2 axis + 0 or 1."""

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from pathjax.compile import register_dataclass
 from pathjax.core.math import at, cos_sin_turns, dot, normalize, safe_divide, safe_sqrt, turns
 from pathjax.core.types import Surface
 from pathjax.description.fields import Fields
@@ -35,7 +36,7 @@ class Tube(Primitives):
         return bounds(self.tubes)
 
 
-@jax.tree_util.register_dataclass
+@register_dataclass
 @dataclass(frozen=True)
 class Cylinders(Table):
     leaves: jax.Array  # of `tubes`

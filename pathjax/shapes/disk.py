@@ -5,16 +5,16 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
+from pathjax.compile import register_dataclass
 from pathjax.core.math import at, cos_sin_turns, safe_sqrt, turns
 from pathjax.core.warp import square_to_disk
 from pathjax.shapes.planar import Planar, PlanarShape
 
 
-@jax.tree_util.register_dataclass
+@register_dataclass
 @dataclass(frozen=True)
 class Disks(Planar):
     kind = "disk"

@@ -15,7 +15,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from pathjax.compile import compute_once, one_by_one
+from pathjax.compile import compute_once, one_by_one, register_dataclass
 from pathjax.core.math import at, dot, frame_from_normal, integer_like, safe_divide, smaller
 from pathjax.core.types import Hit, Ray, Surface
 from pathjax.shapes.accel import traverse as bvh
@@ -25,7 +25,7 @@ from pathjax.shapes.shape import Lamps, LampSample, Searched, Table
 NO_HIT = np.int32(0x7FFFFFFF)
 
 
-@jax.tree_util.register_dataclass
+@register_dataclass
 @dataclass(frozen=True)
 class Geometry:
     tables: tuple[Table, ...]  # one for each kind of primitive present, through which these are numbered in this order

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
+from pathjax.compile import register_dataclass
 from pathjax.core.math import at, larger
 from pathjax.kinds import Unused
 from pathjax.shapes.planar import Planar, PlanarShape
 
 
-@jax.tree_util.register_dataclass
+@register_dataclass
 @dataclass(frozen=True)
 class Rectangles(Planar):
     kind = "rectangle"

@@ -12,12 +12,11 @@ from dataclasses import dataclass, field, fields
 from types import MappingProxyType
 from typing import Any, ClassVar, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from pathjax.compile import compute_once
+from pathjax.compile import compute_once, register_dataclass
 from pathjax.core.math import at, dot, safe_divide, safe_sqrt
 from pathjax.core.types import Hit, Ray, Surface
 from pathjax.description.fields import Fields
@@ -98,7 +97,7 @@ class Primitives(ABC):
 # ---- in kernels -----------------------------------------------------------------------------------------------------
 
 
-@jax.tree_util.register_dataclass
+@register_dataclass
 @dataclass(frozen=True)
 class Lamps:
     """Shapes that emit: a row for each rectangle, disk, sphere and face of a cube, and one for each whole mesh."""

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pathjax.compile import compute_once
+from pathjax.compile import compute_once, register_dataclass
 from pathjax.core.math import (
     at,
     cos_sin_turns,
@@ -47,7 +47,7 @@ class Ball(Primitives):
         return bounds(self.balls)
 
 
-@jax.tree_util.register_dataclass
+@register_dataclass
 @dataclass(frozen=True)
 class Spheres(Table):
     leaves: jax.Array  # of center, radius

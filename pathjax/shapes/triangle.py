@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from pathjax.compile import register_dataclass
 from pathjax.core.math import at, cross, dot, larger, normalize, rescale, safe_divide
 from pathjax.core.types import Surface
 from pathjax.core.warp import square_to_triangle
@@ -61,7 +62,7 @@ class Facets(Primitives):
         self.vertices += moves
 
 
-@jax.tree_util.register_dataclass
+@register_dataclass
 @dataclass(frozen=True)
 class Triangles(Table):
     leaves: jax.Array  # of x of the three vertices, y, z

@@ -15,6 +15,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
+from pathjax.compile import register_dataclass
 from pathjax.core.types import Surface
 from pathjax.kinds import Instance, Parameters, Row, Table, ordered
 from pathjax.kinds import register as register_kind
@@ -51,7 +52,7 @@ def register(name: str):
     return register_kind(KINDS, Texture, name, "textures")
 
 
-@jax.tree_util.register_dataclass
+@register_dataclass
 @dataclass(frozen=True)
 class Textures:
     tables: tuple[Table, ...]  # one for each kind present

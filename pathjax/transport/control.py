@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 
-from pathjax.compile import compute_once
+from pathjax.compile import compute_once, register_dataclass
 from pathjax.core.math import dot, safe_divide
 from pathjax.errors import InputError
 from pathjax.integrators import roulette
@@ -32,7 +32,7 @@ from pathjax.transport.view import Radiosity, radiance
 _FIRST = 2
 
 
-@jax.tree_util.register_dataclass
+@register_dataclass
 @dataclass(frozen=True)
 class Control:
     """For `pathjax.render`, of `Operator.control`."""

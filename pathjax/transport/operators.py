@@ -24,7 +24,7 @@ import numpy as np
 from jax import lax
 
 from pathjax import bsdfs, emitters
-from pathjax.compile import is_traced, usual_promotion
+from pathjax.compile import is_traced, register_dataclass, usual_promotion
 from pathjax.core.math import safe_divide
 from pathjax.errors import InputError
 from pathjax.integrators.options import check_counts
@@ -49,7 +49,7 @@ _MOST_POWERS = 10_000
 _MOST_TERMS = 100_000
 
 
-@jax.tree_util.register_dataclass
+@register_dataclass
 @dataclass(frozen=True)
 class Dense:
     """Form factors, and their errors, as matrices."""
@@ -64,7 +64,7 @@ class Dense:
         return jnp.matmul(self.errors**2, x, precision=lax.Precision.HIGHEST)
 
 
-@jax.tree_util.register_dataclass
+@register_dataclass
 @dataclass(frozen=True)
 class Sparse:
     """Form factors of the pairs that some ray joins, by row: they take the space of rays, not of pairs.
@@ -93,7 +93,7 @@ class Solution(NamedTuple):
     residual: jax.Array  # () |Le + T L - L| / |Le|
 
 
-@jax.tree_util.register_dataclass
+@register_dataclass
 @dataclass(frozen=True)
 class Operator:
     """T of a scene, U patches and 3 channels; a pytree, which may be passed to jitted functions."""

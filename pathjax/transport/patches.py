@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pathjax import bsdfs, emitters
+from pathjax.compile import register_dataclass
 from pathjax.core.math import at
 from pathjax.core.warp import square_to_triangle
 from pathjax.errors import InputError
@@ -21,7 +22,7 @@ from pathjax.scene.scene import Scene
 from pathjax.shapes import Geometry, geometry
 
 
-@jax.tree_util.register_dataclass
+@register_dataclass
 @dataclass(frozen=True)
 class Patches:
     """U patches, the sides that are not black of C cells of Q primitives."""

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from pathjax.compile import native_map, usual_promotion
+from pathjax.compile import native_map, register_dataclass, usual_promotion
 from pathjax.core import sampler
 from pathjax.core.math import at, dot
 from pathjax.errors import InputError
@@ -24,7 +24,7 @@ from pathjax.shapes.geometry import Geometry
 from pathjax.transport.patches import Patches, patch_at, refuse_media
 
 
-@jax.tree_util.register_dataclass
+@register_dataclass
 @dataclass(frozen=True)
 class Radiosity:
     """Light on the patches of a scene, to be looked up within kernels: pass it to them whole, as the scene."""

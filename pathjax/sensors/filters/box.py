@@ -8,10 +8,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from pathjax.compile import register_dataclass
 from pathjax.sensors.filters.filter import Filter
 
 
-@jax.tree_util.register_dataclass
+@register_dataclass
 @dataclass(frozen=True)
 class Box(Filter):
     radius: jax.Array | float = 0.5  # () pixels

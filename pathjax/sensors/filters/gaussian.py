@@ -6,10 +6,11 @@ from dataclasses import dataclass
 
 import jax
 
+from pathjax.compile import register_dataclass
 from pathjax.sensors.filters.tabulated import Tabulated
 
 
-@jax.tree_util.register_dataclass
+@register_dataclass
 @dataclass(frozen=True)
 class Gaussian(Tabulated):
     stddev: jax.Array | float = 0.5  # () pixels

@@ -6,10 +6,11 @@ from dataclasses import dataclass
 
 import jax
 
+from pathjax.compile import register_dataclass
 from pathjax.sensors.filters.tabulated import Tabulated
 
 
-@jax.tree_util.register_dataclass
+@register_dataclass
 @dataclass(frozen=True)
 class Lanczos(Tabulated):
     radius: jax.Array | float = 3.0  # () pixels, as many as lobes

@@ -6,10 +6,11 @@ from dataclasses import dataclass
 
 import jax
 
+from pathjax.compile import register_dataclass
 from pathjax.sensors.filters.tabulated import Tabulated
 
 
-@jax.tree_util.register_dataclass
+@register_dataclass
 @dataclass(frozen=True)
 class Mitchell(Tabulated):
     B: jax.Array | float = 1 / 3  # () how much it blurs
@@ -28,7 +29,7 @@ class Mitchell(Tabulated):
         return xp.where(x < 1, near, far)
 
 
-@jax.tree_util.register_dataclass
+@register_dataclass
 @dataclass(frozen=True)
 class CatmullRom(Mitchell):
     """The one that interpolates."""

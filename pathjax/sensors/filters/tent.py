@@ -8,11 +8,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from pathjax.compile import register_dataclass
 from pathjax.core.warp import tent
 from pathjax.sensors.filters.filter import Filter
 
 
-@jax.tree_util.register_dataclass
+@register_dataclass
 @dataclass(frozen=True)
 class Tent(Filter):
     radius: jax.Array | float = 1.0  # () pixels

@@ -9,12 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from pathjax.compile import register_dataclass
 from pathjax.core.math import at, integer_like, larger, smaller
 
 WIDTH = 8
 
 
-@jax.tree_util.register_dataclass
+@register_dataclass
 @dataclass(frozen=True)
 class Tree:
     # (N, 7, 8) integers as wide as the reals: bits of the children's lower planes x, y, z and upper planes, NaN in
