@@ -27,6 +27,8 @@ def scene(path: Path, parameters: Mapping[str, object]) -> tuple[dict, list[str]
     Raises:
         InputError: the file cannot be read, or holds nothing to be seen; another parameter.
     """
+    if not path.is_file():
+        raise InputError(f"{path}: {'not a file' if path.exists() else 'no such file'}")
     for name in parameters:
         if name != "res":
             raise InputError(f'{path}: the scene has no parameter "{name}"; it has: res')

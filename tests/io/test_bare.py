@@ -65,6 +65,15 @@ def test_a_file_that_holds_nothing_to_see_is_refused(tmp_path):
         pj.load_scene(tmp_path / "flat.obj")
 
 
+@pytest.mark.parametrize("suffix", sorted(bare.SUFFIXES))
+def test_a_file_that_is_not_there_is_said_to_be_missing(tmp_path, suffix):
+    with pytest.raises(pj.InputError, match=rf"nothing\{suffix}: no such file$"):
+        pj.load_scene(tmp_path / f"nothing{suffix}")
+    (tmp_path / f"folder{suffix}").mkdir()
+    with pytest.raises(pj.InputError, match="not a file$"):
+        pj.load_scene(tmp_path / f"folder{suffix}")
+
+
 def test_a_saved_mesh_is_the_same_scene(ball, tmp_path):
     mesh = trimesh.creation.icosphere(2)
     mesh.visual.vertex_colors = np.random.default_rng(1).integers(0, 256, (len(mesh.vertices), 4))
