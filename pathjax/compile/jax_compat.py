@@ -64,7 +64,10 @@ def register_dataclass(cls: Class) -> Class:
         return list(zip(keys, children, strict=True)), about
 
     def unflatten(about, children):
-        return cls(**dict(zip(data, children, strict=True)), **dict(zip(static, about, strict=True)))
+        x = object.__new__(cls)  # unchecked, as JAX puts other things in the place of arrays
+        for name, value in zip(data + static, (*children, *about), strict=True):
+            object.__setattr__(x, name, value)
+        return x
 
     jax.tree_util.register_pytree_with_keys(cls, flatten_with_keys, unflatten, flatten)
     return cls

@@ -15,6 +15,7 @@ from pathjax.images.metrics import ROUNDING
 from pathjax.inverse.parameter_vector import ParameterVector
 from pathjax.inverse.target import Target
 from pathjax.scene import parameters as named
+from pathjax.scene.metadata import Names
 from pathjax.scene.scene import Scene
 from pathjax.sensors import film
 
@@ -181,12 +182,11 @@ def _groups(scenes, targets, exposure, names) -> list[Views]:
     groups: dict = {}
     for number, scene in enumerate(scenes):
         leaves, tree = jax.tree.flatten(named.nameless(scene))
-        held = tuple(name for name in names if name in scene.about.parameters)
-        places = tuple(scene.about.parameters[name] for name in held)
-        key = tree, tuple((leaf.shape, leaf.dtype) for leaf in leaves), held, places
+        held = Names(tuple((name, scene.about.parameters[name]) for name in names if name in scene.about.parameters))
+        key = tree, tuple((leaf.shape, leaf.dtype) for leaf in leaves), held
         groups.setdefault(key, []).append((number, leaves))
     views = []
-    for (_, _, held, _), members in groups.items():
+    for (_, _, held), members in groups.items():
         numbers, leaves = zip(*members, strict=True)
         stacked, axes = [], []
         for same in zip(*leaves, strict=True):
@@ -194,8 +194,10 @@ def _groups(scenes, targets, exposure, names) -> list[Views]:
             stacked.append(same[0] if equal else jnp.stack(same))
             axes.append(None if equal else 0)
         first = scenes[numbers[0]]
-        scene = jax.tree.unflatten(jax.tree.structure(first), stacked)
+        # So that a scene that is loaded again has the same structure, and its fit the same programs.
+        structure = jax.tree.structure(replace(first, about=held))
+        scene = jax.tree.unflatten(structure, stacked)
         dtype = first.camera.origin.dtype
         here = jnp.asarray(np.stack([targets[i].image for i in numbers]), dtype)
-        views.append(Views(scene, here, jnp.asarray(exposure, dtype), held, tuple(axes), numbers))
+        views.append(Views(scene, here, jnp.asarray(exposure, dtype), tuple(held.parameters), tuple(axes), numbers))
     return views

@@ -29,7 +29,7 @@ from pathjax.kinds.declared import (
     Unused,
 )
 from pathjax.kinds.kind import Instance, Kind, ordered, register
-from pathjax.kinds.parameter import Parameter, Parameters
+from pathjax.kinds.parameter import Fixed, Parameter, Parameters
 from pathjax.kinds.table import Column, Row, Table
 
 __all__ = [
@@ -44,6 +44,7 @@ __all__ = [
     "Internal",
     "Kind",
     "Number",
+    "Fixed",
     "Parameter",
     "Parameters",
     "PerRow",

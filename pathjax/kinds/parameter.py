@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
+import functools
+import hashlib
 import math
 from dataclasses import dataclass, field, replace
 
@@ -12,6 +13,23 @@ import numpy as np
 from jaxtyping import Array, Shaped
 
 from pathjax.core.math import luminance
+
+
+class Fixed:
+    """Whole numbers that stand in what programs are kept by: equal to others of the same content."""
+
+    def __init__(self, values: np.ndarray):
+        self.values = values
+
+    @functools.cached_property
+    def _content(self) -> tuple:
+        return self.values.shape, hashlib.sha256(np.int64(self.values).tobytes()).digest()
+
+    def __eq__(self, other):
+        return isinstance(other, Fixed) and (self is other or self._content == other._content)
+
+    def __hash__(self):
+        return hash(self._content)
 
 
 @dataclass(frozen=True)
@@ -29,7 +47,7 @@ class Parameter:
     # Paths to arrays, and rows of these, where the mean of a texture stands, by which lights are chosen.
     means: tuple[tuple[tuple[str | int, ...], int], ...] = ()
     # Of what the vertices or faces of a mesh carry, (rows, 3): which of them a corner has.
-    corners: np.ndarray | None = dataclasses.field(default=None, compare=False)
+    corners: Fixed | None = None
 
     @property
     def is_texture(self) -> bool:
@@ -43,8 +61,9 @@ class Parameter:
         mine = values[first : first + self.rows]
         if self.corners is not None:
             # What no corner has is 0.
-            corner_of = np.full(self.shape[0], self.corners.size)
-            corner_of[self.corners.ravel()] = np.arange(self.corners.size)
+            corners = self.corners.values
+            corner_of = np.full(self.shape[0], corners.size)
+            corner_of[corners.ravel()] = np.arange(corners.size)
             return jnp.concatenate([mine.reshape(-1, 3), jnp.zeros((1, 3), mine.dtype)])[corner_of]
         if mine.size > math.prod(self.shape):
             mine = jnp.where(jnp.ptp(mine, 1) > 0, luminance(mine), mine[:, 0])
@@ -56,7 +75,7 @@ class Parameter:
             return values.at[self.index].set(value)
         first, (_, *others) = self.index[0], values.shape
         if self.corners is not None:
-            return values.at[first : first + self.rows].set(value[self.corners])
+            return values.at[first : first + self.rows].set(value[self.corners.values])
         value = jnp.broadcast_to(value.reshape(self.rows, -1), (self.rows, math.prod(others)))
         return values.at[first : first + self.rows].set(value.reshape(self.rows, *others))
 

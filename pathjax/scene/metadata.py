@@ -24,3 +24,14 @@ class About:
 
     def __hash__(self):
         return id(self.parameters)
+
+
+@dataclass(frozen=True)
+class Names:
+    """What of `About` sets parameters: equal for all scenes that have these in the same places."""
+
+    places: tuple[tuple[str, Parameter], ...]
+
+    @property
+    def parameters(self) -> dict[str, Parameter]:
+        return dict(self.places)

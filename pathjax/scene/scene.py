@@ -13,7 +13,7 @@ from pathjax.compile import register_dataclass, usual_promotion
 from pathjax.emitters import Lights
 from pathjax.errors import InputError
 from pathjax.media import Media
-from pathjax.scene.metadata import About
+from pathjax.scene.metadata import About, Names
 from pathjax.sensors import Camera
 from pathjax.sensors.film import Film
 from pathjax.shapes import Geometry
@@ -35,7 +35,7 @@ class Scene:
     max_depth: Int[Array, ""]  # vertices of the longest path; 1: emission only
     rr_depth: Int[Array, ""]  # vertices before roulette begins
     hide_emitters: bool = field(metadata={"static": True})  # from the camera
-    about: About | None = field(metadata={"static": True})  # None: within kernels
+    about: About | Names | None = field(metadata={"static": True})  # Names: within fits; None: within kernels
     free_passes: bool = field(default=False, metadata={"static": True})  # straight through a surface is no vertex
     media: Media | None = None  # between surfaces; None: all is clear
     # Parameters that `with_parameters` set to traced values, by name. They carry the derivative, and tables hold the

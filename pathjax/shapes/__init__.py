@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pathjax.kinds import Parameter, Parameters
+from pathjax.kinds import Fixed, Parameter, Parameters
 from pathjax.shapes import coincident
 from pathjax.shapes.accel.build import Tree
 from pathjax.shapes.cube import Cube
@@ -144,7 +144,7 @@ def _enter_attributes(parameters: Parameters, path: tuple, shape, primitives: Pr
         bounds = (low, high) if known is None else (max(low, known.bounds[0]), min(high, known.bounds[1]))
         corners = primitives.entries[attribute]
         where = (*path, attribute), (first,)
-        parameters.known[name] = Parameter(*where, values.shape, bounds, rows=len(corners), corners=corners)
+        parameters.known[name] = Parameter(*where, values.shape, bounds, rows=len(corners), corners=Fixed(corners))
 
 
 def lamp_table(lamps: list[Lamp], dtype) -> Lamps:

@@ -211,6 +211,9 @@ def test_a_second_fit_of_the_problem_does_not_compile(make_scene):
     first, again = (pj.fit(scene, target, NAMES[:1], start={NAMES[0]: 0.4}, spp=32, seed=seed) for seed in (0, 5))
     assert again.compile_seconds < first.compile_seconds / 10
     assert again.values[NAMES[0]].tolist() != first.values[NAMES[0]].tolist()
+    same = pj.fit(make_scene(ROOM, res=12, depth=3), target, NAMES[:1], start={NAMES[0]: 0.4}, spp=32, seed=5)
+    assert same.compile_seconds < first.compile_seconds / 10
+    assert same.values[NAMES[0]].tolist() == again.values[NAMES[0]].tolist()
 
 
 def test_programs_are_shared_by_solvers_that_are_the_same_and_by_no_others():
