@@ -49,8 +49,9 @@ def load(name, res, **more):
 
 def with_tent(scene):
     description = scene.about.description
-    film = replace(description.film, filter=Tent(1.0))
-    return build(replace(description, film=film))
+    view = description.view
+    film = replace(view.film, filter=Tent(1.0))
+    return build(replace(description, view=view._replace(film=film)))
 
 
 def strategy(res):

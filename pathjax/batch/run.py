@@ -120,7 +120,7 @@ def _outcome(job: Job, output: Path, loading: Future | None, interrupts: Interru
     try:
         scene, load_seconds = loading.result()
         no_limit = job.spp is None and job.error is None and job.time is None
-        spp = scene.about.description.spp if no_limit else job.spp
+        spp = scene.about.description.view.spp if no_limit else job.spp
         render = Render(padded(scene), job.error, job.time, spp, job.seed, job.strategy, None)
         render.compile()
         result = render.run()

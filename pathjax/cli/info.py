@@ -38,14 +38,14 @@ def scene_facts(scene: Scene) -> dict:
     dark = emitters.darkness(scene.emitters, scene.samples_lights)
     return {
         "file": description.file,
-        "image": {"width": width, "height": height, "filter": _type(scene.film.filter), "spp": description.spp},
-        "camera": _type(description.camera),
+        "image": {"width": width, "height": height, "filter": _type(scene.film.filter), "spp": description.view.spp},
+        "camera": _type(description.view.camera),
         "integrator": {
             "max_depth": None if max_depth == UNBOUNDED else max_depth,
             "rr_depth": int(scene.rr_depth),
             "hide_emitters": scene.hide_emitters,
         },
-        "sampler": {"file": description.sampler, "used": _SAMPLER},
+        "sampler": {"file": description.view.sampler, "used": _SAMPLER},
         "shapes": len(description.shapes),
         "primitives": {f"{part.kind}s": _primitives(part) for part in parts},
         "compiled": {

@@ -36,7 +36,7 @@ def run(options, output: Output) -> int:
     if "bounces" in options.aov:
         _check_depth(scene, options)
     if options.spp is None and options.error is None and options.time is None:
-        options.spp = scene.about.description.spp
+        options.spp = scene.about.description.view.spp
     load_seconds = time.perf_counter() - started
     render = Render(
         scene, options.error, options.time, options.spp, options.seed, options.strategy, options.checkpoint

@@ -42,27 +42,23 @@ class View(NamedTuple):
     film: object  # a `sensors.film.HDRFilm`
     spp: int
     sampler: str  # the type that the file names; pathjax uses its own
-    medium: Instance | None  # in which the camera is
+    medium: Instance | None = None  # in which the camera is
 
 
 @dataclass(frozen=True)
 class Description:
     file: str
-    camera: object  # a `sensors.Sensor`
-    film: object  # a `sensors.film.HDRFilm`
+    view: View  # which is used
     integrator: Integrator
-    spp: int
-    sampler: str  # the type that the file names; pathjax uses its own
     shapes: tuple[Shape, ...]
     emitters: tuple[Instance, ...] = ()  # those that stand outside of shapes
-    medium: Instance | None = None  # in which the camera is
     notes: tuple[str, ...] = field(default=())  # what `info` should tell: dropped triangles, replaced samplers
     # What was read, to be written again, and what each of its elements became: an `Instance`, a `Shape`, ...
     document: Document | None = None
     made: Mapping[Element, object] = field(default_factory=dict)
     # Of all sensors, by id, or by number where they have none, in the order of the file; or why one cannot be used.
     views: Mapping[str, View | InputError] = field(default_factory=dict)
-    seen: str = ""  # the name of that which is used
+    seen: str = ""  # the name of `view`
 
     def seen_by(self, which: int | str) -> Description:
         """The same, seen by the sensor of this number or name.
@@ -74,7 +70,7 @@ class Description:
         view = self.views[name]
         if isinstance(view, InputError):
             raise view
-        return replace(self, **view._asdict(), seen=name)
+        return replace(self, view=view, seen=name)
 
 
 def chosen(sensors: list[str], which: int | str, file: str) -> str:

@@ -40,7 +40,7 @@ def build(description: desc.Description, dtype=jnp.float32, split_rule: str = "s
     within = None
     if description.integrator.media:
         sides = [(shape.interior, shape.exterior) for shape in description.shapes]
-        within = media.build(sides, description.medium, dtype, ("media",), parameters)
+        within = media.build(sides, description.view.medium, dtype, ("media",), parameters)
     about = About(description, parameters.known, parameters.refused, trees)
     view = seen(description, dtype)
     # NumPy up to here: `jnp.asarray` compiles a program for every shape that it meets.
@@ -53,8 +53,8 @@ def seen(description: desc.Description, dtype) -> dict[str, object]:
     """The fields of a scene that say how it is looked at."""
     integrator = description.integrator
     return {
-        "camera": description.camera.build(description.film, dtype),
-        "film": description.film.build(dtype),
+        "camera": description.view.camera.build(description.view.film, dtype),
+        "film": description.view.film.build(dtype),
         "max_depth": np.int32(UNBOUNDED if integrator.max_depth < 0 else integrator.max_depth),
         "rr_depth": np.int32(integrator.rr_depth),
         "hide_emitters": integrator.hide_emitters,

@@ -58,11 +58,12 @@ class Scene:
         """
         about = self.described
         description = about.description.seen_by(which)
-        if self.media is not None and description.medium is not about.description.medium:
+        if self.media is not None and description.view.medium is not about.description.view.medium:
             name = description.seen
             raise InputError(f"sensor {name!r} stands in another medium; load the scene with sensor={name!r}")
         dtype = self.camera.origin.dtype
-        view = description.camera.build(description.film, dtype), description.film.build(dtype)
+        seen = description.view
+        view = seen.camera.build(seen.film, dtype), seen.film.build(dtype)
         camera, film = jax.device_put(view)
         return replace(self, camera=camera, film=film, about=replace(about, description=description))
 

@@ -58,7 +58,7 @@ def shape(geo, radiance=RADIANCE, flip=False, name="light"):
 def scene_of(*shapes, background=None, dtype=jnp.float32):
     camera, film = Perspective(np.eye(4), 45.0), HDRFilm(2, 2)
     skies = () if background is None else (Constant.instance("sky", radiance=background),)
-    about = desc.Description("test", camera, film, desc.Integrator(), 1, "independent", shapes, skies)
+    about = desc.Description("test", desc.View(camera, film, 1, "independent"), desc.Integrator(), shapes, skies)
     return build(about, dtype)
 
 

@@ -86,7 +86,7 @@ def test_a_dictionary_is_the_scene_of_the_file(tmp_path):
         }
     )
     same(made, pj.load_scene(tmp_path / "scene.xml"))
-    assert made.about.description.spp == 7
+    assert made.about.description.view.spp == 7
 
 
 def test_keys_at_the_top_and_ids_name_parameters():

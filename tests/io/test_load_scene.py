@@ -58,7 +58,7 @@ def test_a_scene_is_seen_by_each_sensor_of_its_file(write_scene, tmp_path):
         for a, b in zip(jax.tree.leaves(view), jax.tree.leaves(loaded), strict=True):
             np.testing.assert_array_equal(a, b)
         assert view.about.description.seen == name and view.geometry is scene.geometry
-        assert view.with_sensor(0).about.description.camera is scene.about.description.camera
+        assert view.with_sensor(0).about.description.view.camera is scene.about.description.view.camera
     assert scene.with_sensor("near").film.width == 6
     with pytest.raises(pj.InputError, match="there is no sensor 'far'; use 0 to 1 or near"):
         scene.with_sensor("far")

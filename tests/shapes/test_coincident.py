@@ -190,7 +190,7 @@ def tables_of(*geometries, dtype=np.float32):
     grey = Diffuse.instance("grey")
     shapes = tuple(desc.Shape(f"s{i}", g, grey, None, False) for i, g in enumerate(geometries))
     camera, film = Perspective(np.eye(4), 45.0), HDRFilm(2, 2)
-    description = desc.Description("test", camera, film, desc.Integrator(), 1, "independent", shapes)
+    description = desc.Description("test", desc.View(camera, film, 1, "independent"), desc.Integrator(), shapes)
     return build(description, dtype).geometry.tables
 
 

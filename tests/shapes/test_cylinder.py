@@ -45,7 +45,8 @@ def cylinders(n, seed=0):
 
 def scene_of(*shapes, dtype=jnp.float32, flip=False, light=None):
     made = tuple(desc.Shape(f"s{i}", g, GREY, light, flip) for i, g in enumerate(shapes))
-    about = desc.Description("t", Perspective(np.eye(4), 45.0), HDRFilm(2, 2), desc.Integrator(), 1, "", made)
+    view = desc.View(Perspective(np.eye(4), 45.0), HDRFilm(2, 2), 1, "")
+    about = desc.Description("t", view, desc.Integrator(), made)
     return build(about, dtype)
 
 

@@ -33,7 +33,7 @@ def x64():
 def scene_of(*geometries, dtype=jnp.float32, flip=False):
     shapes = tuple(desc.Shape(f"s{i}", g, GREY, None, flip) for i, g in enumerate(geometries))
     camera, film = Perspective(np.eye(4), 45.0), HDRFilm(2, 2)
-    about = desc.Description("test", camera, film, desc.Integrator(), 1, "independent", shapes)
+    about = desc.Description("test", desc.View(camera, film, 1, "independent"), desc.Integrator(), shapes)
     return build(about, dtype).geometry
 
 

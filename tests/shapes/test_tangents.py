@@ -40,8 +40,8 @@ class Brushed(BSDF):
 
 def geometry_of(shape, bsdf=Brushed):
     shapes = (desc.Shape("s", shape, bsdf.instance("b"), None, False),)
-    camera, film = Perspective(np.eye(4), 45.0), HDRFilm(2, 2)
-    return build(desc.Description("test", camera, film, desc.Integrator(), 1, "independent", shapes)).geometry
+    view = desc.View(Perspective(np.eye(4), 45.0), HDRFilm(2, 2), 1, "independent")
+    return build(desc.Description("test", view, desc.Integrator(), shapes)).geometry
 
 
 SHEARED = np.array([[0.9, 0.5, 0.1, 0.1], [-0.2, 0.8, 0.3, 0.2], [0.3, -0.1, 0.7, 0.3], [0, 0, 0, 1]])

@@ -100,7 +100,6 @@ class _Loader:
         name = d.chosen(names, sensor, scene["sensor"][0].file)
         seen = scene["sensor"][names.index(name)]
         views = {each: self.view(element, seen) for each, element in zip(names, scene["sensor"], strict=True)}
-        camera, film, spp, sampler, medium = views[name]
         if scene["integrator"]:
             integrator = self.make(scene["integrator"][0], integrators.KINDS)
         else:
@@ -126,17 +125,13 @@ class _Loader:
             if element not in self.made:
                 self.note(element, "is used by nothing")
                 self.shared(element, element.id or element.tag)
-        self.check_media(scene["integrator"], integrator, shapes, medium)
+        self.check_media(scene["integrator"], integrator, shapes, views[name].medium)
         return d.Description(
             file,
-            camera,
-            film,
+            views[name],
             integrator,
-            spp,
-            sampler,
             shapes,
             lights,
-            medium,
             tuple(self.notes),
             self.document,
             self.made,
