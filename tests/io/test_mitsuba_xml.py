@@ -70,15 +70,15 @@ def first_bsdf(scene: d.Description) -> Instance:
 
 def test_cornell_box_is_read_as_written():
     box = load(CORNELL, res=32, spp=4)
-    assert (box.film.width, box.film.height, box.spp, box.film.filter) == (32, 32, 4, Box())
+    assert (box.view.film.width, box.view.film.height, box.view.spp, box.view.film.filter) == (32, 32, 4, Box())
     assert box.integrator == d.Integrator(max_depth=8, rr_depth=5)
     assert [shape.name for shape in box.shapes][:3] == ["lamp", "floor", "ceiling"]
     lamp, floor = box.shapes[0], box.shapes[1]
     assert lamp.bsdf is floor.bsdf and lamp.bsdf.name == "white"
     np.testing.assert_allclose(lamp.emitter.values["radiance"], [18.387, 13.9873, 6.75357])
     assert lamp.emitter.name == "light" and floor.emitter is None
-    assert (box.camera.fov, box.camera.fov_axis) == (39.3077, "smaller")
-    np.testing.assert_allclose(box.camera.to_world[:3, 3], [0, 0, 3.9])
+    assert (box.view.camera.fov, box.view.camera.fov_axis) == (39.3077, "smaller")
+    np.testing.assert_allclose(box.view.camera.to_world[:3, 3], [0, 0, 3.9])
     np.testing.assert_allclose(floor.geometry.to_world @ [0, 0, 0, 1], [0, -1, 0, 1], atol=1e-15)
 
 
@@ -571,14 +571,15 @@ def test_defaults_of_sensor_film_and_integrator_are_mitsubas(read, mitsuba):
     scene = read("")
     sensor = mitsuba.load_string(f'<scene version="3.0.0">{SENSOR}</scene>').sensors()[0]
     params = mitsuba.traverse(sensor)
-    assert (scene.film.width, scene.film.height) == tuple(sensor.film().size())
-    assert scene.spp == sensor.sampler().sample_count()
-    assert (scene.camera.near_clip, scene.camera.far_clip) == pytest.approx((params["near_clip"], params["far_clip"]))
-    assert str(sensor.film().rfilter()) == f"GaussianFilter[stddev={scene.film.filter.stddev:.2f}, radius=2.00]"
-    assert scene.film.filter == Gaussian(0.5, 2)
+    assert (scene.view.film.width, scene.view.film.height) == tuple(sensor.film().size())
+    assert scene.view.spp == sensor.sampler().sample_count()
+    camera = scene.view.camera
+    assert (camera.near_clip, camera.far_clip) == pytest.approx((params["near_clip"], params["far_clip"]))
+    assert str(sensor.film().rfilter()) == f"GaussianFilter[stddev={scene.view.film.filter.stddev:.2f}, radius=2.00]"
+    assert scene.view.film.filter == Gaussian(0.5, 2)
     # 50 mm on 36 x 24 mm film, measured along the diagonal; Mitsuba keeps what that makes along x
-    assert scene.camera.fov_axis == "diagonal"
-    x_fov = 2 * math.degrees(math.atan(math.tan(math.radians(scene.camera.fov / 2)) * 4 / 5))
+    assert scene.view.camera.fov_axis == "diagonal"
+    x_fov = 2 * math.degrees(math.atan(math.tan(math.radians(scene.view.camera.fov / 2)) * 4 / 5))
     assert x_fov == pytest.approx(params["x_fov"], rel=1e-5)
     path = mitsuba.load_string('<scene version="3.0.0"><integrator type="path"/></scene>').integrator()
     assert f"rr_depth = {scene.integrator.rr_depth}\n" in str(path)
@@ -588,7 +589,7 @@ def test_defaults_of_sensor_film_and_integrator_are_mitsubas(read, mitsuba):
 def test_thin_lens_focuses_at_the_far_clip_unless_told(read, mitsuba):
     lens = '<float name="aperture_radius" value="0.1"/><float name="far_clip" value="9"/>'
     lens = f'<sensor type="thinlens">{lens}</sensor>'
-    camera = read("", sensor=lens).camera
+    camera = read("", sensor=lens).view.camera
     theirs = mitsuba.traverse(mitsuba.load_string(f'<scene version="3.0.0">{lens}</scene>').sensors()[0])
     assert camera.aperture_radius == 0.1
     assert camera.focus_distance == pytest.approx(theirs["focus_distance"]) == 9
@@ -606,8 +607,8 @@ def test_film_crop_filter_and_settings_without_effect(read):
       <string name="pixel_format" value="rgb"/><string name="component_format" value="float16"/>
       <rfilter type="gaussian"><float name="stddev" value="0.7"/></rfilter></film>"""
     scene = read("", sensor=f'<sensor type="perspective">{film}</sensor>')
-    assert scene.film.crop == (4, 0, 20, 30)
-    assert (scene.film.filter.stddev, scene.film.filter.radius) == (0.7, pytest.approx(2.8))
+    assert scene.view.film.crop == (4, 0, 20, 30)
+    assert (scene.view.film.filter.stddev, scene.view.film.filter.radius) == (0.7, pytest.approx(2.8))
     assert any("component_format has no effect" in note for note in scene.notes)
 
 
@@ -615,7 +616,7 @@ def test_film_crop_filter_and_settings_without_effect(read):
 def test_any_sampler_sets_spp_and_is_noted(read, kind):
     inside = '<integer name="sample_count" value="9"/><integer name="seed" value="4000000000"/>'
     scene = read("", sensor=f'<sensor type="perspective"><sampler type="{kind}">{inside}</sampler></sensor>')
-    assert (scene.spp, scene.sampler) == (9, kind)
+    assert (scene.view.spp, scene.view.sampler) == (9, kind)
     assert any(kind in note for note in scene.notes)
 
 
@@ -776,8 +777,8 @@ def test_what_has_no_effect_is_taken_and_noted(read, picture, place, names):
 
     with_it, without = (loaded(read, place, inside) for inside in ("".join(map(given, names)), ""))
     assert told(with_it) == set(names) and not told(without)
-    assert with_it.integrator == without.integrator and with_it.spp == without.spp
-    assert repr(with_it.camera) == repr(without.camera) and with_it.film == without.film
+    assert with_it.integrator == without.integrator and with_it.view.spp == without.view.spp
+    assert repr(with_it.view.camera) == repr(without.view.camera) and with_it.view.film == without.view.film
 
 
 @pytest.mark.parametrize(("place", "names"), [case[1:] for case in WITHOUT_EFFECT], ids=[c[0] for c in WITHOUT_EFFECT])
@@ -817,7 +818,7 @@ def test_prb_ends_at_its_own_depth(read):
 def test_the_first_of_several_sensors_is_used(read):
     second = '<sensor type="orthographic" id="other"/>'
     scene = read(second, sensor=f'<sensor type="perspective">{FOV}</sensor>')
-    assert scene.camera.fov == 40
+    assert scene.view.camera.fov == 40
     assert any('scene.xml:2: <sensor type="orthographic"> is left out' in note for note in scene.notes)
 
 
@@ -828,7 +829,7 @@ def test_another_sensor_is_chosen_by_its_number_or_id(tmp_path, which):
         for name, fov in (("left", 30), ("right", 50))
     )
     (tmp_path / "scene.xml").write_text(f'<scene version="3.0.0">{views}</scene>')
-    assert load(tmp_path / "scene.xml", which).camera.fov == 50
+    assert load(tmp_path / "scene.xml", which).view.camera.fov == 50
     with pytest.raises(InputError, match=r"scene.xml: there is no sensor \'rihgt\'; use 0 to 1 or left, right; did"):
         load(tmp_path / "scene.xml", "rihgt")
     with pytest.raises(InputError, match="there is no sensor 2; use 0 to 1"):
@@ -892,9 +893,9 @@ def old(tmp_path):
 
 def test_older_files_have_older_names(old):
     scene = load(old)
-    assert scene.integrator == d.Integrator(max_depth=7, rr_depth=3) and scene.spp == 16
-    assert (scene.camera.near_clip, scene.camera.far_clip, scene.camera.fov_axis) == (0.5, 20, "smaller")
-    np.testing.assert_allclose(scene.camera.to_world[:3, 3], [0, 1, 5])
+    assert scene.integrator == d.Integrator(max_depth=7, rr_depth=3) and scene.view.spp == 16
+    assert (scene.view.camera.near_clip, scene.view.camera.far_clip, scene.view.camera.fov_axis) == (0.5, 20, "smaller")
+    np.testing.assert_allclose(scene.view.camera.to_world[:3, 3], [0, 1, 5])
     glass, board = (shape.bsdf.values for shape in scene.shapes)
     assert (glass["int_ior"], glass["ext_ior"]) == (1.7, 1.1) and scene.shapes[0].flip_normals
     np.testing.assert_array_equal(board["reflectance"].values["to_uv"], [[4, 0, 1], [0, 2, 0]])  # shifts, then scales
@@ -905,8 +906,8 @@ def test_older_files_mean_what_they_mean_to_mitsuba(mitsuba, old):
     old.write_text(OLD.replace("lookAt", "lookat"))  # Mitsuba 3.9 no longer renames this one
     ours, theirs = load(old), mitsuba.load_file(str(old))
     sensor = mitsuba.traverse(theirs.sensors()[0])
-    np.testing.assert_allclose(ours.camera.to_world, np.array(sensor["to_world"].matrix), atol=1e-6)
-    assert sensor["far_clip"] == ours.camera.far_clip
+    np.testing.assert_allclose(ours.view.camera.to_world, np.array(sensor["to_world"].matrix), atol=1e-6)
+    assert sensor["far_clip"] == ours.view.camera.far_clip
     glass, board = (mitsuba.traverse(shape.bsdf()) for shape in theirs.shapes())
     assert glass["eta"] == pytest.approx(1.7 / 1.1)
     to_uv = np.array(board["reflectance.to_uv"].matrix)
