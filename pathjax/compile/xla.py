@@ -18,6 +18,8 @@ import warnings
 import jax
 import jaxlib
 
+from pathjax.system.cores import cores
+
 _OPTION = "xla_cpu_small_while_loop_byte_threshold"
 _FLAG = f"--xla_backend_extra_options={_OPTION}=1000000000000"
 # XLA halves the vectors of processors that have them this wide; kernels of lanes gain a tenth or more from whole ones.
@@ -62,11 +64,11 @@ def setup() -> None:
         patience = "" if _PATIENCE_OPTION in flags else _PATIENCE_FLAGS
         os.environ["XLA_FLAGS"] = " ".join(filter(None, (flags, _FLAG, width, patience)))
     devices_chosen = _DEVICE_FLAG in flags or jax.config.jax_num_cpu_devices >= 0
-    devices = max(_cores(), jax.config.jax_num_cpu_devices, *map(int, re.findall(rf"{_DEVICE_FLAG}=(\d+)", flags)))
+    devices = max(cores(), jax.config.jax_num_cpu_devices, *map(int, re.findall(rf"{_DEVICE_FLAG}=(\d+)", flags)))
     os.environ.setdefault(_POOL_VARIABLE, str(_POOL_OF_A_DEVICE * devices))
     try:
         if not devices_chosen:
-            jax.config.update("jax_num_cpu_devices", _cores())
+            jax.config.update("jax_num_cpu_devices", cores())
         elif wanted:
             # The update refuses a started backend: the one public way to ask whether it has started.
             chosen = jax.config.jax_num_cpu_devices
@@ -86,8 +88,3 @@ def setup() -> None:
 def native() -> bool:
     """Whether loops over rays become native code here: on CPUs, unless the user opted out."""
     return jax.default_backend() == "cpu" and _OPTION in os.environ.get("XLA_FLAGS", "")
-
-
-def _cores() -> int:
-    """Number of cores that this process may use, where the system tells."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -7,8 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pathjax.shapes.accel import build as bvh_build
+from pathjax.shapes.accel import binary
 from pathjax.shapes.accel.build import build
+from pathjax.system import cores
 
 RULES = ["sah", "equal", "middle"]
 
@@ -60,6 +61,12 @@ def check(tree, lo, hi, leaf_size=8, width=8):
     while len(level):
         depth, level = depth + 1, tree.child[level][tree.child[level] > 0]
     assert depth == tree.depth
+
+
+def alike(first, *others):
+    for other in others:
+        for name in ("bounds", "child", "leaf_first", "leaf_count", "order"):
+            assert np.array_equal(getattr(first, name), getattr(other, name), equal_nan=True)
 
 
 def enter(lo, hi, o, d, axis):
@@ -173,7 +180,7 @@ def test_equal_counts_give_a_balanced_tree():
 def test_sah_is_the_cheapest_rule():
     for lo, hi in (random_boxes(3000), surface(60)):
         cost = {rule: build(lo, hi, rule).sah_cost for rule in RULES}
-        assert cost["sah"] < 0.97 * min(cost["equal"], cost["middle"])
+        assert cost["sah"] < 0.98 * min(cost["equal"], cost["middle"])
 
 
 def test_one_leaf_costs_what_is_tested():
@@ -182,14 +189,23 @@ def test_one_leaf_costs_what_is_tested():
     assert tree.sah_cost == pytest.approx(2) and tree.depth == 1             # the root's boxes, and one leaf as large
 
 
-def test_nodes_too_large_for_a_group(monkeypatch):
+def test_few_places_for_splits_cost_little(monkeypatch):
     lo, hi = surface(60)
     cost = build(lo, hi).sah_cost
-    monkeypatch.setattr(bvh_build, "GROUP", 200)
-    monkeypatch.setattr(bvh_build, "CANDIDATES", 5)
+    monkeypatch.setattr(binary, "PLACES", 16)
     tree = build(lo, hi)
     check(tree, lo, hi)
-    assert tree.sah_cost < 1.15 * cost
+    assert tree.sah_cost < 1.05 * cost
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_the_same_tree_on_any_number_of_cores(rule, monkeypatch):
+    monkeypatch.setattr(binary, "BATCH", 500)  # so that some nodes are divided among cores, and others dealt to them
+    trees = []
+    for number in (1, 2, 5):
+        monkeypatch.setattr(cores, "cores", lambda number=number: number)
+        trees.append(build(*surface(40), rule))
+    alike(*trees)
 
 
 @pytest.mark.parametrize("rule", RULES)
@@ -225,9 +241,7 @@ def test_invariants_hold_for_any_boxes(corners, rule, leaf_size, width):
 
 def test_the_same_tree_every_time():
     lo, hi = surface(40)
-    first, second = build(lo, hi), build(lo.astype(np.float64), hi.astype(np.float64))
-    for name in ("bounds", "child", "leaf_first", "leaf_count", "order"):
-        assert np.array_equal(getattr(first, name), getattr(second, name), equal_nan=True)
+    alike(build(lo, hi), build(lo.astype(np.float64), hi.astype(np.float64)))
 
 
 def test_refusals():

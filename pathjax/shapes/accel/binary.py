@@ -1,0 +1,220 @@
+"""A binary tree over boxes: level by level, all open nodes at once, over the cores.
+
+The primitives stay sorted by centroid along each axis, so a split is an axis and a count whatever the rule, and
+centroids that coincide are no special case. The surface area heuristic is evaluated between any two primitives of a
+small node (Wald and Havran 2006, "On building fast kd-trees for ray tracing, and on doing that in O(N log N)"), and at
+PLACES places of equal counts of a larger one. Nodes of about the same count lie side by side in memory, a place of each
+in a row: running bounds of all of them are then a few operations on whole rows, which NumPy vectorises.
+
+Nothing depends on the number of cores: what is done at once are nodes, or exact maxima of parts.
+"""
+
+from __future__ import annotations
+
+from functools import partial, reduce
+
+import numpy as np
+
+from pathjax.system.cores import over_cores
+
+THICKNESS = np.float32(1e-6)  # of the scene, added to every extent: flat and linear boxes have areas to compare too
+PLACES = 128  # a multiple of twice as many makes trees half a percent cheaper to search, and takes a third longer
+BATCH = 1 << 16  # primitives whose nodes are split together: their arrays stay in the cache
+SPREAD = 1.15  # of counts in a batch, which fills all of its nodes up to the largest
+
+
+def binary_tree(unit, rule, leaf_size):
+    """Split every node of more than `leaf_size` primitives.
+
+    Args:
+        unit: (2, 3, P) float32 from 0 to 1, lower and upper corners of boxes.
+        rule: of `RULES`.
+    Returns, for B nodes of which parents come first:
+        left:   (B,) int64, the first of a node's two children, which are neighbours; 0 at a leaf.
+        start:  (B,) int64, how many primitives come before the node's, depth first.
+        count:  (B,) int64, its primitives.
+        levels: slices of B, from the root down.
+        leaf_of: (P,) int64, the leaf that holds each primitive.
+    """
+    p = unit.shape[2]
+    rows = np.zeros((p, 8), np.float32)  # of 32 bytes, which NumPy gathers faster than 24
+    rows[:, :3], rows[:, 3:6] = -unit[0].T, unit[1].T + THICKNESS
+    centre = unit[0] + unit[1]
+    left, start, count = np.zeros((3, 2 * p), np.int64)
+    side, leaf_of = np.zeros(p, bool), np.zeros(p, np.int64)
+    count[0], levels = p, [slice(0, 1)]
+    nodes = np.arange(p > leaf_size)  # the open ones of this level
+    with over_cores() as run:
+        by_axis = run(sorted_by, centre.view(np.int32), [np.arange(p)] * 3)
+        order = np.stack(list(by_axis))  # (3, n): of the open nodes, by node, then centroid
+        while len(nodes):
+            size = count[nodes]
+            first = np.cumsum(size) - size
+            axis, nl = RULES[rule](order, rows, centre, first, size, leaf_size, run)
+            partition(order, first, size, axis, nl, side, run)
+            level = slice(levels[-1].stop, levels[-1].stop + 2 * len(nodes))
+            levels.append(level)
+            left[nodes] = np.arange(level.start, level.stop, 2)
+            count[level] = np.stack([nl, size - nl], 1).ravel()
+            start[level] = np.stack([start[nodes], start[nodes] + nl], 1).ravel()
+            is_open = count[level] > leaf_size
+            kept = np.repeat(is_open, count[level])
+            closed = np.flatnonzero(~kept)
+            leaf_of[order[0, closed]] = np.repeat(np.arange(level.start, level.stop), count[level])[closed]
+            order = np.take(order, np.flatnonzero(kept), axis=1) if len(closed) else order
+            nodes = np.flatnonzero(is_open) + level.start
+    b = levels[-1].stop
+    return left[:b], start[:b], count[:b], levels, leaf_of
+
+
+def sorted_by(key, values):
+    """`values` (P,) >= 0 by ascending int32 `key` (P,), stable: one fast sort of 64-bit integers."""
+    return np.sort(key.astype(np.int64) << 32 | values) & 0xFFFFFFFF
+
+
+# ---- rules: the axis (M,) to split each of M nodes along, and how many primitives (M,) go to the left ----------------
+# order: (3, n) as above; rows: (P, 8) the lower corner negated (3), the upper one (3), padding; centre: (3, P);
+# first, count: (M,) where a node begins in `order`, and its primitives.
+
+
+def least_cost(order, rows, centre, first, count, leaf_size, run):
+    """The least surface area heuristic."""
+    axis, nl = np.empty((2, len(count)), np.int64)
+    choose = partial(_least_cost, order, rows, leaf_size)
+    single, many = [], []
+    for nodes in _alike(count):
+        (single if count[nodes[0]] > BATCH else many).append(nodes)
+    chosen = [choose(first[nodes], count[nodes], run) for nodes in single]
+    chosen += run(choose, [first[nodes] for nodes in many], [count[nodes] for nodes in many])
+    for nodes, (axes, numbers) in zip(single + many, chosen, strict=True):
+        axis[nodes], nl[nodes] = axes, numbers
+    return axis, nl
+
+
+def _alike(count):
+    """Batches of nodes of about the same count, that have some BATCH primitives together, or more in one node alone."""
+    by = np.argsort(count, kind="stable")
+    size, full = np.log(count[by]) // np.log(SPREAD), np.cumsum(count[by]) // BATCH
+    return np.split(by, np.flatnonzero(np.diff(size) + np.diff(full)) + 1)
+
+
+def _least_cost(order, rows, leaf_size, first, count, run=map):
+    """Of a batch of nodes: the best of some splits, then the best of those between its neighbours."""
+    start = first + order.shape[1] * np.arange(3)[:, None]  # (3, M) of each axis in all of `order`
+    find = partial(_least_between, order.ravel(), rows, leaf_size, start, count, run=run)
+    nothing = np.full((6, *start.shape), -np.inf, np.float32)
+    key, *between = find(np.zeros_like(count)[None], count[None], nothing, nothing)
+    if count.max() > PLACES:
+        key, *_ = find(*between)
+    uneven = (key.min(0) & 0xFFFFFFFF) >> 1
+    return key.argmin(0), (count + np.where(key.min(0) & 1, uneven, -uneven)) >> 1
+
+
+def _least_between(order, rows, leaf_size, start, count, low, high, before, after, run):
+    """The least cost of splits with more than `low` primitives on the left and less than `high`.
+
+    A side costs its area times (its primitives + the places in the leaves that they fill at least). Up to PLACES - 1
+    splits are tried, with equal numbers of primitives in between, up to one.
+
+    Args:
+        start: (3, M) where the node begins in the flat `order`, by axis; low, high: (1 or 3, M).
+        before, after: (6, 3, M) bounds, as in `rows`, of what comes before `low` and from `high` on.
+    Returns:
+        (3, M) the cost above, and below it how uneven the split is, and which way; then low, high, before and after of
+        what lies between the splits tried next to it.
+    """
+    wide = high - low
+    ends = np.arange(min(wide.max(), PLACES) + 1)[:, None, None] * (wide / np.minimum(wide, PLACES))
+    ends = low + np.minimum(ends.astype(np.int64), wide)  # (places + 1, 1 or 3, M); the last one may be repeated
+    begin, last = start + np.minimum(ends[:-1], high - 1), start + np.maximum(ends[1:], low + 1) - 1
+    most, step = (last - begin).max() + 1, max(BATCH // begin.size, 1)
+
+    def bounds(some):
+        at = np.minimum(begin + np.arange(some.start, some.stop)[:, None, None, None], last)
+        return np.maximum.reduce(np.take(rows, np.take(order, at), axis=0), axis=0)
+
+    parts = run(bounds, [range(k, min(k + step, most)) for k in range(0, most, step)])
+    left, right = np.empty((2, 6, len(ends), *start.shape), np.float32)
+    left[:, 1:] = right[:, :-1] = np.moveaxis(reduce(np.maximum, parts), 3, 0)[:6]
+    left[:, 0], right[:, -1] = before, after
+    for k in range(1, len(ends)):
+        np.maximum(left[:, k], left[:, k - 1], out=left[:, k])
+        np.maximum(right[:, -k - 1], right[:, -k], out=right[:, -k - 1])
+
+    nl = ends[1:-1]
+    nr = count - nl
+    area_l, area_r = (half_area(*(bound[:3, 1:-1] + bound[3:, 1:-1])) for bound in (left, right))
+    weight_l, weight_r = ((n + -(-n // leaf_size) * leaf_size).astype(np.float32) for n in (nl, nr))
+    weight_l[nl == high] = np.inf
+    cost = area_l * weight_l + area_r * weight_r
+    # The bits of positive floats order as these do. Of costs equal but for rounding, the most even.
+    key = (cost.view(np.int32) & ~7).astype(np.int64) << 32 | (np.abs(nl - nr) << 1 | (nl > nr))
+    place = key.argmin(0)[None]
+    low, high = (np.take_along_axis(np.broadcast_to(ends, left.shape[1:]), place + k, axis=0)[0] for k in (0, 2))
+    before, after = (np.take_along_axis(of, place[None] + k, axis=1)[:, 0] for of, k in ((left, 0), (right, 2)))
+    return key.min(0), low, high, before, after
+
+
+def half_area(x, y, z):
+    """Half the surface area of a box of these extents."""
+    return x * (y + z) + y * z
+
+
+def equal_counts(order, rows, centre, first, count, leaf_size, run):
+    """The axis of the largest extent of the centroids, and half of the count."""
+    return _widest(order, centre, first, count)[0], count // 2
+
+
+def middle(order, rows, centre, first, count, leaf_size, run):
+    """The same axis, and the count below the middle of that extent; half of the count if that would be none or all."""
+    axis, at = _widest(order, centre, first, count)
+    low, high = np.zeros_like(count), count
+    while (low < high).any():
+        half = (low + high) // 2
+        below = centre[axis, order[axis, first + np.minimum(half, count - 1)]] < at
+        low, high = np.where(below & (low < high), half + 1, low), np.where(below, high, half)
+    return axis, np.where((low > 0) & (low < count), low, count // 2)
+
+
+def _widest(order, centre, first, count):
+    """The axis of the largest extent of each node's centroids (M,) and the middle of it (M,)."""
+    axes = np.arange(3)[:, None]
+    lo, hi = centre[axes, order[:, first]], centre[axes, order[:, first + count - 1]]
+    axis = (hi - lo).argmax(0)
+    return axis, ((lo + hi) / 2)[axis, np.arange(len(count))]
+
+
+RULES = {"sah": least_cost, "equal": equal_counts, "middle": middle}
+
+
+# ---- partition ------------------------------------------------------------------------------------------------------
+def partition(order, first, count, axis, nl, side, run):
+    """Let `order` (3, n) become, in place, the order of the 2 M children of M nodes that lie one after the other.
+
+    side: (P,) bool, scratch.
+    """
+    split = partial(_partition, order, first, count, axis, nl, side)
+    ends = first + count
+    large = np.flatnonzero(count > BATCH)
+    full = np.searchsorted(ends, np.arange(BATCH, ends[-1], BATCH))
+    cuts = np.unique(np.concatenate([[0, len(count)], large, large + 1, full]))
+    some = [slice(a, b) for a, b in zip(cuts[:-1], cuts[1:], strict=True)]
+    for each in (nodes for nodes in some if count[nodes.start] > BATCH):
+        split(each, run)
+    list(run(split, (nodes for nodes in some if count[nodes.start] <= BATCH)))
+
+
+def _partition(order, first, count, axis, nl, side, nodes, run=map):
+    """Of neighbouring nodes; stable."""
+    begin = first[nodes.start]
+    part = order[:, begin : begin + count[nodes].sum()]
+    segment = np.repeat(np.arange(nodes.start, nodes.stop), count[nodes])
+    right = np.arange(begin, begin + len(segment)) >= (first + nl)[segment]
+    side[part[axis[segment], np.arange(len(segment))]] = right
+    to_left, to_right = np.flatnonzero(~right), np.flatnonzero(right)
+
+    def move(row):
+        goes = side[row]
+        row[to_left], row[to_right] = row[np.flatnonzero(~goes)], row[np.flatnonzero(goes)]
+
+    list(run(move, part))
