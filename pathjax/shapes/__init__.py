@@ -110,20 +110,22 @@ def build(
     margins = _part_coincident(by_table, dtype)
     tables, trees, lamps, shape_of = [], {}, [], []
     for table, parts in by_table.items():
-        lamps += _lamps(parts, len(tables), len(shape_of))
-        shape_of += [part.shape for part in parts for _ in part.primitives.areas]
+        lamps += _lamps(parts, len(tables), sum(map(len, shape_of)))
+        counts = [part.primitives.count for part in parts]
+        shape_of.append(np.repeat([part.shape for part in parts], counts))
         if parameters is not None:
             first = 0
-            for part in parts:
+            for part, count in zip(parts, counts, strict=True):
                 where = *path, "tables", len(tables), "attributes"
                 _enter_attributes(parameters, where, shapes[part.shape], part.primitives, first)
-                first += len(part.primitives.areas)
+                first += count
         primitives, lit = [part.primitives for part in parts], [part.lamp for part in parts]
         made, built = table.build(primitives, lit, dtype, rule, margins.get(table))
         tables.append(made)
         trees |= built
     lamps.sort(key=lambda lamp: (shapes[lamp.shape].geometry.comes_last, lamp.shape))
-    geometry = Geometry(tuple(tables), np.asarray(shape_of, np.int32), None, tangents, along)
+    shape = np.concatenate([np.zeros(0), *shape_of]).astype(np.int32)
+    geometry = Geometry(tuple(tables), shape, None, tangents, along)
     return geometry, lamps, {kind: tree for kind, tree in trees.items() if tree is not None}
 
 
@@ -159,8 +161,8 @@ def _lamps(parts: list[_Part], table, primitive):
     """Of one table, whose first primitive has this number."""
     first = 0
     for shape, primitives, _, lamp in parts:
-        areas = primitives.areas
         if lamp:
+            areas = primitives.areas
             boxes = np.stack(primitives.boxes(), 1)
             if primitives.one_lamp:
                 around = np.stack([boxes[:, 0].min(0), boxes[:, 1].max(0)])
@@ -168,7 +170,7 @@ def _lamps(parts: list[_Part], table, primitive):
             else:
                 each = enumerate(zip(areas, boxes, strict=True), first)
                 yield from (Lamp(shape, table, row, 1, area, primitive + row, box) for row, (area, box) in each)
-        first += len(areas)
+        first += primitives.count
 
 
 def _part_coincident(by_table: dict[type[Table], list[_Part]], dtype):
@@ -184,6 +186,6 @@ def _part_coincident(by_table: dict[type[Table], list[_Part]], dtype):
     contacts = coincident.contacts([faces for *_, faces in flat], dtype)
     for (table, primitives, _), moves, found in zip(flat, *contacts, strict=True):
         primitives.move(moves)
-        margins[table].append(np.broadcast_to(found, len(primitives.areas)))
+        margins[table].append(np.broadcast_to(found, primitives.count))
     joined = {table: np.concatenate(each) for table, each in margins.items()}
     return {table: np.asarray(each, dtype) for table, each in joined.items() if each.any()}

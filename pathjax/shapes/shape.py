@@ -81,6 +81,10 @@ class Primitives(ABC):
     areas: np.ndarray  # (P,)
     one_lamp: ClassVar[bool] = False  # they shine as one lamp, which is sampled uniformly in area; else each is one
 
+    @property
+    def count(self) -> int:
+        return len(self.areas)
+
     @abstractmethod
     def boxes(self) -> tuple[np.ndarray, np.ndarray]:
         """Lower and upper corners (P, 3) of boxes around them."""

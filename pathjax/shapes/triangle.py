@@ -37,6 +37,10 @@ class Facets(Primitives):
     one_lamp = True
 
     @property
+    def count(self):
+        return len(self.vertices)
+
+    @property
     def areas(self):
         return _areas(self.vertices)
 
@@ -48,10 +52,14 @@ class Facets(Primitives):
         some = self.vertices[:_SOME]
         largest = some[np.argmax(_areas(some))]
         corner, edge, normal = largest[0], largest[1] - largest[0], unit_normal(largest)
+        uneven = Faces(self.vertices, None, None, glass, lamp)
+        farthest = [np.abs(self.vertices[:, :, axis]).max() for axis in range(3)]
+        if np.abs((some - corner) @ normal).max() > 2 * precision(dtype) * (farthest @ np.abs(normal)):
+            return uneven  # without a look at all of a large mesh
         from_corner = self.vertices - corner
         reach = (np.abs(self.vertices) @ np.abs(normal)).max()
         if np.abs(from_corner @ normal).max() > 2 * precision(dtype) * reach:
-            return Faces(self.vertices, None, None, glass, lamp)
+            return uneven
         axes = np.stack([edge, np.cross(normal, edge)]) / np.linalg.norm(edge)
         places = from_corner @ axes.T
         (x0, y0), (x1, y1) = places.min((0, 1)), places.max((0, 1))
@@ -81,7 +89,7 @@ class Triangles(Table):
     @classmethod
     def build(cls, parts, lit, dtype, rule, margins):
         def joined(arrays):
-            return np.asarray(np.concatenate(arrays), dtype)
+            return np.concatenate([np.asarray(array, dtype) for array in arrays])
 
         def optional(name, default):
             values = [getattr(part, name) for part in parts]
@@ -95,13 +103,13 @@ class Triangles(Table):
         if any(lit):
             running = ((part.areas, on) for part, on in zip(parts, lit, strict=True))
             cdf = joined([np.cumsum(areas) / np.sum(areas) * on for areas, on in running])
-        vertices = np.concatenate([part.vertices for part in parts])
+        vertices = joined([part.vertices for part in parts])
         packed, tree, built = pack(leaf_numbers(vertices), *bounds(vertices), dtype, rule)
         names = dict.fromkeys(name for part in parts for name in part.attributes)
         attributes = {
             name: joined([part.attributes.get(name, np.zeros_like(part.vertices)) for part in parts]) for name in names
         }
-        made = cls(packed, tree, np.asarray(vertices, dtype), normals, uv, margins, cdf, attributes)
+        made = cls(packed, tree, vertices, normals, uv, margins, cdf, attributes)
         return made, {cls.kind: built}
 
     def prepare(self, o, d):
@@ -290,11 +298,12 @@ class Mesh(Shape):
 
     def primitives(self, flip):
         faces = self.faces[:, ::-1] if flip else self.faces
-        normals = None if self.normals is None else self.normals[faces] * (-1 if flip else 1)
+        normals = None if self.normals is None else np.take(self.normals, faces, axis=0) * (-1 if flip else 1)
         own = np.repeat(np.arange(len(faces))[:, None], 3, axis=1)
         entries = {name: faces if name.startswith("vertex_") else own for name in self.attributes}
-        carried = {name: values[entries[name]] for name, values in self.attributes.items()}
-        return Facets(self.vertices[faces], normals, None if self.uv is None else self.uv[faces], carried, entries)
+        carried = {name: np.take(values, entries[name], axis=0) for name, values in self.attributes.items()}
+        uv = None if self.uv is None else np.take(self.uv, faces, axis=0)
+        return Facets(np.take(self.vertices, faces, axis=0), normals, uv, carried, entries)
 
 
 class SerializedMesh(Mesh):

@@ -19,7 +19,7 @@ def pack(numbers, lo, hi, dtype, rule="sah", first=0, step=1):
     """Pack primitives for intersection.
 
     Args:
-        numbers: (P, K) what the intersection wants to know of each primitive.
+        numbers: (P, K) what the intersection wants to know of each primitive, in any dtype.
         lo, hi: (P, 3) bounds.
         first, step: primitive i is row first + step i of its table.
     Returns:
@@ -37,12 +37,13 @@ def pack(numbers, lo, hi, dtype, rule="sah", first=0, step=1):
         place = built.leaf_first[:, None] + lane
         rows = np.where(lane < built.leaf_count[:, None], built.order[np.minimum(place, count - 1)], -1)
         tree = bvh.pack(built, dtype)
-    padded = np.concatenate([numbers, np.full((1, numbers.shape[1]), np.nan)])
-    leaves = np.moveaxis(padded[rows], 1, 2).astype(dtype)  # row -1 is the padding
-    rows = np.where(rows < 0, rows, first + step * rows)
-    integer = integer_like(leaves.dtype)
-    blocks = np.concatenate([leaves.view(integer), rows[:, None].astype(integer)], 1)
-    return jnp.asarray(blocks), tree, built
+    dtype = np.dtype(dtype)
+    integer = integer_like(dtype)
+    blocks = np.empty((len(rows), numbers.shape[1] + 1, rows.shape[1]), integer)
+    blocks[:, :-1] = np.moveaxis(np.take(numbers.astype(dtype).view(integer), rows, axis=0, mode="wrap"), 1, 2)
+    np.moveaxis(blocks[:, :-1], 2, 1)[rows < 0] = np.array(np.nan, dtype).view(integer)
+    blocks[:, -1] = np.where(rows < 0, rows, first + step * rows)
+    return blocks, tree, built
 
 
 def numbers_of(block, dtype):

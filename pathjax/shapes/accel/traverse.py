@@ -31,7 +31,7 @@ def pack(built, dtype) -> Tree:
     planes = built.bounds.reshape(-1, 6, WIDTH).astype(dtype)
     integer = integer_like(planes.dtype)
     nodes = np.concatenate([planes.view(integer), built.child[:, None].astype(integer)], 1)
-    return Tree(jnp.asarray(nodes), built.depth)
+    return Tree(nodes, built.depth)
 
 
 def prepare(o, d):
