@@ -44,7 +44,7 @@ def contacts(shapes: list[Faces], dtype) -> tuple[list[np.ndarray], list[np.ndar
     """
     moves = [np.zeros(3 if each.normal is None else each.normal.shape) for each in shapes]
     margins = [np.zeros(len(each.corners)) for each in shapes]
-    size = max((np.abs(each.corners).max() for each in shapes), default=0)
+    size = max((end for each in shapes for end in (each.corners.max(), -each.corners.min())), default=0)
     movable = [i for i, each in enumerate(shapes) if each.normal is not None]
     fixed = [i for i, each in enumerate(shapes) if each.normal is None]
     eps = np.finfo(dtype).eps
@@ -113,10 +113,18 @@ def _coplanar(shapes: list[Faces], movable, others, least, dtype):
     """
     if not movable or not others:
         return
-    corners = np.concatenate([shapes[j].corners for j in others])
-    counts = [len(shapes[j].corners) for j in others]
-    owner, rows = np.repeat(others, counts), np.concatenate([np.arange(count) for count in counts])
-    lo, hi = (reduce(end, np.moveaxis(corners, 1, 0)) for end in (np.minimum, np.maximum))
+    # Of a large mesh few triangles lie in the box around all that may touch them.
+    around = np.concatenate([shapes[i].corners.reshape(-1, 3) for i in movable])
+    slack = precision(dtype) * np.abs(around).max(0)
+    bottom, top = around.min(0) - slack, around.max(0) + slack
+    near_by = []
+    for lo, hi in (_ends(shapes[j].corners) for j in others):
+        near_by.append(np.flatnonzero((lo <= top).all(1) & (hi >= bottom).all(1)))
+    owner, rows = np.repeat(others, [len(each) for each in near_by]), np.concatenate(near_by)
+    if not len(rows):
+        return
+    corners = np.concatenate([shapes[j].corners[each] for j, each in zip(others, near_by, strict=True)])
+    lo, hi = _ends(corners)
     longest = (hi - lo).max(0)
 
     @cache
@@ -146,3 +154,8 @@ def _coplanar(shapes: list[Faces], movable, others, least, dtype):
                 # The faces of a body differ from each other, and those of a mesh that stays in place are alike here.
                 groups = zip(*partners, strict=True) if shapes[j].normal is not None else [partners]
                 yield from ((i, row, j, *map(np.atleast_1d, group)) for group in groups)
+
+
+def _ends(corners):
+    """(F, K, 3) -> lower and upper ends (F, 3)."""
+    return [reduce(end, np.moveaxis(corners, 1, 0)) for end in (np.minimum, np.maximum)]

@@ -19,6 +19,7 @@ from pathjax.errors import InputError
 from pathjax.io.mesh import gltf, obj, ply, polygons, serialized, stl
 from pathjax.io.mesh.raw import Raw
 from pathjax.shapes import Mesh
+from pathjax.system.cores import over_cores
 
 READERS = {
     "obj": obj.read,
@@ -28,6 +29,8 @@ READERS = {
     "gltf": gltf.read,
     "serialized": serialized.read,
 }
+# Faces that are computed at once: their numbers stay in the cache.
+BLOCK = 1 << 15
 # Formats whose meshes are shaded smoothly where the file has no normals.
 SMOOTH = ("obj", "ply", "serialized")
 
@@ -113,7 +116,9 @@ def _in_world(
             notes.append(f"{crossing} polygons cross themselves; no triangles cover such just once")
     area_vectors = _area_vectors(vertices, faces)
     # Also false where an index is repeated. Both spaces: a transform rounds a line of three vertices to a sliver.
-    solid = _area_vectors(raw.vertices, faces).any(axis=0) & area_vectors.any(axis=0)
+    solid = area_vectors.any(axis=0)
+    if not np.array_equal(vertices, raw.vertices):
+        solid &= _area_vectors(raw.vertices, faces).any(axis=0)
     dropped = int(len(solid) - np.count_nonzero(solid))
     if dropped:
         faces, area_vectors = faces[solid], area_vectors[:, solid]
@@ -203,10 +208,28 @@ def _first_bad(values: np.ndarray) -> int:
 
 def _area_vectors(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """(3, F) twice the area along the normal; 0 for what has no area once rounded to float32."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        rounded = vertices.T.astype(np.float32).astype(np.float64)
-        a, b, c = (np.take(rounded, corner, axis=1) for corner in faces.T)
-        return polygons.cross(b - a, c - a)
+    with np.errstate(over="ignore"):
+        rounded = vertices.T.astype(np.float32).astype(np.float64, order="C")
+
+    def of_block(block: slice) -> np.ndarray:
+        with np.errstate(over="ignore", invalid="ignore"):
+            a, b, c = (np.take(rounded, corner, axis=1) for corner in faces[block].T)
+            return polygons.cross(b - a, c - a)
+
+    return _in_blocks(of_block, (3, len(faces)))
+
+
+def _in_blocks(of_block: Callable[[slice], np.ndarray], shape: tuple[int, ...]) -> np.ndarray:
+    """What a function returns of blocks of the last axis, joined."""
+    joined = np.empty(shape)
+
+    def fill(begin: int) -> None:
+        block = slice(begin, begin + BLOCK)
+        joined[..., block] = of_block(block)
+
+    with over_cores() as run:
+        list(run(fill, range(0, shape[-1], BLOCK)))
+    return joined
 
 
 def _smooth_normals(vertices: np.ndarray, faces: np.ndarray, area_vectors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -215,16 +238,27 @@ def _smooth_normals(vertices: np.ndarray, faces: np.ndarray, area_vectors: np.nd
     Returns:
         (V, 3) the sums, and (V,) where they cancel, as for a sheet that has a face for each of its sides, or are empty.
     """
-    unit = area_vectors / _norm(area_vectors)
-    sums, angles = np.zeros_like(vertices), np.zeros(len(vertices))
-    corners = [np.take(vertices.T, corner, axis=1) for corner in faces.T]
-    for k in range(3):
-        one, two = corners[(k + 1) % 3] - corners[k], corners[(k + 2) % 3] - corners[k]
-        cosine = _dot(one, two) / (_norm(one) * _norm(two))
-        angle = np.arccos(np.clip(cosine, -1, 1))
-        angles += np.bincount(faces[:, k], angle, len(vertices))
-        for axis in range(3):
-            sums[:, axis] += np.bincount(faces[:, k], angle * unit[axis], len(vertices))
+    columns = np.ascontiguousarray(vertices.T)
+
+    def weights(block: slice) -> np.ndarray:
+        """(4, 3, N) by corner the unit normal times the angle, and the angle."""
+        vectors = area_vectors[:, block]
+        unit = np.concatenate([vectors / _norm(vectors), np.ones_like(vectors[:1])])
+        corners = [np.take(columns, corner, axis=1) for corner in faces[block].T]
+        angles = []
+        for k in range(3):
+            one, two = corners[(k + 1) % 3] - corners[k], corners[(k + 2) % 3] - corners[k]
+            cosine = _dot(one, two) / (_norm(one) * _norm(two))
+            angles.append(np.arccos(np.clip(cosine, -1, 1)))
+        return unit[:, None] * angles
+
+    def total(of_corners: np.ndarray) -> np.ndarray:
+        return sum(np.bincount(at, each, len(vertices)) for at, each in zip(faces.T, of_corners, strict=True))
+
+    weighted = _in_blocks(weights, (4, 3, len(faces)))
+    with over_cores() as run:
+        *sums, angles = run(total, weighted)
+    sums = np.stack(sums, axis=1)
     cancel = _norm(sums.T) <= np.finfo(np.float32).eps * angles
     sums[cancel] = [1, 0, 0]
     return sums, cancel
