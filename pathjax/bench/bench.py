@@ -5,6 +5,7 @@ Efficiency is 1 / (relMSE x seconds), relMSE against a converged reference of pa
 
 from __future__ import annotations
 
+import json
 import platform
 from pathlib import Path
 
@@ -14,6 +15,7 @@ import pathjax
 from pathjax.bench import peers, plot
 from pathjax.bench.measure import Plan, measure
 from pathjax.bench.report import markdown
+from pathjax.bench.summary import summary
 from pathjax.errors import InputError
 from pathjax.system.files import check_writable, write_text
 from pathjax.system.interrupts import Interrupts
@@ -21,24 +23,16 @@ from pathjax.system.json_text import json_text
 from pathjax.system.output import Output, say
 
 
-def run(
-    files: list[str], defines: dict[str, str], plan: Plan, folder: Path | None, output: Output
-) -> tuple[dict, bool]:
-    """Measure scenes one after another; after each one the report of all is in the folder, if there is one.
+def prepare(folder: Path | None) -> None:
+    """Make the folder of a report, if there is to be one.
 
-    Returns:
-        The report, and whether all was measured. What ends it early, Ctrl-C too, costs no scene that is done.
     Raises:
-        InputError: a scene, the folder or the peer is not as it must be; nothing was measured.
+        InputError: it cannot be made, or not written into.
     """
     if folder is not None and not folder.parent.is_dir():
         raise InputError(f"{folder}: there is no folder {folder.parent}; make it first")
     if folder is not None and folder.exists() and not folder.is_dir():
         raise InputError(f"{folder}: is a file; name a folder")
-    for file in files:
-        pathjax.load_scene(file, parameters=defines)  # a wrong one is refused before an hour of work on the others
-    if plan.against == "mitsuba":
-        _find_mitsuba(files[0], defines)
     if folder is not None:
         try:
             folder.mkdir(exist_ok=True)
@@ -48,10 +42,41 @@ def run(
             check_writable(folder / name)
         if not plot.available():
             say("no plots, for there is no matplotlib: pip install 'pathjax[bench]'")
-    report = {"machine": machine(), "against": plan.against, "repeat": plan.repeat, "scenes": []}
+
+
+def run(
+    files: list[str], defines: dict[str, str], plan: Plan, folder: Path | None, output: Output, resume: bool = False
+) -> tuple[dict, bool]:
+    """Measure scenes one after another; after each one the report of all is in the folder, if there is one.
+
+    Args:
+        folder: `prepare`d; resume: go on after the scenes of the report that is there.
+    Returns:
+        The report, and whether all was measured. What ends it early, Ctrl-C too, costs no scene that is done.
+    Raises:
+        InputError: a scene, the report to go on with or the peer is not as it must be; nothing was measured.
+    """
+    report = {
+        "machine": machine(),
+        "against": plan.against,
+        "repeat": plan.repeat,
+        "plan": {"spp": plan.spps, "reference_spp": plan.reference_spp, "quick": plan.quick, "parameters": defines},
+        "scenes": [],
+        "summary": None,
+    }
+    if resume and (folder / "bench.json").exists():
+        report = _begun(folder / "bench.json", report)
+        report["scenes"] = [scene for scene in report["scenes"] if scene["file"] in files]
+    done = {scene["file"] for scene in report["scenes"]}
+    todo = [(name, file) for name, file in _plot_names(files) if file not in done]
+    for _, file in todo:
+        pathjax.load_scene(file, parameters=defines)  # a wrong one is refused before an hour of work on the others
+    if plan.against == "mitsuba" and todo:
+        _find_mitsuba(todo[0][1], defines)
     whole = True
     with Interrupts() as interrupts:
-        for name, file in _plot_names(files):
+        for name, file in todo:
+            say(f"scene {len(report['scenes']) + 1} of {len(files)}")
             try:
                 with interrupts.raised():
                     scene = measure(file, defines, plan)
@@ -66,6 +91,7 @@ def run(
                 say(f"{file}: {failure}")
             whole &= not scene["failures"]
             report["scenes"].append({**scene, "plot": None})
+            report["summary"] = summary(report["scenes"])
             if folder is not None:
                 _write(report, folder, name, output)
     return report, whole
@@ -79,6 +105,18 @@ def _write(report: dict, folder: Path, name: str, output: Output) -> None:
         scene["plot"] = name if place == folder / name else place and str(place)
     output.file(folder / "bench.json", lambda path: write_text(path, json_text(report, indent=2)))
     output.file(folder / "bench.md", lambda path: write_text(path, markdown(report)))
+
+
+def _begun(file: Path, report: dict) -> dict:
+    """The report of a file, which must have been measured as `report` would be."""
+    try:
+        begun = json.loads(file.read_text(encoding="utf-8"))
+        other = [key for key, value in report.items() if key not in ("scenes", "summary") and begun[key] != value]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(f"--resume: {file} is no report to go on with: {error!r}") from None
+    if other:
+        raise InputError(f"--resume: {file} has another {' and '.join(other)}; ask for the same, or for another folder")
+    return begun
 
 
 def _find_mitsuba(scene: str, defines: dict) -> None:

@@ -65,10 +65,11 @@ def reference_of(images, spp_each: int) -> Reference:
     return Reference(mean, variance, count * spp_each)
 
 
-def row(asked_spp: int, spp: int, seconds, errors, noise: float, paths: int) -> dict:
+def row(asked_spp: int, spp: int, seconds, errors, noise: float, paths: int, cpu_seconds=None) -> dict:
     """Time, error and efficiency of several renders that differ in their seeds.
 
     Args:
+        seconds: that each took; cpu_seconds: of all processors, which others' work on the machine lengthens little.
         errors: relMSE of each to the reference; noise: that of the reference.
         paths: of a render of one sample a pixel.
     The error of images that are not finite is not either; the efficiency is None where there is no noise.
@@ -81,6 +82,7 @@ def row(asked_spp: int, spp: int, seconds, errors, noise: float, paths: int) -> 
         "spp": spp,
         "seconds": list(seconds),
         "run_seconds": run,
+        "cpu_seconds": cpu_seconds and statistics.median(cpu_seconds),
         "mpaths_per_second": paths * spp / run / 1e6,
         "rel_mse": error,
         "rel_mse_standard_error": standard_error(errors),

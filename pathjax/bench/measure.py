@@ -45,9 +45,9 @@ class Subject(NamedTuple):
     reference: Reference
     paths: int  # of a render of one sample a pixel
 
-    def row(self, asked_spp, spp, seconds, images) -> dict:
+    def row(self, asked_spp, spp, seconds, images, cpu_seconds=None) -> dict:
         errors = self.reference.errors(images)
-        row = figures.row(asked_spp, spp, seconds, errors, self.reference.noise, self.paths)
+        row = figures.row(asked_spp, spp, seconds, errors, self.reference.noise, self.paths, cpu_seconds)
         return {**row, "bias": self.reference.bias(images)}
 
 
@@ -73,8 +73,7 @@ def measure(file: str, defines: dict[str, str], plan: Plan) -> dict:
     after = _timed(scene, kinds, range(plan.repeat // 2, plan.repeat))
     rows = []
     for spp in plan.spps:
-        (seconds, images), (more_seconds, more_images) = before[spp], after[spp]
-        row = subject.row(spp, spp, seconds + more_seconds, images + more_images)
+        row = subject.row(spp, spp, *(half + rest for half, rest in zip(before[spp], after[spp], strict=True)))
         best = figures.best(peers, spp)
         row["best_peer"] = best and best["sampler"]
         row["best_peer_spp"] = best and best["spp"]  # samplers round up
@@ -140,14 +139,15 @@ def _reference(scene: Scene, spp: int) -> Reference:
 
 
 def _timed(scene: Scene, kinds: dict, seeds) -> dict:
-    """(seconds, images) of every kind {name: (spp, strategy)}, one of each seed; kinds take turns."""
-    done = {name: ([], []) for name in kinds}
+    """(seconds, images, CPU seconds) of every kind {name: (spp, strategy)}, one of each seed; kinds take turns."""
+    done = {name: ([], [], []) for name in kinds}
     for seed in seeds:
         for name, (spp, strategy) in kinds.items():
-            started = time.perf_counter()
+            started, worked = time.perf_counter(), time.process_time()
             image = np.asarray(pathjax.render(scene, spp, seed, strategy))
-            done[name][0].append(time.perf_counter() - started)
-            done[name][1].append(image)
+            result = time.perf_counter() - started, image, time.process_time() - worked
+            for values, value in zip(done[name], result, strict=True):
+                values.append(value)
     return done
 
 
@@ -163,7 +163,7 @@ def _mitsuba(subject: Subject, sampler: str, plan: Plan, failures) -> list[dict]
     rows = []
     for k, (asked, done) in enumerate(zip(runs, report["runs"], strict=True)):
         images = arrays[f"images_{k}"][..., :3]
-        row = subject.row(asked["spp"], done["spp"], done["seconds"], images)
+        row = subject.row(asked["spp"], done["spp"], done["seconds"], images, done["cpu_seconds"])
         rows.append({"sampler": sampler, "program": report["program"], **row})
     return rows
 

@@ -29,6 +29,8 @@ def markdown(report: dict) -> str:
     ]
     for scene in scenes:
         lines += _scene(scene)
+    if report["summary"]:
+        lines += _summary(report["summary"])
     return "\n".join(lines)
 
 
@@ -52,6 +54,41 @@ def _scene(scene: dict) -> list[str]:
     if scene["closest_hits"]:
         lines += _rays(scene["closest_hits"], scene["rays"])
     return lines
+
+
+def _summary(summary: dict) -> list[str]:
+    """Of all scenes; ratios only beside a peer."""
+    rows, wall, cpu = summary["rows"], summary["wall"], summary["cpu"]
+    head = [f"at {summary['spp']} spp", "run s", "relMSE", "compiled s"]
+    cells = [
+        [row["scene"], f"{row['seconds']:.3f}", _number(row["rel_mse"]), f"{row['compile_seconds']:.2f}"]
+        for row in rows
+    ]
+    lines = ["## All scenes", ""]
+    if wall is None:
+        return lines + _table(head, cells)
+    head += ["efficiency ratio", "by CPU time", "time ratio", "relMSE ratio", "over Mitsuba's"]
+    for row, line in zip(rows, cells, strict=True):
+        if row["efficiency_ratio"] is None:
+            line += [""] * 5
+            continue
+        given = math.isfinite(row["relative_error"])
+        sure = f" ± {row['relative_error']:.0%}" if given else ""
+        line += [f"{row['efficiency_ratio']:.2f}{sure}"]
+        line += [f"{row[key]:.2f}" for key in ("cpu_ratio", "time_ratio", "rel_mse_ratio")]
+        line += [row["best_peer"]]
+    said = "; ".join(
+        f"{each['geometric_mean']:.2f}{by}, the worst {each['worst']:.2f} ({each['worst_scene']})"
+        for each, by in ((wall, ""), (cpu, " by CPU time"))
+    )
+    return [
+        *lines,
+        *_table(head, cells),
+        f"Geometric mean of the {wall['scenes']} efficiency ratios: {said}.",
+        "",
+        "Ratios above 1: pathjax is ahead. ± is the standard error that those of both relMSE leave.",
+        "",
+    ]
 
 
 def _speed(scene: dict) -> list[str]:

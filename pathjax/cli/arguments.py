@@ -61,14 +61,19 @@ def parser() -> argparse.ArgumentParser:
     convert.add_argument("--json", action="store_true", help="print one JSON object on stdout")
 
     bench = subparsers.add_parser("bench", help="speed against error")
-    bench.add_argument("scenes", nargs="+", metavar="SCENE.xml")
+    bench.add_argument("scenes", nargs="*", metavar="SCENE.xml", help="none: twelve, and one number for all of them")
     bench.add_argument("-D", dest="defines", action="append", default=[], type=_pair, metavar="name=value")
     bench.add_argument("--against", choices=("mitsuba",), help="measure this peer in the same run")
-    bench.add_argument("--spp", type=_comma_separated(_positive), default=[16, 64, 256], metavar="16,64,256")
-    bench.add_argument("--reference-spp", type=_positive, default=16384, metavar="N", help="of the converged reference")
+    spp = "default: 16,64,256; of the twelve 64"
+    bench.add_argument("--spp", type=_comma_separated(_positive), metavar="16,64,256", help=spp)
+    reference = "of the converged reference; default: 16384, of the twelve 4096"
+    bench.add_argument("--reference-spp", type=_positive, metavar="N", help=reference)
     bench.add_argument("--repeat", type=_positive, default=5, metavar="N", help="timed runs of each; medians are shown")
     bench.add_argument("-o", "--output", metavar="DIR", help="also write bench.md, bench.json and plots to this folder")
-    bench.add_argument("--quick", action="store_true", help="speed against error alone")
+    bench.add_argument("--quick", action="store_true", help="speed against error alone; the twelve always are")
+    bunny = "a mesh, upright along y, for the box of the twelve that has a made one else"
+    bench.add_argument("--bunny", metavar="MESH.ply", help=bunny)
+    bench.add_argument("--resume", action="store_true", help="go on after the scenes in DIR/bench.json")
     bench.add_argument("--json", action="store_true", help="print one JSON object on stdout")
 
     compare = subparsers.add_parser(

@@ -248,7 +248,8 @@ def test_the_best_sampler_is_named_and_one_that_fails_is_told(tmp_path, capsys, 
                 raise peers.PeerFailed("no strata")
             images[f"images_{k}"] = np.stack([pathjax.render(scene, wanted["spp"], 50 + s) for s in wanted["seeds"]])
             second = 1e-6 if wanted["sampler"] == "multijitter" else 1.0
-            runs.append({"spp": wanted["spp"], "seconds": [second] * len(wanted["seeds"])})
+            seconds = [second] * len(wanted["seeds"])
+            runs.append({"spp": wanted["spp"], "seconds": seconds, "cpu_seconds": seconds})
         return {"program": "Mitsuba 0", "runs": runs}, images
 
     monkeypatch.setattr(peers, "call", call)

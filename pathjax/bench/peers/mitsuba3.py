@@ -18,13 +18,13 @@ OUTPUT.npz then holds, for run k, `images_k` (seeds, H, W, 3) float32. The repor
       "program": "Mitsuba 3.9.1", "variant": "llvm_ad_rgb", "threads": 2, "width": 256, "height": 256,
       "load_seconds": 0.1,
       "runs": [{"sampler": "independent", "requested_spp": 64, "spp": 64, "seeds": [1, 2, 3],
-                "warm_up_seconds": 3.1, "seconds": [2.6, 2.6, 2.7], "median_seconds": 2.6, "mpaths_per_second": 1.6,
-                "nonfinite": 0}]
+                "warm_up_seconds": 3.1, "seconds": [2.6, 2.6, 2.7], "cpu_seconds": [5.0, 5.0, 5.1],
+                "median_seconds": 2.6, "mpaths_per_second": 1.6, "nonfinite": 0}]
     }
 
 `spp` is what the sampler really took: all but independent may round up (stratified to a square, say). The warm-up
 compiles (Dr.Jit keeps kernels on disk, so a second process warms up faster) and renders once; it is no part of
-`seconds`, each of which runs from the call to the image in NumPy.
+`seconds`, each of which runs from the call to the image in NumPy; `cpu_seconds` are those of all threads.
 """
 
 from __future__ import annotations
@@ -137,12 +137,12 @@ def render_run(mi, scene, run: dict) -> tuple[dict, np.ndarray]:
     """Warm up, then render once for each seed: an entry of the report, and the images."""
 
     def timed(seed):
-        start = time.perf_counter()
+        start, worked = time.perf_counter(), time.process_time()
         image = np.array(mi.render(scene, seed=seed), dtype=np.float32)
-        return image, time.perf_counter() - start
+        return image, time.perf_counter() - start, time.process_time() - worked
 
-    _, warm_up = timed(WARM_UP_SEED)
-    images, seconds = zip(*map(timed, run["seeds"]), strict=True)
+    _, warm_up, _ = timed(WARM_UP_SEED)
+    images, seconds, cpu_seconds = zip(*map(timed, run["seeds"]), strict=True)
     images = np.stack(images)
     _, height, width, _ = images.shape
     spp = scene.sensors()[0].sampler().sample_count()
@@ -153,6 +153,7 @@ def render_run(mi, scene, run: dict) -> tuple[dict, np.ndarray]:
         "seeds": run["seeds"],
         "warm_up_seconds": warm_up,
         "seconds": seconds,
+        "cpu_seconds": cpu_seconds,
         "median_seconds": statistics.median(seconds),
         "mpaths_per_second": width * height * spp / statistics.median(seconds) / 1e6,
         "nonfinite": int((~np.isfinite(images)).sum()),
