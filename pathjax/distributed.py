@@ -1,16 +1,19 @@
-"""Several processes, on one machine or on many, that render one image by JAX's distributed runtime.
+"""Several processes, on one machine or on many, that share their work by JAX's distributed runtime.
 
-All of them run the same program, and do the same but for the calls of kernels, which are dealt out, and for what is
-written, which is the first one's. Whatever decides how a render goes on (time, signals, the noise so far) is agreed
-upon, so that they never part.
+All of them run the same program and do the same, but for what is written, which is the first one's. The items of a
+kernel are dealt to the devices of all (`compile.mapping`); `render_until` deals out whole calls of kernels, so that no
+device waits for another (`dealt`). Whatever decides how work goes on (time, signals, the noise so far) is agreed upon,
+so that they never part.
 """
 
 from __future__ import annotations
 
+import hashlib
 import os
+import re
 import socket
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from itertools import islice
 from pathlib import Path
@@ -22,6 +25,7 @@ import numpy as np
 from pathjax.compile import calls_at_once, concurrently
 from pathjax.compile.jax_compat import gathered
 from pathjax.errors import InputError
+from pathjax.system.interrupts import Interrupts
 
 T = TypeVar("T")
 # Seconds without a sign of life after which JAX ends all processes, and those in which they must find each other.
@@ -29,6 +33,8 @@ PATIENCE, MEETING = 10, 60
 # Calls of each device between two exchanges: all wait for the slowest, so the fewer exchanges the better; but signals
 # are heard then.
 _CALLS = 2
+# Words of what the transport raises when it has lost a process.
+TRANSPORT = re.compile("gloo|nccl|peer|connection|socket|heartbeat|coordination|deadline", re.IGNORECASE)
 
 _peers: list[tuple[str, int]] = []  # host and process number in the system, by process
 
@@ -62,15 +68,16 @@ def start(coordinator: str | None = None, processes: int | None = None, process:
     with _stdout_as_stderr():
         found = exchanged((here, np.int32(os.getpid())))
     _peers.extend((bytes(host).rstrip(b"\0").decode(errors="replace"), int(number)) for host, number in found)
+    same({"pathjax": _package(), f"version of JAX ({jax.__version__} here)": _digest(jax.__version__.encode())})
 
 
 def count() -> int:
-    return jax.process_count() if _peers else 1
+    return jax.process_count() if jax.distributed.is_initialized() else 1
 
 
 def index() -> int:
     """Of this process; 0 is the one that writes and tells."""
-    return jax.process_index() if _peers else 0
+    return jax.process_index() if jax.distributed.is_initialized() else 0
 
 
 def exchanged(tree: T) -> list[T]:
@@ -79,10 +86,8 @@ def exchanged(tree: T) -> list[T]:
     Raises:
         ProcessLost: one has ended.
     """
-    try:
+    with losses():
         found = jax.tree.map(np.array, gathered(tree))
-    except Exception as error:  # of whatever type the transport has it
-        raise ProcessLost(f"{_lost()}: {str(error).splitlines()[0]}") from None
     return [jax.tree.map(lambda x, i=i: x[i], found) for i in range(jax.process_count())]
 
 
@@ -91,15 +96,61 @@ def of_first(tree: T) -> T:
     return exchanged(tree)[0] if count() > 1 else tree
 
 
-def same(what: str, digest: str) -> None:
-    """Raises:
-    InputError: processes differ in what the digest is of.
+def same(digests: Mapping[str, str]) -> None:
+    """Compare what processes have: names, and digests of 16 letters.
+
+    Raises:
+        InputError: they differ.
     """
     if count() > 1:
-        own = np.frombuffer(digest.encode(), np.uint8)
-        others = [i for i, theirs in enumerate(exchanged(own)) if (theirs != own).any()]
-        if others:
-            raise InputError(f"process {index()} has another {what} than process {others[0]}; give all the same")
+        own = np.stack([np.frombuffer(digest.encode(), np.uint8) for digest in digests.values()])
+        for other, theirs in enumerate(exchanged(own)):
+            for what, differs in zip(digests, (theirs != own).any(1), strict=True):
+                if differs:
+                    raise InputError(f"process {index()} has another {what} than process {other}; give all the same")
+
+
+def _package() -> str:
+    """Digest of the code of pathjax, which may be of one version and yet not the same."""
+    files = sorted(Path(__file__).parent.rglob("*.py"))
+    return _digest(b"".join(file.read_bytes().replace(b"\r\n", b"\n") for file in files))
+
+
+def _digest(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()[:16]
+
+
+@contextmanager
+def losses() -> Iterator[None]:
+    """Raises:
+    ProcessLost: for what JAX raises within it, if there are several processes and one has ended.
+    """
+    try:
+        yield
+    except (ValueError, RuntimeError) as error:  # of either type the transport has it
+        if count() == 1 or isinstance(error, InputError | ProcessLost) or not (why := _lost(str(error))):
+            raise
+        said = str(error).partition("\n")[0]
+        raise ProcessLost(f"{why}: {said}") from None
+
+
+@contextmanager
+def interruptible(interrupts: Interrupts) -> Iterator[None]:
+    """`interrupts.raised` in one process. Several, which must not part, ask `heard` now and then."""
+    if count() == 1:
+        with interrupts.raised():
+            yield
+    else:
+        heard(interrupts)
+        yield
+
+
+def heard(interrupts: Interrupts) -> None:
+    """Raises:
+    KeyboardInterrupt: a signal came, to any process.
+    """
+    if highest(bool(interrupts.heard)):
+        raise KeyboardInterrupt
 
 
 def highest(number: int) -> int:
@@ -145,13 +196,13 @@ def _stdout_as_stderr() -> Iterator[None]:
         os.close(kept)
 
 
-def _lost() -> str:
-    """Which of the others has ended, where that can be known: on this machine."""
+def _lost(said: str) -> str | None:
+    """Which of the others has ended, where that can be known: on this machine. None: none, by what the error says."""
     here = socket.gethostname()
     gone = [process for process, (host, number) in enumerate(_peers) if host == here and _ended(number)]
     if gone:
         return f"process {', '.join(map(str, gone))} has ended"
-    return "another process has ended, or cannot be reached"
+    return "another process has ended, or cannot be reached" if TRANSPORT.search(said) else None
 
 
 def _ended(number: int) -> bool:

@@ -26,7 +26,9 @@ def main(arguments: list[str] | None = None) -> int:
         try:
             _join(options)
             # Only the command that is asked for: the solvers of `fit` alone take half a second.
-            status = importlib.import_module(f"pathjax.cli.{options.command}").run(options, output)
+            command = importlib.import_module(f"pathjax.cli.{options.command}")
+            with distributed.losses():
+                status = command.run(options, output)
         except InputError as error:
             say(str(error))
             status = WRONG

@@ -48,6 +48,7 @@ def parser() -> argparse.ArgumentParser:
     wrote = "writes PREFIX.json and PREFIX.png; of a texture also PREFIX.NAME.exr and the scene, PREFIX.xml"
     fit.add_argument("-o", "--output", default="fit", metavar="PREFIX", help=wrote)
     fit.add_argument("--json", action="store_true", help="print one JSON object on stdout")
+    _add_processes(fit)
 
     info = subparsers.add_parser("info", help="what a scene holds and what is compiled for it")
     _add_scene(info)

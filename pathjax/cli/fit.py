@@ -8,7 +8,7 @@ import numpy as np
 from rich.console import Console
 from rich.markup import escape
 
-from pathjax import images, inverse
+from pathjax import distributed, images, inverse
 from pathjax.cli import DONE, FAILED
 from pathjax.cli.inputs import load, numbers
 from pathjax.inverse import report
@@ -23,7 +23,8 @@ from pathjax.system.output import Output
 
 def run(options, output: Output) -> int:
     table, picture = (Path(f"{Path(options.output)}{suffix}") for suffix in (".json", ".png"))
-    for path in (table, picture):
+    first = distributed.index() == 0  # of several processes, the one that tells and writes
+    for path in (table, picture) if first else ():
         check_writable(path, [options.target, options.scene])
     start, names = {}, []
     for text in options.params:
@@ -33,16 +34,18 @@ def run(options, output: Output) -> int:
             start[name] = numbers("--param", name, value)
     target = inverse.read_target(options.target)
     scene = load(options)
-    if any(np.ndim(value) == 3 for name, value in parameters(scene).items() if name in names):
+    if first and any(np.ndim(value) == 3 for name, value in parameters(scene).items() if name in names):
         check_writable(Path(f"{options.output}.xml"), [options.target, options.scene])
     with Interrupts():
-        with Console(stderr=True).status("compiling") as status:
+        with Console(stderr=True, quiet=not first).status("compiling") as status:
 
             def show(entry):
                 status.update(escape(step_text(entry)))
 
             how = dict(spp=options.spp, seed=options.seed, smoothness=options.smoothness)
             fit = inverse.fit(scene, target, names, start=start, progress=show, **how)
+        if not first:
+            return DONE if fit.converged else FAILED
         facts = {"scene": str(options.scene), "target": str(options.target), "spp": options.spp, "seed": options.seed}
         facts |= report.facts(fit)
         output.file(table, lambda path: write_text(path, json_text(facts, indent=1) + "\n"))

@@ -48,12 +48,12 @@ def run(options, output: Output) -> int:
     # From here on a signal only ends the rendering: what is rendered is written, however many come.
     with Interrupts() as interrupts:
         result = render.run(progress=first)
-        if not first:
-            return DONE if result.reason != "interrupted" else FAILED
         layers = first_hits | _image_layers("error", result.standard_error)
         channels = {name: layers[name] for name in layers if name.partition(".")[0] in options.aov}
         if "bounces" in options.aov:
             channels |= _bounces(scene, result, options, interrupts, output)
+        if not first:
+            return DONE if result.reason != "interrupted" else FAILED
         made_of = {"scene": options.scene, "parameters": dict(options.defines + options.settings), "seed": options.seed}
         place = output.file(path, lambda place: picture.write(place, result, channels, **made_of))
         saved = render.checkpoint is not None and render.checkpoint.problem is None
@@ -74,7 +74,8 @@ def run(options, output: Output) -> int:
 def _check(path: Path, options) -> None:
     if path.suffix.lower() not in (".exr", ".png"):
         raise InputError(f"{path}: images are written as .exr or .png")
-    check_writable(path, [options.checkpoint] if options.checkpoint is not None else [])
+    if distributed.index() == 0:
+        check_writable(path, [options.checkpoint] if options.checkpoint is not None else [])
     aovs.check_names(options.aov, (*CHANNELS, "bounces"))
     if options.aov and path.suffix.lower() == ".png":
         raise InputError(f"{path}: --aov needs an .exr file; a .png holds one image")
@@ -111,10 +112,12 @@ def _bounces(scene, result: RenderResult, options, interrupts: Interrupts, outpu
         return {"": np.asarray(found.terms), "error.": found.standard_error}
 
     try:
-        with interrupts.raised():
+        with distributed.interruptible(interrupts):
             terms = wait_for(rendered)
     except (KeyboardInterrupt, Exception) as error:  # the image is there, whatever this second render ran out of
         output.failed = True
+        if distributed.index():
+            return {}
         say(f"{'interrupted' if isinstance(error, KeyboardInterrupt) else error}; the bounces are left out")
         return {}
     return {

@@ -1,4 +1,8 @@
-"""A function of one item over millions of them: on CPUs one native loop a device, elsewhere chunks of `vmap`."""
+"""A function of one item over millions of them: on CPUs one native loop a device, elsewhere chunks of `vmap`.
+
+Where several processes have joined (`distributed`), the devices are those of all of them. Each holds all items, does
+its share, and gets all results, so that whatever comes before and after is the same program in each.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +34,7 @@ _CHUNK_BYTES = 1 << 30
 
 @usual_promotion
 def native_map(f: Callable, xs, *shared, form: str | None = None, devices: int | None = None):
-    """`f(x, *shared)` for every x of `xs`, on all local devices.
+    """`f(x, *shared)` for every x of `xs`, on all devices.
 
     Args:
         f: pure function of one item, with real control flow.
@@ -39,7 +43,7 @@ def native_map(f: Callable, xs, *shared, form: str | None = None, devices: int |
         form: "lanes" (one native loop a device over groups of items, see `lanes`), "loop" (the same, item by item),
             "vmap" (chunks of vectorised items), or None: what suits the backend. All give the same results up to
             rounding.
-        devices: how many local devices to use; None: all.
+        devices: how many devices of this process to use; None: all, of all processes, each of which calls it then.
     Returns:
         pytree of arrays (N, ...); bitwise the same for every number of devices.
     Under `jax.vmap` each item loops over the batch, within the same kernel.
@@ -76,7 +80,7 @@ def native_map(f: Callable, xs, *shared, form: str | None = None, devices: int |
 
 @usual_promotion
 def native_fold(f: Callable, xs, *shared, start: Callable, finish: Callable, devices: int | None = None):
-    """What all items together leave in memory that they share (`together`), on all local devices.
+    """What all items together leave in memory that they share (`together`), on all devices.
 
     Items are dealt to parts, whose number depends on theirs alone. Each part has a memory of its own and is done by one
     device, and parts are added up in their order: so the sums are bitwise the same for every number of devices.
@@ -87,7 +91,7 @@ def native_fold(f: Callable, xs, *shared, start: Callable, finish: Callable, dev
         shared: pytrees that every item sees whole.
         start: number of lanes -> memory before the first item.
         finish: memory after the last item of a part -> pytree of arrays, which are added up.
-        devices: how many local devices to use; None: all.
+        devices: of `native_map`.
     """
     nbytes = sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(jax.eval_shape(lambda: finish(start(_LANES)))))
 
@@ -145,7 +149,7 @@ def _by_parts(part: Callable, xs, shared, devices: int | None, most: int = MOST_
     Item i belongs to part i % parts. Each device does some parts; how many there are depends on the items alone.
     """
     count = jax.tree.leaves(xs)[0].shape[0]
-    used = jax.local_devices()[:devices]
+    used = _used(devices)
     parts = min(MOST_PARTS, -(-count // ITEMS_OF_A_PART), most)
     rounds = -(-parts // len(used))
     each = -(-count // parts)
@@ -159,56 +163,65 @@ def _by_parts(part: Callable, xs, shared, devices: int | None, most: int = MOST_
         return x.reshape(len(used), rounds, *x.shape[1:])
 
     def on_one_device(xs, *shared):
-        return lax.map(lambda xs: part(xs, width, shared), jax.tree.map(lambda x: x[0], xs))
+        return lax.map(lambda xs: part(xs, width, shared), xs)
 
+    results = _dealt(on_one_device, used, jax.tree.map(deal, xs), shared)
+    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:parts], results)
+
+
+def _used(devices: int | None) -> list[jax.Device]:
+    return jax.devices() if devices is None else jax.local_devices()[:devices]
+
+
+def _dealt(f: Callable, used: list[jax.Device], xs, shared):
+    """f(xs, *shared) on each of the devices, of its own row of xs: both pytrees of arrays (devices, ...)."""
     if len(used) == 1:
-        results = on_one_device(jax.tree.map(deal, xs), *shared)
-    else:
-        spec = PartitionSpec("device")
-        results = jax.shard_map(
-            on_one_device,
-            mesh=Mesh(np.array(used), ("device",)),
-            in_specs=(spec, *(PartitionSpec() for _ in shared)),
-            out_specs=spec,
-            check_vma=False,
-        )(jax.tree.map(deal, xs), *shared)
-    return jax.tree.map(lambda x: x[:parts], results)
+        return jax.tree.map(lambda y: y[None], f(jax.tree.map(lambda x: x[0], xs), *shared))
+    # A process that holds a part of an array could do nothing with it but what all others do at the same time.
+    alone = all(device.process_index == jax.process_index() for device in used)
+
+    def on_one_device(xs, *shared):
+        mine = 0 if alone else lax.axis_index("device")
+        results = f(jax.tree.map(lambda x: x[mine], xs), *shared)
+        return jax.tree.map(lambda y: y[None] if alone else lax.all_gather(y, "device"), results)
+
+    rows = PartitionSpec("device") if alone else PartitionSpec()
+    mapped = jax.shard_map(
+        on_one_device,
+        mesh=Mesh(np.array(used), ("device",)),
+        in_specs=(rows, *(PartitionSpec() for _ in shared)),
+        out_specs=rows,
+        check_vma=False,
+    )
+    return mapped(xs, *shared)
 
 
 def _map(f, xs, shared, form, devices):
     count = jax.tree.leaves(xs)[0].shape[0]
     form = form or ("lanes" if native() else "vmap")
-    devices = jax.local_devices()[:devices]
-    each = -(-count // len(devices))
+    used = _used(devices)
+    each = -(-count // len(used))
     run = {
         # By the items of all devices, so that their number does not change the program.
         "lanes": partial(_lanes, width=_LANES if count >= MANY_ITEMS else _FEW_LANES),
         "loop": _loop,
         "vmap": partial(_vmap_chunks, chunk=_CHUNK_BYTES // _BYTES_PER_LANE),
     }[form]
-    if len(devices) == 1:
+    if len(used) == 1:
         return run(f, xs, shared)
 
     # Device i takes items i, i + D, i + 2 D, ...: each gets its share of the expensive part of an image.
     def deal(x):
-        x = jnp.concatenate([x, jnp.broadcast_to(x[:1], (each * len(devices) - count, *x.shape[1:]))])
-        return x.reshape(each, len(devices), *x.shape[1:]).swapaxes(0, 1)
+        x = jnp.concatenate([x, jnp.broadcast_to(x[:1], (each * len(used) - count, *x.shape[1:]))])
+        return x.reshape(each, len(used), *x.shape[1:]).swapaxes(0, 1)
 
     def gather(y):
-        return y.swapaxes(0, 1).reshape(each * len(devices), *y.shape[2:])[:count]
+        return y.swapaxes(0, 1).reshape(each * len(used), *y.shape[2:])[:count]
 
     def on_one_device(xs, *shared):
-        return jax.tree.map(lambda y: y[None], run(f, jax.tree.map(lambda x: x[0], xs), shared))
+        return run(f, xs, shared)
 
-    spec = PartitionSpec("device")
-    mapped = jax.shard_map(
-        on_one_device,
-        mesh=Mesh(np.array(devices), ("device",)),
-        in_specs=(spec, *(PartitionSpec() for _ in shared)),
-        out_specs=spec,
-        check_vma=False,
-    )
-    return jax.tree.map(gather, mapped(jax.tree.map(deal, xs), *shared))
+    return jax.tree.map(gather, _dealt(on_one_device, used, jax.tree.map(deal, xs), shared))
 
 
 def split_map(f: Callable, count: int, *shared, devices: int | None = None):
@@ -216,23 +229,16 @@ def split_map(f: Callable, count: int, *shared, devices: int | None = None):
 
     For arithmetic on whole arrays that every device holds: each computes a part of the columns.
     """
-    chosen = jax.local_devices()[:devices]
-    size = -(-count // len(chosen))
-    if len(chosen) == 1:
+    used = _used(devices)
+    size = -(-count // len(used))
+    if len(used) == 1:
         return f(jnp.int32(0), size, *shared)
 
-    def on_one_device(*shared):
-        return f(lax.axis_index("device") * size, size, *shared)[None]
+    def on_one_device(_, *shared):
+        return f(lax.axis_index("device") * size, size, *shared)
 
-    mapped = jax.shard_map(
-        on_one_device,
-        mesh=Mesh(np.array(chosen), ("device",)),
-        in_specs=PartitionSpec(),
-        out_specs=PartitionSpec("device"),
-        check_vma=False,
-    )
-    runs = jnp.moveaxis(mapped(*shared), 0, -2)
-    return runs.reshape(*runs.shape[:-2], size * len(chosen))[..., :count]
+    runs = jnp.moveaxis(_dealt(on_one_device, used, (), shared), 0, -2)
+    return runs.reshape(*runs.shape[:-2], size * len(used))[..., :count]
 
 
 def _loop(f, xs, shared):

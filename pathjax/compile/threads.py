@@ -16,9 +16,9 @@ def calls_at_once() -> int:
     return len(jax.local_devices()) if jax.default_backend() == "cpu" else 1
 
 
-def devices_of_a_call() -> int | None:
+def devices_of_a_call() -> int:
     """`devices` of `native_map` in a kernel for `concurrently`: one of a CPU runs on the thread that calls it."""
-    return 1 if jax.default_backend() == "cpu" else None
+    return 1 if jax.default_backend() == "cpu" else len(jax.local_devices())
 
 
 def concurrently(f: Callable, items: Iterable) -> Iterator[tuple]:

@@ -29,6 +29,7 @@ from pathjax.integrators.options import Counts, Options
 from pathjax.integrators.reconstruction import map_pixels
 from pathjax.kinds.parameter import Parameter
 from pathjax.scene import parameters as named
+from pathjax.scene.alike import by_all
 from pathjax.scene.scene import Scene
 from pathjax.sensors import film
 from pathjax.system import memory
@@ -71,6 +72,7 @@ class Wanted:
     glass: tuple[int, ...]  # rows of the dielectrics that get a difference
 
 
+@by_all
 @usual_promotion
 def jacobian(
     scene: Scene,

@@ -149,7 +149,7 @@ def spread_samples(
     ones = jnp.ones_like(scale)[..., None]
     weighted = jnp.concatenate([values, ones], -1) * scale[..., None]
     # Columns are pixels: those around the run, and what the last device has too many, have no samples.
-    spare = 2 * edge + len(jax.local_devices())
+    spare = 2 * edge + len(jax.devices())
     ends = (0, 0), (0, 0), (0, 0), (2 * edge, spare)
     u, weighted = (jnp.pad(jnp.moveaxis(x, -1, 2), ends) for x in (u, weighted))
 

@@ -24,6 +24,7 @@ import optimistix as optx
 from jax.typing import ArrayLike
 from jaxtyping import Array, Real
 
+from pathjax import distributed
 from pathjax.compile import usual_promotion
 from pathjax.errors import InputError
 from pathjax.integrators.options import check_counts
@@ -36,6 +37,7 @@ from pathjax.inverse.refine import refine
 from pathjax.inverse.scan import scan as scanned
 from pathjax.inverse.state import State
 from pathjax.inverse.target import Target
+from pathjax.scene.alike import by_all
 from pathjax.scene.scene import Scene
 from pathjax.system.interrupts import Interrupts
 
@@ -88,6 +90,7 @@ class Fit:
             return self.covariance / np.outer(sigma, sigma)
 
 
+@by_all
 @usual_promotion
 def fit(
     scene: Scene | Sequence[Scene],
@@ -117,7 +120,8 @@ def fit(
         scan: try indices of refraction over their whole range first, since a local method finds the nearest minimum.
         smoothness: of textures, how much neighbouring texels are expected to differ, in the root mean square and in
             units of the parameter; "auto" finds it out; None: nothing is supposed of neighbours.
-        progress: True for a line on stderr at each step, or a function that is called with each entry of the history.
+        progress: True for a line on stderr at each step, or a function that is called with each entry of the history;
+            of several processes, in the first.
     Returns:
         Fit. Ctrl-C ends it with what it has, marked as not converged.
     Raises:
@@ -138,6 +142,8 @@ def fit(
     if not isinstance(solver, optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser):
         raise InputError(f"solver is a {type(solver).__name__}; use a least-squares solver or minimiser of optimistix")
     tell = _print_step if progress is True else progress or None
+    if distributed.index():
+        tell = None
     views = problem.build(scene, target, names, start or {})
     if problem.is_many(views.vector):
         if chosen is not None:
@@ -148,7 +154,7 @@ def fit(
     with Interrupts() as interrupts:
         state = State(views, spp, seed, solver, tell, interrupts)
         try:
-            with interrupts.raised():
+            with distributed.interruptible(interrupts):
                 converged, message = _stages(state, scan)
         except KeyboardInterrupt:
             converged, message = False, "interrupted"
@@ -160,7 +166,7 @@ def _fit_many(problem: Problem, spp: int, seed: int, smoothness, tell) -> Fit:
     with Interrupts() as interrupts:
         search = Search(problem, spp, seed, prior, tell, interrupts)
         try:
-            with interrupts.raised():
+            with distributed.interruptible(interrupts):
                 converged, message = search.run()
         except KeyboardInterrupt:
             converged, message = False, "interrupted"

@@ -20,6 +20,7 @@ import numpy as np
 from scipy import ndimage
 from scipy.sparse.linalg import LinearOperator, cg
 
+from pathjax import distributed
 from pathjax.errors import InputError
 from pathjax.inverse import weights
 from pathjax.inverse.prior import Prior, is_grid
@@ -300,8 +301,7 @@ class Search:
             self.tell(entry)
 
     def listen(self, _=None) -> None:
-        if self.interrupts.heard:  # its exception may have been lost, while Python collected garbage
-            raise KeyboardInterrupt
+        distributed.heard(self.interrupts)  # its exception may have been lost, while Python collected garbage
 
 
 def _whole(samples: float) -> int:

@@ -31,6 +31,7 @@ from pathjax.inverse.parameter_vector import ParameterVector
 from pathjax.inverse.problem import Views
 from pathjax.inverse.target import Target
 from pathjax.scene import parameters as named
+from pathjax.scene.alike import by_all
 from pathjax.scene.scene import Scene
 from pathjax.system import memory
 
@@ -68,6 +69,7 @@ class NormalEquations:
     components: tuple[str, ...] = field(metadata={"static": True})
 
 
+@by_all
 @usual_promotion
 def normal_equations(
     scene: Scene | Sequence[Scene],

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from pathjax import distributed
 from pathjax.inverse import normal, uncertainty, weights
 from pathjax.inverse.compiled_cache import Stepper, compiled, identity
 from pathjax.inverse.normal import NormalEquations
@@ -100,5 +101,4 @@ class State:
         self.history.append({"stage": stage, "spp": spp, "values": values, "loss": loss, "seconds": seconds})
         if self.progress:
             self.progress(self.history[-1])
-        if self.interrupts.heard:  # its exception may have been lost, while Python collected garbage
-            raise KeyboardInterrupt
+        distributed.heard(self.interrupts)  # its exception may have been lost, while Python collected garbage

@@ -14,6 +14,7 @@ from pathjax.integrators import aov, pixel
 from pathjax.integrators.options import DEFAULTS, Options, check_counts
 from pathjax.integrators.reconstruction import map_pixels
 from pathjax.rendering.progressive import replicates
+from pathjax.scene.alike import by_all
 from pathjax.scene.parameters import nameless
 from pathjax.scene.scene import Scene
 from pathjax.sensors import film
@@ -24,6 +25,7 @@ MAX_SPP = 16
 CHUNK_PIXELS = 1 << 14
 
 
+@by_all
 @usual_promotion
 def render_aovs(scene: Scene, names: Sequence[str], spp: int = MAX_SPP, seed: int = 0) -> dict[str, np.ndarray]:
     """Return images of what the camera sees first, as Mitsuba's `aov` integrator does.

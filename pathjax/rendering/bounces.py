@@ -21,6 +21,7 @@ from pathjax.integrators.options import DEFAULTS, Options
 from pathjax.integrators.reconstruction import map_pixels
 from pathjax.rendering import tail
 from pathjax.rendering.progressive import error_estimate, replicates
+from pathjax.scene.alike import by_all
 from pathjax.scene.scene import Scene
 from pathjax.sensors import film
 
@@ -68,6 +69,7 @@ class Bounces:
         return tail.fit(means[:, known].mean(1), error)
 
 
+@by_all
 @usual_promotion
 def render_bounces(
     scene: Scene,

@@ -13,12 +13,14 @@ from jaxtyping import Array, Bool, Real
 from pathjax.compile import native_map, usual_promotion
 from pathjax.core.math import normalize, rescale
 from pathjax.core.types import Hit, Ray
+from pathjax.scene.alike import by_all
 from pathjax.scene.scene import Scene
 from pathjax.shapes import geometry
 
 Vectors = Real[Array | np.ndarray, "N 3"]
 
 
+@by_all
 @usual_promotion
 def closest_hit(scene: Scene, origins: Vectors, directions: Vectors) -> Hit:
     """Return the first primitive that each ray meets; directions are of any positive length.
@@ -32,6 +34,7 @@ def closest_hit(scene: Scene, origins: Vectors, directions: Vectors) -> Hit:
     return _closest_hit(scene.geometry, jnp.asarray(origins, dtype), jnp.asarray(directions, dtype))
 
 
+@by_all
 @usual_promotion
 def any_hit(
     scene: Scene, origins: Vectors, directions: Vectors, distances: Real[ArrayLike, "..."] = jnp.inf

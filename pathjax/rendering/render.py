@@ -19,10 +19,12 @@ from pathjax.errors import InputError
 from pathjax.integrators import pixel
 from pathjax.integrators.options import DEFAULTS, Options
 from pathjax.integrators.reconstruction import map_pixels
+from pathjax.scene.alike import by_all
 from pathjax.scene.scene import Scene
 from pathjax.sensors import film
 
 
+@by_all
 @usual_promotion
 def render(
     scene: Scene,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import glob
-import hashlib
 import json
 import time
 import warnings
@@ -12,14 +11,13 @@ from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
-import jax
 import numpy as np
 
 from pathjax import distributed, version
 from pathjax.errors import InputError, InputWarning
 from pathjax.rendering.progressive.passes import State
 from pathjax.rendering.progressive.replicates import one_if_equal
-from pathjax.scene.parameters import nameless
+from pathjax.scene.alike import fingerprint
 from pathjax.scene.scene import Scene
 from pathjax.sensors import film
 from pathjax.system.files import write_whole
@@ -42,16 +40,6 @@ def identity(scene: Scene, seed: int, strategy: str, adaptive: bool) -> dict[str
         "seed": seed,
         "sampling": "adaptive" if adaptive else "uniform",
     }
-
-
-def fingerprint(scene: Scene) -> str:
-    """Hash of a scene's structure and arrays; names and files do not count."""
-    leaves, structure = jax.tree.flatten(nameless(scene))
-    digest = hashlib.sha256(str(structure).encode())
-    for leaf in map(np.asarray, leaves):
-        digest.update(f"{leaf.dtype}{leaf.shape}".encode())
-        digest.update(leaf.tobytes())
-    return digest.hexdigest()[:16]
 
 
 class Checkpoint:

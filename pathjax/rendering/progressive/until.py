@@ -18,11 +18,11 @@ from pathjax.compile import usual_promotion
 from pathjax.errors import InputError
 from pathjax.integrators.options import Options, check_counts
 from pathjax.rendering.progressive import error_estimate, passes, replicates
-from pathjax.rendering.progressive.checkpoint import Checkpoint, fingerprint, identity
+from pathjax.rendering.progressive.checkpoint import Checkpoint, identity
+from pathjax.scene.alike import fingerprint
 from pathjax.scene.scene import Scene
 from pathjax.sensors import film
 from pathjax.system.interrupts import Interrupts
-from pathjax.version import __version__
 
 # Samples of every pixel before their number may differ.
 PILOT_SPP = 16
@@ -117,8 +117,8 @@ class Render:
             self.state = self.checkpoint.load(self.state)
             self.checkpoint.save(self.state)
         if distributed.count() > 1:
-            distributed.same("version of pathjax", __version__)
-            distributed.same("scene", fingerprint(scene))
+            limits = target_error, time_limit, spp, seed, strategy
+            distributed.same({"scene": fingerprint(scene), "limit, seed or strategy": fingerprint(limits)})
             self._agree()
         if not adaptive or self.state.spp > self.spp:
             passes.plan(self.state, self.spp)
