@@ -26,10 +26,11 @@ from pathjax.compile import calls_at_once, concurrently
 from pathjax.compile.jax_compat import gathered
 from pathjax.errors import InputError
 from pathjax.system.interrupts import Interrupts
+from pathjax.system.meeting import meet
 
 T = TypeVar("T")
-# Seconds without a sign of life after which JAX ends all processes, and those in which they must find each other.
-PATIENCE, MEETING = 10, 60
+# Seconds without a sign of life after which JAX ends all processes, and those for which they wait for each other.
+PATIENCE, MEETING = 5, 60
 # Calls of each device between two exchanges: all wait for the slowest, so the fewer exchanges the better; but signals
 # are heard then.
 _CALLS = 2
@@ -51,24 +52,27 @@ def start(coordinator: str | None = None, processes: int | None = None, process:
             JAX finds the cluster by itself (SLURM, Open MPI, Kubernetes).
         processes: how many there are; process: which of them this is, from 0.
     Raises:
-        InputError: the others were not found, two have one number, or JAX's backend has started already.
+        InputError: the others were not found, two have one number, their code differs, or JAX's backend has started
+            already.
     """
+    facts = {"code of pathjax": _package(), "version of JAX": jax.__version__}
     try:
+        if coordinator is not None:
+            meet(coordinator, processes, process, facts, MEETING)
         jax.config.update("jax_cpu_collectives_implementation", "gloo")
         jax.distributed.initialize(
             coordinator, processes, process, initialization_timeout=MEETING, heartbeat_timeout_seconds=PATIENCE
         )
+    except InputError:
+        raise
     except (RuntimeError, ValueError) as error:
-        where = f"at {coordinator}" if coordinator else "in this environment"
-        raise InputError(
-            f"process {process} found no others {where} within {MEETING} s; start all of them, each with a number of "
-            f"its own, with the address of the first ({str(error).splitlines()[0]})"
-        ) from None
+        said = str(error).partition("\n")[0]
+        raise InputError(f"this process could not join the others ({said}); start each of them anew") from None
     here = np.frombuffer(socket.gethostname().encode()[:64].ljust(64, b"\0"), np.uint8)
     with _stdout_as_stderr():
         found = exchanged((here, np.int32(os.getpid())))
     _peers.extend((bytes(host).rstrip(b"\0").decode(errors="replace"), int(number)) for host, number in found)
-    same({"pathjax": _package(), f"version of JAX ({jax.__version__} here)": _digest(jax.__version__.encode())})
+    same({what: _digest(fact.encode()) for what, fact in facts.items()})
 
 
 def count() -> int:

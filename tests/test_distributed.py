@@ -1,0 +1,187 @@
+"""Scripts in several processes: whatever takes a scene gives the bits of one process, within a user's own jit too."""
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+PREAMBLE = """
+import sys
+import jax, jax.numpy as jnp, numpy as np
+import pathjax as pj
+from pathjax import distributed
+
+port, processes, process, out = sys.argv[1:5]
+if processes != "1":
+    distributed.start(f"127.0.0.1:{port}", int(processes), int(process))
+"""
+
+
+@pytest.fixture
+def started(root, tmp_path):
+    """(script, processes, devices of each) -> running processes, each of which may save `found` of its own."""
+    running = []
+
+    def start(script, processes, devices=1):
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            port = free.getsockname()[1]
+        environment = os.environ | {"JAX_NUM_CPU_DEVICES": str(devices), "PYTHONPATH": str(root)}
+        pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
+        for process in range(processes):
+            out = tmp_path / f"{processes}_{devices}_{process}.npz"
+            command = [sys.executable, "-u", "-c", PREAMBLE + script, *map(str, (port, processes, process, out))]
+            running.append(subprocess.Popen(command, cwd=root, env=environment, **pipes))
+        return running[-processes:]
+
+    yield start
+    for process in running:
+        process.kill()
+        process.communicate()
+
+
+@pytest.fixture
+def found(started, tmp_path):
+    """(script, processes, devices of each) -> what each process saved."""
+
+    def found(script, processes, devices=1):
+        for process in started(script, processes, devices):
+            told, _ = process.communicate(timeout=600)
+            assert process.returncode == 0, told
+        return [dict(np.load(tmp_path / f"{processes}_{devices}_{process}.npz")) for process in range(processes)]
+
+    return found
+
+
+def assert_same(*results):
+    first, *others = results
+    assert first
+    for other in others:
+        assert first.keys() == other.keys()
+        for name, value in first.items():
+            np.testing.assert_array_equal(value, other[name], err_msg=name)
+
+
+MAPS = """
+from pathjax.compile import native_fold, native_map, persistent_loop, split_map, together
+
+xs = jnp.linspace(0, 3, 601)
+
+def add(x, total):
+    def step(state):
+        gathered = together(lambda total, here, x: total + jnp.where(here, x, 0).sum())(state[1], x)
+        return state[0] + 1, gathered
+
+    return persistent_loop(lambda state: state[0] != 1 + jnp.int32(x), step, (jnp.int32(0), total))[1]
+
+@jax.jit
+def all_of(xs):
+    squares = native_map(lambda x: (x > 1, jnp.sin(x) ** 2), xs)
+    total = native_fold(add, xs, start=lambda lanes: jnp.zeros(()), finish=lambda total: total)
+    columns = split_map(lambda first, size, xs: jnp.cumsum(jnp.ones(size)) + first, 7, xs)
+    return squares, total, columns, jnp.mean(squares[1])
+
+(low, squares), total, columns, mean = all_of(xs)
+np.savez(out, low=low, squares=squares, total=total, columns=columns, mean=mean)
+"""
+REFUSED = """
+for says, call in (
+    ("directions for closest_hit", lambda: pj.closest_hit(None, xs, xs + int(process))),
+    ("call", lambda: (pj.any_hit if process == "1" else pj.closest_hit)(None, xs, xs)),
+):
+    try:
+        call()
+    except pj.InputError as error:
+        assert f"another {says} than process" in str(error), error
+    else:
+        raise AssertionError(f"{says} was not refused")
+"""
+
+
+def test_kernels_are_dealt_to_all_processes_and_what_differs_is_refused(found, tmp_path):
+    exec(MAPS, {"jax": jax, "jnp": jnp, "np": np, "out": tmp_path / "here.npz"})
+    assert_same(dict(np.load(tmp_path / "here.npz")), *found(MAPS + REFUSED, 2))
+
+
+# What takes a scene, outside of jit and within a user's own. A film that shares samples adds up runs of pixels, whose
+# sums depend on how many devices there are.
+EVERYTHING = """
+scene = pj.load_scene("scenes/cornell_box.xml", res=16)
+names = ["white.reflectance", "light.radiance"]
+values = {name: pj.parameters(scene)[name] for name in names}
+image, J = pj.jacobian(scene, names, spp=4, seed=1)
+normal = pj.normal_equations(scene, names, 1.1 * np.asarray(image), spp=4)
+
+def rendered(values):
+    return pj.render(pj.with_parameters(scene, values), 4, 1)
+
+again, pull = jax.vjp(rendered, values)
+loss = lambda values: jnp.mean((rendered(values) - 0.5) ** 2)
+value, slope = jax.jit(jax.value_and_grad(loss))(values)
+textured = pj.load_scene("tests/scenes/textures.xml", res=16)
+name = next(n for n, x in pj.parameters(textured).items() if np.ndim(x) == 3)
+texels = pj.parameters(textured)[name]
+_, pulled = jax.vjp(lambda x: pj.render(pj.with_parameters(textured, {name: x}), 4, 1), texels)
+everything = {
+    "image": pj.render(scene, 4, 1), "jacobian": (image, J.derivatives), "again": again, "J^T v": pull(image),
+    "J v": jax.jvp(rendered, (values,), (values,)), "in jit": (value, slope), "texels": pulled(image),
+    "normal": (normal.matrix, normal.gradient, normal.loss, normal.scatter, normal.residuals),
+    "bounces": pj.render_bounces(scene, 3, spp=8).terms, "aovs": pj.render_aovs(scene, ["depth"], spp=8),
+}
+leaves, _ = jax.tree_util.tree_flatten_with_path(everything)
+np.savez(out, **{jax.tree_util.keystr(path).replace("/", "|"): np.asarray(x) for path, x in leaves})
+"""
+FITS = """
+scene = pj.load_scene("scenes/cornell_box.xml", res=12)
+target = pj.render_until(scene, spp=64).image
+few = pj.fit(scene, target, ["white.reflectance"], start={"white.reflectance": 0.5}, spp=8)
+textured = pj.load_scene("tests/scenes/textures.xml", res=16)
+name = next(n for n, x in pj.parameters(textured).items() if np.ndim(x) == 3)
+many = pj.fit(textured, pj.render_until(textured, spp=64).image, [name], spp=8, smoothness=0.1)
+np.savez(out, few=few.values["white.reflectance"], covariance=few.covariance, many=many.values[name],
+         errors=many.standard_errors[name], steps=[len(few.history), len(many.history)])
+"""
+LOOP = """
+scene = pj.load_scene("scenes/cornell_box.xml", res=64)
+for number in range(1, 1000):
+    print("called", number, flush=True)
+    pj.jacobian(scene, ["white.reflectance"], spp={spp})
+"""
+
+
+@pytest.mark.slow
+def test_images_derivatives_and_normal_equations_are_those_of_one_process(found):
+    one = found(EVERYTHING, 1, 2)
+    assert_same(*one, *found(EVERYTHING, 2))
+    assert_same(*one, *found(EVERYTHING, 3))
+
+
+@pytest.mark.slow
+def test_fits_of_few_numbers_and_of_textures_are_those_of_one_process(found):
+    assert_same(*found(FITS, 1, 2), *found(FITS, 2))
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform == "win32", reason="sends SIGKILL")
+@pytest.mark.parametrize("spp", [8, 20000])
+@pytest.mark.parametrize("victim", [0, 1])
+def test_a_process_is_killed_between_calls_or_within_one_and_the_other_ends(started, spp, victim):
+    """With many samples it computes for long, and does not ask for the other."""
+    running = started(LOOP.format(spp=spp), 2)
+    for line in running[1 - victim].stdout:
+        if line == "called 2\n" or (line == "called 1\n" and spp > 8):
+            break
+    time.sleep(0.5 if spp == 8 else 3)
+    running[victim].send_signal(signal.SIGKILL)
+    killed = time.monotonic()
+    told, _ = running[1 - victim].communicate(timeout=15)
+    assert time.monotonic() - killed < 15
+    assert running[1 - victim].returncode not in (0, None)
+    assert spp > 8 or f"process {victim} has ended" in told or "distributed service" in told
