@@ -1,5 +1,6 @@
 """Batches: scenes of one structure share a kernel, and nothing of a batch is lost, done twice or half done."""
 
+import errno
 import json
 import random
 import subprocess
@@ -120,6 +121,17 @@ def test_parts_share_the_jobs(folder, tmp_path):
     assert [[outcome.output.name for outcome in part] for part in parts] == [["0.exr", "2.exr"], ["1.exr"]]
 
 
+def test_a_full_disk_ends_the_batch_and_leaves_nothing_half_written(folder, tmp_path, monkeypatch):
+    def full(_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("pathjax.system.files.os.fsync", full)
+    outcomes = pj.render_batch(write_jobs(folder / "no_room.jsonl", some_jobs(2)), tmp_path)
+    assert [outcome.status for outcome in outcomes] == ["unwritten", "waiting"]
+    assert "no_room.jsonl:1" in outcomes[0].message and "No space left" in outcomes[0].message
+    assert not list(tmp_path.iterdir())
+
+
 def test_an_output_that_cannot_be_written_ends_the_batch(folder, tmp_path):
     (tmp_path / "in_the_way").touch()
     jobs = [{"scene": "0.xml", "output": "in_the_way/a.exr", "spp": 1}, *some_jobs(2)]
@@ -162,14 +174,14 @@ def test_wrong_parts_are_refused(tmp_path, refused, part):
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="sends SIGKILL")
 def test_killed_at_random_and_started_again_all_outputs_are_there_once_and_whole(folder, tmp_path, environment):
-    listed = [{"scene": f"{n % 4}.xml", "output": f"more/{n}.exr", "seed": n, "spp": 256} for n in range(40)]
+    listed = [{"scene": f"{n % 4}.xml", "output": f"more/{n}.exr", "seed": n, "spp": 256} for n in range(80)]
     jobs = write_jobs(folder / "killed.jsonl", listed)
     whole = tmp_path / "whole"
     pj.render_batch(jobs, whole)
     command = [sys.executable, "-m", "pathjax", "batch", jobs, "-o", tmp_path / "killed"]
     environment = environment | {"PATHJAX_CACHE": "1", "XDG_CACHE_HOME": str(tmp_path / "cache")}
     choose, done = random.Random(0), 0
-    for _ in range(5):
+    for _ in range(10):
         running = subprocess.Popen(command, env=environment, stderr=subprocess.DEVNULL)
         while running.poll() is None and len(list((tmp_path / "killed").rglob("*.exr"))) == done:
             time.sleep(0.01)

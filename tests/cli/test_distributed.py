@@ -31,19 +31,20 @@ def test_wrong_numbers_are_refused(refused, tmp_path, arguments, says):
 
 
 @pytest.fixture
-def together(root, environment):
-    """(processes, *arguments) -> running processes of one render.
+def together(root, environment, tmp_path):
+    """(processes, *arguments) -> running processes of one command.
 
     devices: of each; each: further arguments, with the number of the process for {}.
     """
     running = []
 
-    def start(processes, *arguments, devices=1, each=()):
+    def start(processes, *arguments, devices=1, each=(), command="render"):
         with socket.socket() as free:
             free.bind(("127.0.0.1", 0))
             address = f"127.0.0.1:{free.getsockname()[1]}"
         own = environment | {"JAX_NUM_CPU_DEVICES": str(devices)}
-        command = [sys.executable, "-m", "pathjax", "render", *map(str, arguments)]
+        own |= {"PATHJAX_CACHE": "1", "XDG_CACHE_HOME": str(tmp_path / "cache")}
+        command = [sys.executable, "-m", "pathjax", command, *map(str, arguments)]
         numbers = ["--coordinator", address, "--processes", str(processes), "--process"]
         started = [
             subprocess.Popen(
@@ -88,11 +89,11 @@ def test_images_are_those_of_one_process(together, tmp_path, root, film, others)
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="sends SIGKILL")
 def test_one_is_killed_the_others_end_and_another_number_goes_on(together, tmp_path):
-    given = SCENE, "-D", "res=32", "--spp", 40000, "--json"
+    given = SCENE, "-D", "res=32", "--spp", 120000, "--json"
     outcome(together(1, *given, "-o", tmp_path / "whole.exr", devices=2))
     checkpoint, image = tmp_path / "state.npz", tmp_path / "parts.exr"
     choose = random.Random(1)
-    for processes in (2, 3, 2):
+    for processes in (2, 3, 2, 2, 3, 2, 3, 2, 2, 3):
         before = checkpoint.stat().st_mtime_ns if checkpoint.exists() else 0
         running = together(processes, *given, "-o", image, "--checkpoint", checkpoint)
         while not checkpoint.exists() or checkpoint.stat().st_mtime_ns == before or checkpoint.stat().st_size < 2000:
@@ -122,3 +123,18 @@ def test_scenes_that_differ_are_refused(together, tmp_path):
         _, err = process.communicate(timeout=60)
         assert process.returncode == 2
         assert "another scene than process" in err
+
+
+@pytest.mark.slow
+def test_fits_are_those_of_one_process(together, tmp_path, run):
+    target = tmp_path / "target.exr"
+    assert run("render", SCENE, "-D", "res=12", "--spp", 64, "-o", target)[0] == 0
+    facts = []
+    for processes, devices in ((1, 2), (2, 1)):
+        given = SCENE, "-D", "res=12", target, "--param", "white.reflectance=0.5", "--spp", 8, "--json"
+        files = "-o", tmp_path / str(processes)
+        facts.append(outcome(together(processes, *given, *files, devices=devices, command="fit")))
+    one, two = facts
+    for name in ("values", "standard_errors", "covariance", "message"):
+        assert one[name] == two[name]
+    assert (tmp_path / "1.png").read_bytes() == (tmp_path / "2.png").read_bytes()
