@@ -7,12 +7,14 @@ from __future__ import annotations
 
 from dataclasses import fields
 from functools import partial
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import jax
 from jax.custom_derivatives import SymbolicZero
 from jax.extend.core import ClosedJaxpr, Literal, Primitive, jaxpr_as_fun
 from jax.interpreters import ad, batching, mlir
+from jaxlib.mlir import ir
+from jaxlib.mlir.dialects import func as func_dialect
 
 __all__ = [
     "ClosedJaxpr",
@@ -20,6 +22,7 @@ __all__ = [
     "Primitive",
     "ad",
     "batching",
+    "call_of_identity",
     "called_program",
     "gathered",
     "is_symbolic_zero",
@@ -44,6 +47,7 @@ _CALLS = {
     "custom_vmap_call": "call",
 }
 Class = TypeVar("Class", bound=type)
+func: Any = func_dialect  # its annotations leave out what its classes inherit
 
 
 def register_dataclass(cls: Class) -> Class:
@@ -103,6 +107,19 @@ def called_program(eqn) -> ClosedJaxpr | None:
         return None
     program = eqn.params[_CALLS[name]]
     return program if hasattr(program, "consts") else ClosedJaxpr(program, ())
+
+
+def call_of_identity(context: mlir.LoweringRuleContext, value: ir.Value) -> list[ir.Value]:
+    """Lower a value to what a function gives back, which XLA keeps as a call: no fusion reaches across it."""
+    module, types = context.module_context, [value.type]
+    start = ir.InsertionPoint.at_block_begin(module.module.body)
+    function = func.FuncOp("identity", (types, types), visibility="private", ip=start)
+    module.symbol_table.insert(function)
+    with ir.InsertionPoint(function.add_entry_block()):
+        func.ReturnOp(list(function.arguments))
+    call = func.CallOp(types, ir.FlatSymbolRefAttr.get(function.name.value), [value])
+    call.attributes["mhlo.frontend_attributes"] = ir.DictAttr.get({"inlineable": ir.StringAttr.get("false")})
+    return list(call.results)
 
 
 def while_parts(eqn, values) -> tuple[list, list, list]:

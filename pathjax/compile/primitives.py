@@ -12,10 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from pathjax.compile.jax_compat import Primitive, ad, batching, jaxpr_as_fun, mlir, program_of
+from pathjax.compile.jax_compat import Primitive, ad, batching, call_of_identity, jaxpr_as_fun, mlir, program_of
 
 compute_once_p = Primitive("compute_once")
 compute_once_p.multiple_results = True
+column_p = Primitive("computed_column")
 one_by_one_p = Primitive("one_by_one")
 one_by_one_p.multiple_results = True
 persistent_test_p = Primitive("persistent_test")
@@ -106,6 +107,13 @@ mlir.register_lowering(
 batching.primitive_batchers[compute_once_p] = lambda values, axes: (compute_once_p.bind(*values), axes)
 ad.primitive_jvps[compute_once_p] = lambda primals, tangents: (compute_once_p.bind(*primals), _once_each(tangents))
 ad.primitive_transposes[compute_once_p] = lambda cotangents, *primals: _once_each(cotangents)
+
+# What lanes make of it, column by column: a barrier that fusion sees, where XLA's own is gone before.
+column_p.def_impl(jnp.asarray)
+column_p.def_abstract_eval(lambda column: column)
+mlir.register_lowering(column_p, call_of_identity)
+batching.defvectorized(column_p)
+ad.deflinear2(column_p, lambda cotangent, _: [cotangent])
 
 
 # ---- one_by_one -----------------------------------------------------------------------------------------------------

@@ -17,7 +17,6 @@ from collections.abc import Callable, Iterator
 
 import jax
 import jax.numpy as jnp
-from jax import lax
 
 from pathjax.compile.lanes.dataflow import differing_in, find_persistent_loop
 from pathjax.compile.lanes.interpreter import Interpreter
@@ -48,9 +47,7 @@ def lanes(f: Callable, width: int, memory=None) -> Callable:
         xs, shared = jax.tree.leaves(xs), jax.tree.leaves(shared)
         if not len(xs[0]):
             return jax.tree.map(lambda y: jnp.zeros((0, *y.shape), y.dtype), out)
-        # False, and no pass over HLO knows it.
-        never = lax.population_count(xs[0].ravel()[0].astype(jnp.int32)) < 0
-        interpreter = Interpreter(width, never)
+        interpreter = Interpreter(width)
         differing = differing_in(program, [True] * len(xs) + [False] * len(shared))
         loop = find_persistent_loop(program, differing)
         if memory is not None and loop is None:

@@ -24,7 +24,7 @@ from pathjax.compile.lanes.columns import (
 )
 from pathjax.compile.lanes.dataflow import equation_outputs_differ, variables, variables_read_by
 from pathjax.compile.lanes.primitive_rules import COMPONENTWISE, RULES
-from pathjax.compile.primitives import compute_once_p, one_by_one_p, together_p
+from pathjax.compile.primitives import column_p, compute_once_p, one_by_one_p, together_p
 
 # Rows of a table from which lanes select what they want; gathering is faster from more.
 _FEW_ROWS = 8
@@ -33,8 +33,8 @@ _FEW_ROWS = 8
 class Interpreter:
     """Runs programs on values of `width` lanes."""
 
-    def __init__(self, width: int, never):
-        self.width, self.never = width, never
+    def __init__(self, width: int):
+        self.width = width
         # By id: what has been made to be computed once. JAX wants no tracer to outlive its function.
         self.computed: WeakValueDictionary = WeakValueDictionary()
         self.occupied = None  # (W,) bool lanes that hold an item; None: all
@@ -133,23 +133,13 @@ class Interpreter:
         return found
 
     def materialize(self, values):
-        """The values, of which every consumer reads one result: what is carried through a loop that never runs.
+        """The values, of which every consumer reads one result. What lanes share stays as it is.
 
-        XLA's own barrier is gone before fusion. The loop's body changes an entry of each column, or XLA would remove
-        it; that costs one instruction where a change of the whole column is another loop for LLVM to compile. (A branch
-        that is always taken would do, but copies all columns.) What lanes share stays as it is.
+        Column by column, so that those which nobody reads vanish with all that they are made of.
         """
         items = {id(item): item for value in values if differs(value) for item in value.flat}
         new = [item for item in items.values() if id(item) not in self.computed]
-        if not new:
-            return values
-
-        def change(state):
-            _, *items = state
-            changed = (with_entry(x, jnp.zeros((), x.dtype), 0) if x.ndim else jnp.zeros_like(x) for x in items)
-            return False, *changed
-
-        _, *results = lax.while_loop(lambda state: state[0], change, (self.never, *new))
+        results = list(map(column_p.bind, new))
         items |= zip(map(id, new), results, strict=True)
         self.computed.update((id(item), item) for item in results)
         return [

@@ -77,7 +77,7 @@ def in_runs(interpreter, which, branches: tuple[ClosedJaxpr, ...], operands: lis
 
     operands = interpreter.materialize(list(map(in_order, operands, _read_by_any(branches))))
     outputs = branches[0].out_avals
-    narrow = type(interpreter)(WIDTH, interpreter.never)
+    narrow = type(interpreter)(WIDTH)
     results = [[jnp.zeros((size,), aval.dtype)] * math.prod(aval.shape) for aval in outputs]
     for k, branch in enumerate(branches):
         first, end = ends[k], ends[k + 1]
