@@ -240,26 +240,25 @@ def _smooth_normals(vertices: np.ndarray, faces: np.ndarray, area_vectors: np.nd
     """
     columns = np.ascontiguousarray(vertices.T)
 
-    def weights(block: slice) -> np.ndarray:
-        """(4, 3, N) by corner the unit normal times the angle, and the angle."""
-        vectors = area_vectors[:, block]
-        unit = np.concatenate([vectors / _norm(vectors), np.ones_like(vectors[:1])])
+    def angles_of(block: slice) -> np.ndarray:
         corners = [np.take(columns, corner, axis=1) for corner in faces[block].T]
-        angles = []
+        cosines = []
         for k in range(3):
             one, two = corners[(k + 1) % 3] - corners[k], corners[(k + 2) % 3] - corners[k]
-            cosine = _dot(one, two) / (_norm(one) * _norm(two))
-            angles.append(np.arccos(np.clip(cosine, -1, 1)))
-        return unit[:, None] * angles
+            cosines.append(_dot(one, two) / (_norm(one) * _norm(two)))
+        return np.arccos(np.clip(cosines, -1, 1))
 
-    def total(of_corners: np.ndarray) -> np.ndarray:
-        return sum(np.bincount(at, each, len(vertices)) for at, each in zip(faces.T, of_corners, strict=True))
+    def total(weights: np.ndarray) -> np.ndarray:
+        """(V,) of weights (F,) times the angles."""
+        each = zip(faces.T, angles, strict=True)
+        return sum(np.bincount(at, angle * weights, len(vertices)) for at, angle in each)
 
-    weighted = _in_blocks(weights, (4, 3, len(faces)))
+    angles = _in_blocks(angles_of, (3, len(faces)))
+    unit = _in_blocks(lambda block: area_vectors[:, block] / _norm(area_vectors[:, block]), area_vectors.shape)
     with over_cores() as run:
-        *sums, angles = run(total, weighted)
+        *sums, angles_around = run(total, [*unit, np.ones(len(faces))])
     sums = np.stack(sums, axis=1)
-    cancel = _norm(sums.T) <= np.finfo(np.float32).eps * angles
+    cancel = _norm(sums.T) <= np.finfo(np.float32).eps * angles_around
     sums[cancel] = [1, 0, 0]
     return sums, cancel
 

@@ -40,7 +40,8 @@ def pack(numbers, lo, hi, dtype, rule="sah", first=0, step=1):
     dtype = np.dtype(dtype)
     integer = integer_like(dtype)
     blocks = np.empty((len(rows), numbers.shape[1] + 1, rows.shape[1]), integer)
-    blocks[:, :-1] = np.moveaxis(np.take(numbers.astype(dtype).view(integer), rows, axis=0, mode="wrap"), 1, 2)
+    bits = numbers.astype(dtype, copy=False).view(integer)
+    blocks[:, :-1] = np.moveaxis(np.take(bits, rows, axis=0, mode="wrap"), 1, 2)
     np.moveaxis(blocks[:, :-1], 2, 1)[rows < 0] = np.array(np.nan, dtype).view(integer)
     blocks[:, -1] = np.where(rows < 0, rows, first + step * rows)
     return blocks, tree, built
