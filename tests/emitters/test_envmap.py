@@ -13,7 +13,7 @@ from scipy import stats
 
 import pathjax as pj
 from pathjax import emitters, transport
-from pathjax.emitters import Envmap
+from pathjax.emitters import Envmap, envmap
 from pathjax.images import write_exr
 from pathjax.kinds import Parameters, Row
 
@@ -110,24 +110,25 @@ def test_radiance_is_bilinear_between_texels(name):
 
 @pytest.mark.parametrize("name", PICTURES)
 def test_directions_are_drawn_by_their_density(name):
-    """Chi-square over patches, as many as are expected to hold 10 samples."""
+    """Chi-square over quarters of patches, as many as are expected to hold 10 samples."""
     texels, count = PICTURES[name], 100_000
     height, width = max(len(texels), 2), texels.shape[1]
     p = row(texels)
     u = np.random.default_rng(3).integers(0, 1 << 23, (count, 3)) * 2.0**-23 + 2.0**-24
     d = np.asarray(drawn(p._table, jnp.asarray(u, jnp.float32)), float)
     np.testing.assert_allclose(np.linalg.norm(d, axis=1), 1, atol=1e-6)
-    y, x = place(d, height, width)
-    found = np.zeros((height - 1, width))
-    np.add.at(found, (np.minimum(y.astype(int), height - 2), np.floor(x).astype(int) % width), 1)
-    theta, phi = np.linspace(0, np.pi, height), (np.arange(width) + 1) / width * 2 * np.pi
-    middle = (theta[:-1] + theta[1:]) / 2
-    toward = np.stack(np.broadcast_arrays(
-        np.sin(middle)[:, None] * np.sin(phi), np.cos(middle)[:, None], -np.sin(middle)[:, None] * np.cos(phi)
-    ), -1)  # fmt: skip
+    # Quarters of equal solid angle: the density is bilinear, so its mean over one is that of its middle.
+    cos = np.cos(np.linspace(0, np.pi, height))
+    cos = np.append(np.stack([cos[:-1], (cos[:-1] + cos[1:]) / 2], 1).ravel(), -1)
+    _, x = place(d, height, width)
+    y = np.searchsorted(-cos, -d[:, 1], side="right") - 1
+    found = np.zeros((2 * (height - 1), 2 * width))
+    np.add.at(found, (np.clip(y, 0, 2 * height - 3), np.floor(2 * x).astype(int) % (2 * width)), 1)
+    middle, phi = (cos[:-1] + cos[1:])[:, None] / 2, (np.arange(2 * width) / 2 + 0.75) / width * 2 * np.pi
+    radius = np.sqrt(1 - middle**2)
+    toward = np.stack(np.broadcast_arrays(radius * np.sin(phi), middle, -radius * np.cos(phi)), -1)
     _, density = seen(p._table, jnp.asarray(toward.reshape(-1, 3), jnp.float32))
-    solid = -np.diff(np.cos(theta))[:, None] * (2 * np.pi / width)
-    expected = np.asarray(density, float).reshape(height - 1, width) * solid
+    expected = np.asarray(density, float).reshape(found.shape) * -np.diff(cos)[:, None] * (np.pi / width)
     np.testing.assert_allclose(expected.sum(), 1, rtol=1e-5)
     expected = expected * count
     many = expected >= 10
@@ -148,17 +149,39 @@ def test_tabled_probabilities_are_those_of_random_numbers():
 
 
 def test_density_follows_luminance_and_solid_angle():
-    """Of a patch its mean luminance, by quadrature."""
+    """Its mean over a patch is that of the luminance, by quadrature; within the patch it goes from corner to corner."""
     texels = picture(9, 12, hot=[(4, 3)])
     grid = (np.arange(200) + 0.5) / 200
     theta, phi = (3 + grid) / 8 * np.pi, (2.5 + 1 + grid) / 12 * 2 * np.pi
     t, f = (x.ravel() for x in np.meshgrid(theta, phi, indexing="ij"))
     d = np.stack([np.sin(t) * np.sin(f), np.cos(t), -np.sin(t) * np.cos(f)], -1)
     weights = np.sin(t) / np.sin(t).sum()
-    radiance, density = seen(row(texels)._table, jnp.asarray(d, jnp.float32))
-    mean = weights @ np.asarray(radiance, float) @ [0.2126, 0.7152, 0.0722]
+    radiance, density = (np.asarray(x, float) for x in seen(row(texels)._table, jnp.asarray(d, jnp.float32)))
+    shine = radiance @ [0.2126, 0.7152, 0.0722]
     everywhere = 4 * np.pi * float(row(texels).brightness)
-    np.testing.assert_allclose(density, mean / everywhere, rtol=1e-3)
+    np.testing.assert_allclose(weights @ density, weights @ shine / everywhere, rtol=1e-3)
+    # A sixteenth of it is even; and cosines for angles make 0.05 in rows as broad as these.
+    follows = (16 * shine + weights @ shine) / 17
+    np.testing.assert_allclose(density * everywhere, follows, atol=0.06 * shine.max())
+
+
+def test_black_texels_are_looked_at_beside_bright_ones():
+    """So that light in them has a derivative of bounded weight."""
+    texels = np.zeros((9, 12, 3), np.float32)
+    texels[4, 3] = 1
+    t, f = np.array([4 - 1e-3, 5 - 1e-3]) / 8 * np.pi, np.full(2, (3 - 1e-3 + 0.5) / 12 * 2 * np.pi)
+    d = np.stack([np.sin(t) * np.sin(f), np.cos(t), -np.sin(t) * np.cos(f)], -1)
+    _, (beside, far) = (np.asarray(x) for x in seen(row(texels)._table, jnp.asarray(d, jnp.float32)))
+    assert far == pytest.approx(beside / (4 * 16 + 1), rel=0.1)
+
+
+@pytest.mark.parametrize("ends", [(1.0, 1.0), (0.0, 2.0), (3.0, 0.0), (0.2, 1.8), (0.0, 0.0), (1e30, 2e30)])
+def test_straight_densities_are_drawn_by_their_inverse(ends):
+    first, last = (jnp.float32(end) for end in ends)
+    u = jnp.asarray((np.arange(1000) + 0.5) / 1000, jnp.float32)
+    x = np.asarray(jax.vmap(lambda u: envmap._drawn(first, last, u))(u), float)
+    a, b = (end / sum(ends) if sum(ends) else 0.5 for end in ends)
+    np.testing.assert_allclose(2 * a * x + (b - a) * x**2, u, atol=1e-6)
 
 
 def test_brightness_is_the_mean_over_the_sphere():
