@@ -2,6 +2,8 @@
 
 from typing import TYPE_CHECKING
 
+from pathjax.system import imports as _imports  # isort: skip  before all that takes long
+
 import pathjax.compile  # noqa: F401  first: sets XLA up before a backend starts
 from pathjax.batch import render_batch
 from pathjax.derivatives.jacobian import Jacobian, jacobian
@@ -66,3 +68,6 @@ else:
 
             return getattr(check, name)
         raise AttributeError(f"module 'pathjax' has no attribute {name!r}")
+
+
+_imports.done()

@@ -25,6 +25,9 @@ _FLAG = f"--xla_backend_extra_options={_OPTION}=1000000000000"
 # XLA halves the vectors of processors that have them this wide; kernels of lanes gain a tenth or more from whole ones.
 _WIDTH_OPTION = "xla_cpu_prefer_vector_width"
 _WIDTH_FLAG = f"--{_WIDTH_OPTION}=512"
+# LLVM's last level takes a sixth of compilation, and kernels of lanes gain nothing by it.
+_LEVEL_OPTION = "xla_backend_optimization_level"
+_LEVEL_FLAG = f"--{_LEVEL_OPTION}=2"
 _DEVICE_FLAG = "xla_force_host_platform_device_count"
 # A Python thread that starts computations on several devices faster than they end, 32 on each, holds a thread of the
 # pool for each device until one ends. XLA makes a thread for each core, and where all are held, the part of an
@@ -61,8 +64,9 @@ def setup() -> None:
     wanted = native and _OPTION not in flags
     if wanted:
         width = "" if _WIDTH_OPTION in flags else _WIDTH_FLAG
+        level = "" if _LEVEL_OPTION in flags else _LEVEL_FLAG
         patience = "" if _PATIENCE_OPTION in flags else _PATIENCE_FLAGS
-        os.environ["XLA_FLAGS"] = " ".join(filter(None, (flags, _FLAG, width, patience)))
+        os.environ["XLA_FLAGS"] = " ".join(filter(None, (flags, _FLAG, width, level, patience)))
     devices_chosen = _DEVICE_FLAG in flags or jax.config.jax_num_cpu_devices >= 0
     devices = max(cores(), jax.config.jax_num_cpu_devices, *map(int, re.findall(rf"{_DEVICE_FLAG}=(\d+)", flags)))
     os.environ.setdefault(_POOL_VARIABLE, str(_POOL_OF_A_DEVICE * devices))
