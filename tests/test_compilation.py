@@ -69,6 +69,13 @@ def test_every_scene_renders_in_one_native_kernel(kernel_of, name):
     assert_one_native_kernel(kernel_of(name).compiled)
 
 
+def test_the_cornell_box_is_a_small_program(shipped):
+    """What is compiled takes time by its length, and by its loops: 5400 lines and 12 when this was written."""
+    program = lowered(shipped("cornell_box")).as_text()
+    assert program.count("\n") < 6000
+    assert program.count("stablehlo.while") < 16  # one for each value that is computed once would be twice as many
+
+
 @pytest.mark.parametrize("name", ["cornell_box", "glass_and_mirror", "mesh"])
 def test_columns_of_lanes_are_seldom_copied(kernel_of, name):
     """XLA copies what it believes to be overwritten while it is read: once two columns for each that was computed."""

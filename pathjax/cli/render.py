@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
+import sys
 import time
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
-from rich.console import Console
 
 from pathjax import distributed, emitters
 from pathjax.cli import DONE, FAILED
@@ -42,12 +43,13 @@ def run(options, output: Output) -> int:
         scene, options.error, options.time, options.spp, options.seed, options.strategy, options.checkpoint
     )
     first = distributed.index() == 0  # of several processes, the one that tells and writes
-    with Console(stderr=True, quiet=not first).status("compiling"):
+    watched = first and sys.stderr.isatty()
+    with _compiling() if watched else nullcontext():
         wait_for(render.compile)
         first_hits = wait_for(lambda: _first_hits(scene, options))
     # From here on a signal only ends the rendering: what is rendered is written, however many come.
     with Interrupts() as interrupts:
-        result = render.run(progress=first)
+        result = render.run(progress=watched)
         layers = first_hits | _image_layers("error", result.standard_error)
         channels = {name: layers[name] for name in layers if name.partition(".")[0] in options.aov}
         if "bounces" in options.aov:
@@ -69,6 +71,12 @@ def run(options, output: Output) -> int:
             facts = _facts(result, lost, place, options.seed, load_seconds)
             output.text(json_text(facts))
     return FAILED if missed or (options.checkpoint is not None and not saved) else DONE
+
+
+def _compiling():
+    from rich.console import Console  # takes a tenth of the time that a small render does
+
+    return Console(stderr=True).status("compiling")
 
 
 def _check(path: Path, options) -> None:

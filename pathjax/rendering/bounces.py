@@ -41,7 +41,7 @@ class Bounces:
     terms: jax.Array  # (depth, H, W, 3) linear RGB
     deviation: jax.Array  # (depth, H, W, 3) root of `variance`; float32 may not hold the variance itself
     samples: jax.Array  # (H, W) int32 of each pixel, from which the standard error is made
-    correlation: jax.Array  # (S, S) of the noise of pixels around one with its own, `film.correlation`
+    correlation: jax.Array | np.ndarray  # (S, S) of the noise of pixels around one with its own, `film.correlation`
 
     @property
     def variance(self) -> jax.Array:

@@ -146,14 +146,16 @@ def extended(film: Film, image: Real[Array, "R HW"]) -> Real[Array, "R N"]:
     return jnp.pad(inside, ((0, 0), (out, out), (out, out)), mode="edge").reshape(len(image), -1)
 
 
-@jax.jit
-def correlation(film: Film) -> Float[Array, "S S"]:
+def correlation(film: Film) -> Float[Array | np.ndarray, "S S"]:
     """Of the noise of pixels (y, x) with that of the one in the middle, for they share samples.
 
     What a sample tells is taken to be independent of where in its pixel it lies.
     """
-    if not film.shared:
-        return jnp.ones((1, 1), film.filter.radius.dtype)
+    return _correlation(film) if film.shared else np.ones((1, 1), film.filter.radius.dtype)
+
+
+@jax.jit
+def _correlation(film: Film) -> Float[Array, "S S"]:
     heights = _heights(film.filter, film.reach)
     lags = 2 * film.reach
     padded = jnp.pad(heights, ((lags, lags), (0, 0)))

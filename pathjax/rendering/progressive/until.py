@@ -193,7 +193,7 @@ class Render:
         image, variance = (x.reshape(shape) for x in self.state.moments())
         # While some pixels know nothing of their error, neither does the image.
         known = self.state.count.min() >= 2
-        alike = float((film.correlation(self.scene.film) ** 2).sum())
+        alike = float(np.square(film.correlation(self.scene.film)).sum())
         return image, variance, error_estimate.image_error(image, variance, alike) if known else UNKNOWN
 
     def _result(self, reason, found) -> RenderResult:
