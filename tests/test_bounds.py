@@ -43,7 +43,7 @@ class SignedStarts:
 class Inline:
     """`one_by_one` without its primitive, into which `checkify` does not look."""
 
-    def bind(self, *inputs, program):
+    def bind(self, *inputs, program, search):
         return jaxpr_as_fun(program)(*inputs)
 
 

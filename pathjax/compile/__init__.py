@@ -2,8 +2,8 @@
 
 - `native_map` runs a function of one item over all items, on all devices; `lanes/` is how, on CPUs. `native_fold` is
   the same for items that leave something in memory that they share, `native_rows` where each has rows of its own there.
-- `compute_once`, `one_by_one` and `persistent_loop` stand in code of one item. They change nothing of its results, only
-  what is computed when. `together` changes the memory of a `native_fold`.
+- `compute_once`, `one_by_one`, `interleaved` and `persistent_loop` stand in code of one item. They change nothing of
+  its results, only what is computed when. `together` changes the memory of a `native_fold`.
 - `linear` is a linear function with a transpose of its own.
 - `register_dataclass` makes a dataclass a pytree, where JAX's own may give it the kernel of another.
 - `concurrently` calls one kernel several times at once.
@@ -18,17 +18,19 @@ from pathjax.compile.cache import keep_kernels
 from pathjax.compile.jax_compat import is_symbolic_zero, is_traced, register_dataclass
 from pathjax.compile.linear import linear
 from pathjax.compile.mapping import MANY_ITEMS, native_fold, native_map, native_rows, split_map
-from pathjax.compile.primitives import compute_once, one_by_one, persistent_loop, together
+from pathjax.compile.primitives import Search, compute_once, interleaved, one_by_one, persistent_loop, together
 from pathjax.compile.promotion import usual_promotion
 from pathjax.compile.threads import calls_at_once, concurrently, devices_of_a_call
 from pathjax.compile.xla import native, setup
 
 __all__ = [
     "MANY_ITEMS",
+    "Search",
     "calls_at_once",
     "compute_once",
     "concurrently",
     "devices_of_a_call",
+    "interleaved",
     "is_symbolic_zero",
     "is_traced",
     "keep_kernels",

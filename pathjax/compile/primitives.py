@@ -6,13 +6,24 @@ Three change no result, and outside of lanes they do next to nothing. `together`
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from pathjax.compile.jax_compat import Primitive, ad, batching, call_of_identity, jaxpr_as_fun, mlir, program_of
+from pathjax.compile.jax_compat import (
+    ClosedJaxpr,
+    Primitive,
+    ad,
+    batching,
+    call_of_identity,
+    jaxpr_as_fun,
+    mlir,
+    program_of,
+)
 
 compute_once_p = Primitive("compute_once")
 compute_once_p.multiple_results = True
@@ -51,9 +62,72 @@ def one_by_one(f: Callable) -> Callable:
             return outputs
 
         program, consts = program_of(flat, *leaves)
-        return jax.tree.unflatten(results, one_by_one_p.bind(*consts, *leaves, program=program))
+        return jax.tree.unflatten(results, one_by_one_p.bind(*consts, *leaves, program=program, search=None))
 
     return called
+
+
+class Search(NamedTuple):
+    """A search in parts, functions that may close over arrays. Its state is a pytree; of zeros, it is done."""
+
+    begin: Callable  # () -> state, of which `visit` does not come next
+    opens: Callable  # state -> whether `open` comes next
+    open: Callable  # state -> state: the usual step; leaves a search done that is done
+    visits: Callable  # state -> whether `visit` comes next; if neither does, the search is done
+    visit: Callable  # state -> state: a step that comes less often, or costs more
+    result: Callable  # state -> results
+
+
+@dataclass(frozen=True)
+class Part:
+    """A function of a `Search` as a program, called with all inputs of the search and with its state."""
+
+    program: ClosedJaxpr
+    places: tuple[int, ...]  # of the inputs that it reads
+
+    def __call__(self, inputs, *state):
+        return jaxpr_as_fun(self.program)(*(inputs[place] for place in self.places), *state)
+
+
+def interleaved(search: Search):
+    """Results of a search, of which lanes run several at once, as each alone waits for memory most of the time.
+
+    In all else it is what `one_by_one` makes of a function that runs the search.
+    """
+    inputs: list[Any] = []
+    state: list[jax.ShapeDtypeStruct] = []
+    parts: list[Callable] = []
+    structures: dict[str, Any] = {}
+    for name, f in search._asdict().items():
+
+        def flat(*leaves, name=name, f=f):
+            args = [jax.tree.unflatten(structures["begin"], leaves)] if name != "begin" else []
+            outputs, structures[name] = jax.tree.flatten(f(*args))
+            return outputs
+
+        program, consts = program_of(flat, *state)
+        inputs += [const for const in consts if all(const is not x for x in inputs)]
+        places = [next(k for k, x in enumerate(inputs) if x is const) for const in consts]
+        parts.append(Part(program, tuple(places)))
+        state = state or [jax.ShapeDtypeStruct(aval.shape, aval.dtype) for aval in program.out_avals]
+    programs = Search(*parts)
+    program, _ = program_of(lambda *inputs: _search_alone(programs, inputs), *inputs)
+    return jax.tree.unflatten(structures["result"], one_by_one_p.bind(*inputs, program=program, search=programs))
+
+
+def _search_alone(search: Search, inputs):
+    def opens(state):
+        return search.opens(inputs, *state)[0]
+
+    def visits(state):
+        return search.visits(inputs, *state)[0]
+
+    def go_on(state):
+        state = lax.while_loop(opens, lambda state: search.open(inputs, *state), state)
+        return lax.while_loop(visits, lambda state: search.visit(inputs, *state), state)
+
+    state = lax.while_loop(lambda state: opens(state) | visits(state), go_on, search.begin(inputs))
+    return search.result(inputs, *state)
 
 
 def persistent_loop(test: Callable, body: Callable, state):
@@ -119,12 +193,12 @@ ad.deflinear2(column_p, lambda cotangent, _: [cotangent])
 # ---- one_by_one -----------------------------------------------------------------------------------------------------
 
 
-def _one_by_one_batch(inputs, axes, *, program):
+def _one_by_one_batch(inputs, axes, *, program, search):
     outputs = one_by_one(jax.vmap(jaxpr_as_fun(program), axes))(*inputs)
     return outputs, [0] * len(outputs)
 
 
-def _one_by_one_jvp(primals, tangents, *, program):
+def _one_by_one_jvp(primals, tangents, *, program, search):
     """Tangents come from a program of their own, linear in those of the inputs, so that it transposes."""
     moves = [type(tangent) is not ad.Zero for tangent in tangents]
     smooth = [np.issubdtype(aval.dtype, np.inexact) for aval in program.out_avals]
@@ -141,10 +215,10 @@ def _one_by_one_jvp(primals, tangents, *, program):
     following = iter(one_by_one(smooth_tangents)(list(primals), moving))
     zeros = [ad.Zero(aval.to_tangent_aval()) for aval in program.out_avals]
     results = [next(following) if s else zero for s, zero in zip(smooth, zeros, strict=True)]
-    return one_by_one_p.bind(*primals, program=program), results
+    return one_by_one_p.bind(*primals, program=program, search=search), results
 
 
-def _one_by_one_transpose(cotangents, *inputs, program):
+def _one_by_one_transpose(cotangents, *inputs, program, search):
     linear = [ad.is_undefined_primal(x) for x in inputs]
     there = [type(cotangent) is not ad.Zero for cotangent in cotangents]
 
@@ -163,12 +237,12 @@ def _one_by_one_transpose(cotangents, *inputs, program):
     return [next(following) if is_linear else None for is_linear in linear]
 
 
-def _one_by_one_inline(*inputs, program):
+def _one_by_one_inline(*inputs, program, search):
     return jaxpr_as_fun(program)(*inputs)
 
 
 one_by_one_p.def_impl(_one_by_one_inline)
-one_by_one_p.def_abstract_eval(lambda *avals, program: program.out_avals)
+one_by_one_p.def_abstract_eval(lambda *avals, program, search: program.out_avals)
 mlir.register_lowering(one_by_one_p, mlir.lower_fun(_one_by_one_inline, multiple_results=True))
 batching.primitive_batchers[one_by_one_p] = _one_by_one_batch
 ad.primitive_jvps[one_by_one_p] = _one_by_one_jvp

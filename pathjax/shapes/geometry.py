@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +14,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from pathjax.compile import compute_once, one_by_one, register_dataclass
+from pathjax.compile import compute_once, register_dataclass
 from pathjax.core.math import at, dot, frame_from_normal, integer_like, safe_divide, smaller
 from pathjax.core.types import Hit, Ray, Surface
 from pathjax.shapes.accel import traverse as bvh
@@ -45,33 +44,61 @@ def firsts(geometry: Geometry) -> list[int]:
 def closest_hit(geometry: Geometry, ray: Ray) -> Hit:
     """First primitive that the ray meets at 0 < t <= ray.t_max; of coincident ones the lowest."""
     none = jnp.int32(NO_HIT)
-    beyond = _bits(jnp.full_like(ray.t_max, jnp.inf))
     ray = jax.tree.map(lax.stop_gradient, ray)
 
-    def leaf_test(distances, rows, first, t, primitive):
-        if len(distances) == 1:
-            (distance,), (candidate,) = compute_once((distances, rows + first))
-            nearer = (distance > 0) & ((distance < t) | ((distance == t) & (primitive == none)))
-            return jnp.where(nearer, distance, t), jnp.where(nearer, candidate, primitive)
-        hit, distances = compute_once(((distances > 0) & (distances <= t), distances))
+    def test_one(distances, rows, first, t, primitive):
+        (distance,), (candidate,) = compute_once((distances, rows + first))
+        nearer = (distance > 0) & ((distance < t) | ((distance == t) & (primitive == none)))
+        return jnp.where(nearer, distance, t), jnp.where(nearer, candidate, primitive)
 
-        def update():
-            # Positive floats order as integers, and integer minima vectorise.
-            bits = jnp.where(hit, _bits(distances), beyond)
-            nearest = _least(bits)
-            found = lax.bitcast_convert_type(nearest, distances.dtype)
-            # The lowest of those that tie is the first: primitives ascend with the lanes.
-            lanes = jnp.left_shift(jnp.int32(1), jnp.arange(len(bits), dtype=jnp.int32))
-            tied = jnp.sum(jnp.where(bits == nearest, lanes, 0), dtype=jnp.int32)
-            candidate = at(rows, lax.population_count(~tied & (tied - 1))) + first
-            better = (found < t) | (candidate < primitive)
-            return jnp.where(better, found, t), jnp.where(better, candidate, primitive)
+    def search(traverse, intersect, first, t, primitive):
+        def row_in(leaf):
+            """Row of the nearest primitive of a leaf; of coincident ones the lowest, as rows ascend with the lanes."""
+            distances, rows = intersect(leaf)
 
-        return lax.cond(jnp.any(hit), update, lambda: (t, primitive))
+            def pick():
+                order = _order(distances)
+                lanes = jnp.arange(len(order), dtype=jnp.int32)
+                tied = jnp.sum(jnp.left_shift((order == _least(order)).astype(jnp.int32), lanes), dtype=jnp.int32)
+                return at(rows, lax.population_count(~tied & (tied - 1)))
+
+            # A branch reads what was computed before it; without, each that reads distances would compute them again.
+            return lax.cond(leaf >= 0, pick, lambda: none)
+
+        def lowest_at(distance, row):
+            """The lowest row of all that are hit at this distance, one of which is known."""
+            wanted = _order(distance)
+
+            def lower(leaf, t, row):
+                distances, rows = intersect(leaf)
+                return t, jnp.minimum(row, jnp.min(jnp.where(_order(distances) == wanted, rows, none)))
+
+            return traverse(lower, distance, row)[1]
+
+        # Most leaves are left as they are found: which of their primitives is hit is asked at the end. `found` is the
+        # leaf with the nearest one, doubled, and 1 is added if another leaf has one as near; -1: none is found.
+        def leaf_test(leaf, t, found):
+            nearest = jnp.min(_order(intersect(leaf)[0]))
+            beyond = lax.bitcast_convert_type(jnp.maximum(_bits(t), 0), nearest.dtype)
+            tied = (nearest + 1 == beyond) & (found >= 0)
+            better = (nearest < beyond) & ~tied
+            t = jnp.where(better, lax.bitcast_convert_type(nearest + 1, t.dtype), t)
+            return t, jnp.where(better, 2 * leaf, found | tied.astype(jnp.int32))
+
+        def result(nearest, found):
+            def compare():
+                row = row_in(found >> 1)
+                row = lax.cond(found & 1 == 1, lambda: lowest_at(nearest, row), lambda: row)
+                better = (nearest < t) | (row + first < primitive)
+                return jnp.where(better, nearest, t), jnp.where(better, row + first, primitive)
+
+            return lax.cond(found >= 0, compare, lambda: (t, primitive))
+
+        return traverse(leaf_test, t, jnp.int32(-1), result)
 
     # A miss is infinitely far, and no bound may equal that.
     farthest = smaller(ray.t_max, jnp.full_like(ray.t_max, jnp.finfo(ray.t_max.dtype).max))
-    t, primitive = _visit(geometry, ray, leaf_test, farthest, none)
+    t, primitive = _visit(geometry, ray, test_one, search, farthest, none)
     found = primitive != none
     shape = at(geometry.shape, jnp.where(found, primitive, 0)) if geometry.tables else none
     return Hit(jnp.where(found, t, jnp.inf), jnp.where(found, primitive, -1), jnp.where(found, shape, -1))
@@ -80,12 +107,23 @@ def closest_hit(geometry: Geometry, ray: Ray) -> Hit:
 def occluded(geometry: Geometry, ray: Ray, target: Int[Array, ""]) -> Bool[Array, ""]:
     """Whether anything but the primitive `target` lies at 0 < t < ray.t_max."""
 
-    def leaf_test(distances, rows, first, t, primitive):
+    def test_one(distances, rows, first, t, primitive):
         blocked = jnp.any((distances > 0) & (distances < t) & (rows != target - first))
         return jnp.where(blocked, -1, t), primitive
 
+    def search(traverse, intersect, first, t, primitive):
+        def leaf_test(leaf, t, primitive):
+            distances, rows = intersect(leaf)
+            order = _order(distances)
+            before = order < lax.bitcast_convert_type(jnp.maximum(_bits(t), 1) - 1, order.dtype)
+            # Sums of numbers vectorise, those of flags do not.
+            blocked = jnp.sum((before & (rows != target - first)).astype(jnp.int32)) != 0
+            return jnp.where(blocked, -1, t), primitive
+
+        return traverse(leaf_test, t, primitive)
+
     ray = jax.tree.map(lax.stop_gradient, ray)
-    t, _ = _visit(geometry, ray, leaf_test, ray.t_max, jnp.int32(NO_HIT))
+    t, _ = _visit(geometry, ray, test_one, search, ray.t_max, jnp.int32(NO_HIT))
     return t < 0
 
 
@@ -188,40 +226,47 @@ def switch_by_range(number: Int[Array, ""], first: list[int], branches: list[Cal
     return lax.switch(index, branches)
 
 
-def _visit(geometry: Geometry, ray: Ray, leaf_test, t, primitive):
-    """Give every leaf that the ray may meet to `leaf_test(distances (W,), rows (W,), first, t, primitive)`, which
-    returns t, primitive. The primitives are first + rows: W sums that only a hit wants."""
+def _visit(geometry: Geometry, ray: Ray, test_one, search, t, primitive):
+    """Give all primitives that the ray may meet to a test.
+
+    Args:
+        test_one: (distances (1,), rows (1,), first, t, primitive) -> (t, primitive), where there is no tree. The
+            primitives are first + rows.
+        search: (traverse, intersect, first, t, primitive) -> (t, primitive), where there is a tree. traverse is that of
+            `bvh`: (leaf test, t, found, result); intersect: number of a leaf -> (distances (W,), rows (W,)).
+    """
     for table, first in zip(geometry.tables, firsts(geometry), strict=True):
         for part in table.searched():
-            t, primitive = _visit_table(part, first, ray, leaf_test, t, primitive)
+            t, primitive = _visit_table(part, first, ray, test_one, search, t, primitive)
     return t, primitive
 
 
-def _visit_table(table: Searched, first, ray, leaf_test, t, primitive):
-    def leaf(prepared, exclude, number, t, primitive):
-        distances, rows = table.intersect(number, prepared, exclude - first)
-        return leaf_test(distances, rows, first, t, primitive)
-
-    # A search goes its own way for each ray; what it starts from is made for all of them.
-    @one_by_one
-    def search(slabs, entry, prepared, exclude, t, primitive):
-        of_ray = partial(leaf, prepared, exclude)
-        return bvh.traverse(table.tree, of_ray, slabs, entry, t, primitive)
-
+def _visit_table(table: Searched, first, ray, test_one, search, t, primitive):
     prepared = compute_once(table.prepare(ray.o, ray.d))
+
+    def intersect(leaf):
+        return table.intersect(leaf, prepared, ray.exclude - first)
+
     if table.tree is not None:
         slabs = compute_once(bvh.prepare(ray.o, ray.d))
         entry = compute_once(bvh.enter(table.tree, slabs, t))
+
+        def traverse(leaf_test, *state):
+            return bvh.traverse(table.tree, leaf_test, slabs, entry, *state)
+
         # Many rays meet no child of the root.
-        return lax.cond(
-            entry != 0,
-            lambda: search(slabs, entry, prepared, ray.exclude, t, primitive),
-            lambda: (t, primitive),
-        )
-    of_ray = partial(leaf, prepared, ray.exclude)
-    found = lax.fori_loop(0, len(table.leaves), lambda number, state: of_ray(number, *state), (t, primitive))
+        return lax.cond(entry != 0, lambda: search(traverse, intersect, first, t, primitive), lambda: (t, primitive))
+    found = lax.fori_loop(
+        0, len(table.leaves), lambda number, state: test_one(*intersect(number), first, *state), (t, primitive)
+    )
     # XLA dissolves a loop of one trip, and would test again for each consumer.
     return compute_once(found)
+
+
+def _order(x):
+    """(W,) unsigned integers that order as positive floats x do, whose bits less 1 they are; others come last."""
+    bits = _bits(x)
+    return lax.bitcast_convert_type(bits, np.dtype(f"u{bits.dtype.itemsize}")) - 1
 
 
 def _least(x):

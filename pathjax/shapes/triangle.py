@@ -116,7 +116,8 @@ class Triangles(Table):
         """Constants of a ray: the shear that turns it into the z axis (Woop, Benthin, Wald 2013, JCGT 2(1)).
 
         Returns:
-            (3,) int32 axes x, y, z, and (6,) origin and shear in that order.
+            (3,) int32 axes x, y, z, in a tree (3,) uint32 where they begin in a leaf, and (6,) origin and shear in that
+            order.
         """
         size = jnp.abs(d)
         z = jnp.where(size[0] > size[1], jnp.where(size[0] > size[2], 0, 2), jnp.where(size[1] > size[2], 1, 2))
@@ -125,7 +126,10 @@ class Triangles(Table):
         y = jnp.where(x == 2, 0, x + 1)
         scale = 1 / at(d, z)
         shear = [at(d, x) * scale, at(d, y) * scale, scale]
-        return jnp.stack([x, y, z]), jnp.stack([at(o, x), at(o, y), at(o, z), *shear])
+        axes = jnp.stack([x, y, z])
+        if self.tree is not None:
+            axes = jnp.uint32(3) * axes.astype(jnp.uint32)
+        return axes, jnp.stack([at(o, x), at(o, y), at(o, z), *shear])
 
     def intersect(self, leaf, prepared, start):
         """Watertight: edges are inclusive by the rounding error of their edge function. (Contraction to fused
@@ -135,7 +139,8 @@ class Triangles(Table):
         _, _, width = self.leaves.shape
 
         def coordinates(axis):
-            start = [jnp.asarray(i, jnp.uint32) for i in (leaf, 3 * axis, 0)]
+            first = 3 * axis if self.tree is None else axis
+            start = [jnp.asarray(i, jnp.uint32) for i in (leaf, first, 0)]
             block = lax.dynamic_slice(self.leaves, start, (1, 3, width), allow_negative_indices=False)[0]
             return list(numbers_of(block, ray.dtype))
 

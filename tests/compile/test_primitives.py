@@ -1,4 +1,4 @@
-"""`compute_once`, `one_by_one` and `persistent_loop` under JAX's transformations, outside of lanes and within."""
+"""What code says to lanes under JAX's transformations, outside of lanes and within."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from jax import lax
 
-from pathjax.compile import compute_once, one_by_one, persistent_loop
+from pathjax.compile import Search, compute_once, interleaved, one_by_one, persistent_loop
 from pathjax.compile.lanes import lanes
 
 
@@ -116,3 +116,60 @@ def test_a_persistent_loop_is_a_loop():
     ns = jnp.arange(4, dtype=jnp.int32)
     same(jax.jit(jax.vmap(said, (None, 0)))(X, ns), jax.vmap(plain, (None, 0))(X, ns))
     same(*(jax.jacfwd(f)(X, N) for f in (said, plain)))
+
+
+def collatz(n, scale):
+    """Steps from n > 0 to 1, scaled; visits are those up. A search with none but its numbers, of any length."""
+
+    def begin():
+        return 2 * n, jnp.int32(-1)
+
+    def goes_on(odd):
+        return lambda state: (state[0] > 1) & (state[0] % 2 == odd)
+
+    def halve(state):
+        return state[0] // 2, state[1] + 1
+
+    def rise(state):
+        return 3 * state[0] + 1, state[1] + 1
+
+    return interleaved(Search(begin, goes_on(0), halve, goes_on(1), rise, lambda state: {"steps": state[1] * scale}))
+
+
+def collatz_steps(n):
+    return 0 if n == 1 else 1 + collatz_steps(3 * n + 1 if n % 2 else n // 2)
+
+
+NUMBERS = np.arange(1, 60, dtype=np.int32)
+STEPS = np.array(list(map(collatz_steps, NUMBERS)), np.float32)
+
+
+@pytest.mark.parametrize("width", [2, 8, 64])
+def test_interleaved_searches_of_lanes_end_each_with_its_own_result(width):
+    """Fewer lanes than slots, and more."""
+    found = jax.jit(lanes(lambda n, scale: collatz(n, scale)["steps"], width))(NUMBERS, 0.5)
+    np.testing.assert_array_equal(found, STEPS / 2)
+
+
+def test_interleaved_searches_run_for_active_lanes_alone():
+    def some(n):
+        return lax.cond(n % 3 == 0, lambda: collatz(n, n.astype(jnp.float32))["steps"], lambda: jnp.float32(-1))
+
+    found = jax.jit(lanes(some, 16))(NUMBERS)
+    np.testing.assert_array_equal(found, np.where(NUMBERS % 3 == 0, STEPS * NUMBERS, -1))
+
+
+@pytest.mark.parametrize("of", [lambda f: f, jax.jit], ids=["eager", "jit"])
+def test_an_interleaved_search_alone(of):
+    for n, steps in zip(NUMBERS[:7:2], STEPS[:7:2], strict=True):
+        assert of(collatz)(jnp.int32(n), 2.0)["steps"] == 2 * steps
+
+
+def test_interleaved_searches_under_vmap_and_forward_derivatives():
+    found = jax.jit(jax.vmap(collatz, (0, None)))(NUMBERS, 3.0)["steps"]
+    np.testing.assert_array_equal(found, 3 * STEPS)
+
+    def derivative(n):
+        return jax.jacfwd(lambda scale: collatz(n, scale)["steps"])(2.0)
+
+    np.testing.assert_array_equal(jax.jit(lanes(derivative, 8))(NUMBERS), STEPS)

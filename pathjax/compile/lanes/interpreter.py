@@ -11,7 +11,7 @@ import numpy as np
 from jax import lax
 
 from pathjax.compile.jax_compat import ClosedJaxpr, Literal, called_program, jaxpr_as_fun, scan_parts, while_parts
-from pathjax.compile.lanes import flags, runs
+from pathjax.compile.lanes import flags, runs, slots
 from pathjax.compile.lanes.columns import (
     as_components,
     components,
@@ -83,7 +83,7 @@ class Interpreter:
         if primitive is compute_once_p:
             return self.materialize(inputs)
         if primitive is one_by_one_p:
-            return self.one_by_one(eqn.params["program"], inputs)
+            return self.one_by_one(inputs, **eqn.params)
         if primitive is together_p:
             return self.together(inputs, **eqn.params)
         called = called_program(eqn)
@@ -154,7 +154,9 @@ class Interpreter:
         outputs = jax.vmap(partial(eqn.primitive.bind, **eqn.params), in_axes=axes)(*joined)
         return [split(y) for y in (outputs if eqn.primitive.multiple_results else [outputs])]
 
-    def one_by_one(self, program, inputs):
+    def one_by_one(self, inputs, program, search):
+        if search is not None:
+            return slots.in_slots(self, program, search, inputs)
         rows = [join(x, self.width) if differs(x) else x for x in inputs]
         active = jnp.ones((self.width,), bool) if self.active is None else self.active
 

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jaxtyping import Array, Float, Int
 
-from pathjax.compile import register_dataclass
+from pathjax.compile import Search, interleaved, register_dataclass
 from pathjax.core.math import at, integer_like, larger, smaller
 
 WIDTH = 8
@@ -53,29 +55,33 @@ def enter(tree: Tree, prepared, t):
     return _hit_children(tree, jnp.int32(0), ray, _weights(octant), t)
 
 
-def traverse(tree: Tree, leaf, prepared, entry, t, primitive):
+class _State(NamedTuple):
+    free: Int[Array, ""]  # the entry of the stack above those in use
+    entry: Int[Array, ""]  # what comes next; 0: the search is done
+    child: Int[Array, ""]  # its first child: >= 0 a node, < 0 the leaf ~child
+    stack: Int[Array, " depth+1"]
+    t: Float[Array, ""]
+    found: Any
+
+
+def traverse(tree: Tree, leaf, prepared, entry, t, found, result=lambda t, found: (t, found)):
     """Visit the leaves that the ray o + s d, 0 <= s <= t, may hit, near ones first.
 
     Args:
-        leaf: (number of the leaf, t, primitive) -> (t, primitive) after testing it; a negative t ends the search.
+        leaf: (number of the leaf, t, found) -> (t, found) after testing it; a negative t ends the search.
         prepared: of `prepare`; entry: of `enter`.
         t: () the farthest distance of interest; shrinks as hits are found.
-        primitive: () int32, carried along.
-    Returns:
-        t, primitive.
+        found: pytree of arrays, carried along.
+        result: (t, found) at the end -> results.
 
     A node's children still to visit are the bits of a mask: bit k is the child in slot k ^ octant, which the builder
     has chosen so that ascending bits go away from a ray of that octant. An entry is a node's number above its mask; the
     stack holds those whose masks are not empty, above a 0 that ends the search. Nothing else is kept, since every
-    buffer that a loop carries costs instructions in each of its trips; for the same reason the constants of the ray
-    travel in one array, and nodes are opened in a loop of their own (Aila and Laine 2009, "Understanding the efficiency
-    of ray traversal on GPUs"), which carries less than that over leaves.
+    buffer that a loop carries costs instructions in each of its trips.
     """
     ray, octant = prepared
-    weights = _weights(octant)
 
     def first_child(entry):
-        """The one to visit next: < 0 the leaf ~child, > 0 a node."""
         slot = (lax.population_count(~entry & (entry - 1)) ^ octant) & (WIDTH - 1)
         return at(tree.nodes, entry >> WIDTH, 6, slot).astype(jnp.int32)
 
@@ -84,46 +90,49 @@ def traverse(tree: Tree, leaf, prepared, entry, t, primitive):
         rest = entry & (entry - 1)
         return rest, rest & ((1 << WIDTH) - 1) != 0
 
-    def descend(free, entry, stack, t):
-        """Open nodes until a leaf comes next, or nothing."""
+    def begin():
+        stack = jnp.zeros((tree.depth + 1,), jnp.int32)
+        child = first_child(entry)
+        # A search begins by opening a node: if a leaf comes first, by opening the root again.
+        at_node = (child > 0) | (entry == 0)
+        start = jnp.where(at_node, entry, -1 << WIDTH), jnp.where(at_node, child, 0)
+        return _State(jnp.int32(1), *start, stack, t, found)
 
-        def open_node(state):
-            free, entry, child, stack = state
-            below = _hit_children(tree, child, ray, weights, t)
-            rest, some = rest_of(entry)
-            # Push the rest, unless it is empty; then go below, or pop.
-            place = free.astype(jnp.uint32)
-            stack = lax.dynamic_update_slice(stack, rest[None], (place,), allow_negative_indices=False)
-            free = free + some.astype(jnp.int32) - (below == 0).astype(jnp.int32)
-            entry = jnp.where(below != 0, child << WIDTH | below, at(stack, free))
-            return free, entry, first_child(entry), stack
-
-        def at_node(state):
-            _, entry, child, _ = state
-            return (entry != 0) & (child > 0)
-
-        return lax.while_loop(at_node, open_node, (free, entry, first_child(entry), stack))
+    def open_node(state):
+        free, entry, child, stack, t, found = state
+        # Of a search that is done no child is met, nothing is pushed, and the 0 at the bottom is popped for ever.
+        below = _hit_children(tree, child, ray, _weights(octant, entry != 0), t)
+        rest, some = rest_of(entry)
+        # Push the rest, unless it is empty; then go below, or pop.
+        place = free.astype(jnp.uint32)
+        stack = lax.dynamic_update_slice(stack, rest[None], (place,), allow_negative_indices=False)
+        free = jnp.maximum(free + some.astype(jnp.int32) - (below == 0).astype(jnp.int32), 0)
+        entry = jnp.where(below != 0, child << WIDTH | below, at(stack, free))
+        return _State(free, entry, first_child(entry), stack, t, found)
 
     def visit_leaf(state):
-        free, entry, child, stack, t, primitive = state
-        t, primitive = leaf(~child, t, primitive)
+        free, entry, child, stack, t, found = state
+        t, found = leaf(~child, t, found)
         rest, some = rest_of(entry)
         free = free - (~some).astype(jnp.int32)
-        entry = jnp.where(some, rest, at(stack, free))
-        return *descend(free, entry, stack, t), t, primitive
+        entry = jnp.where(t < 0, 0, jnp.where(some, rest, at(stack, free)))
+        return _State(free, entry, first_child(entry), stack, t, found)
 
-    def more(state):
-        _, entry, _, _, t, _ = state
-        return (entry != 0) & (t >= 0)
+    return interleaved(
+        Search(
+            begin=begin,
+            opens=lambda state: (state.entry != 0) & (state.child >= 0),
+            open=open_node,
+            visits=lambda state: (state.entry != 0) & (state.child < 0),
+            visit=visit_leaf,
+            result=lambda state: result(state.t, state.found),
+        )
+    )
 
-    stack = jnp.zeros((tree.depth + 1,), jnp.int32)
-    start = *descend(jnp.int32(1), entry, stack, t), t, primitive
-    return lax.while_loop(more, visit_leaf, start)[4:]
 
-
-def _weights(octant):
-    """(8,) int32: the bit of each slot in an entry."""
-    return jnp.left_shift(jnp.int32(1), jnp.arange(WIDTH, dtype=jnp.int32) ^ octant)
+def _weights(octant, is_any=True):
+    """(8,) int32: the bit of each slot in an entry; of none, 0."""
+    return jnp.left_shift(jnp.int32(is_any), jnp.arange(WIDTH, dtype=jnp.int32) ^ octant)
 
 
 def _hit_children(tree: Tree, node, ray, weights, t):
