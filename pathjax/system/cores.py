@@ -7,6 +7,8 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 
+SMALL = 1 << 15  # as many primitives or faces are done before threads have begun
+
 
 def cores() -> int:
     """Their number, where the system tells."""
@@ -14,12 +16,12 @@ def cores() -> int:
 
 
 @contextmanager
-def over_cores() -> Iterator[Callable]:
-    """`map` whose calls go on beside each other, in threads: for NumPy on arrays large enough to be worth a thread.
+def over_cores(size: int) -> Iterator[Callable]:
+    """`map` whose calls go on beside each other, in threads, where NumPy works on arrays of at least SMALL rows.
 
-    Calls must not map anything themselves.
+    What is mapped must not map anything itself, and all results must be asked for.
     """
-    if cores() == 1:
+    if size < SMALL or cores() == 1:
         yield map
         return
     with ThreadPoolExecutor(cores()) as pool:

@@ -200,6 +200,8 @@ def test_splits_sought_in_two_steps_cost_about_as_little_as_all_tried(boxes, mon
 
 @pytest.mark.parametrize("rule", RULES)
 def test_the_same_tree_on_any_number_of_cores(rule, monkeypatch):
+    monkeypatch.setattr(cores, "SMALL", 0)
+    monkeypatch.setattr(binary, "FEW", 100)
     monkeypatch.setattr(binary, "BATCH", 500)  # so that some nodes are divided among cores, and others dealt to them
     trees = []
     for number in (1, 2, 5):

@@ -227,7 +227,7 @@ def _in_blocks(of_block: Callable[[slice], np.ndarray], shape: tuple[int, ...]) 
         block = slice(begin, begin + BLOCK)
         joined[..., block] = of_block(block)
 
-    with over_cores() as run:
+    with over_cores(shape[-1]) as run:
         list(run(fill, range(0, shape[-1], BLOCK)))
     return joined
 
@@ -255,7 +255,7 @@ def _smooth_normals(vertices: np.ndarray, faces: np.ndarray, area_vectors: np.nd
 
     angles = _in_blocks(angles_of, (3, len(faces)))
     unit = _in_blocks(lambda block: area_vectors[:, block] / _norm(area_vectors[:, block]), area_vectors.shape)
-    with over_cores() as run:
+    with over_cores(len(faces)) as run:
         *sums, angles_around = run(total, [*unit, np.ones(len(faces))])
     sums = np.stack(sums, axis=1)
     cancel = _norm(sums.T) <= np.finfo(np.float32).eps * angles_around

@@ -21,6 +21,7 @@ THICKNESS = np.float32(1e-6)  # of the scene, added to every extent: flat and li
 PLACES = 128  # with twice or half as many, rays visit the same number of nodes within 1 %
 BATCH = 1 << 16  # primitives whose nodes are split together: their arrays stay in the cache
 SPREAD = 1.15  # of counts in a batch, which fills all of its nodes up to the largest
+FEW = 1 << 12  # primitives that are not worth a batch of their own
 
 
 def binary_tree(unit, rule, leaf_size):
@@ -44,9 +45,9 @@ def binary_tree(unit, rule, leaf_size):
     side, leaf_of = np.zeros(p, bool), np.zeros(p, np.int64)
     count[0], levels = p, [slice(0, 1)]
     nodes = np.arange(p > leaf_size)  # the open ones of this level
-    with over_cores() as run:
-        by_axis = run(sorted_by, centre.view(np.int32), [np.arange(p)] * 3)
-        order = np.stack(list(by_axis))  # (3, n): of the open nodes, by node, then centroid
+    with over_cores(p) as run:
+        order = np.empty((3, p), np.int64)  # (3, n) of the open nodes, by node, then centroid
+        list(run(partial(sorted_by, np.arange(p)), centre.view(np.int32), order))
         while len(nodes):
             size = count[nodes]
             first = np.cumsum(size) - size
@@ -67,9 +68,9 @@ def binary_tree(unit, rule, leaf_size):
     return left[:b], start[:b], count[:b], levels, leaf_of
 
 
-def sorted_by(key, values):
+def sorted_by(values, key, out=None):
     """`values` (P,) >= 0 by ascending int32 `key` (P,), stable: one fast sort of 64-bit integers."""
-    return np.sort(key.astype(np.int64) << 32 | values) & 0xFFFFFFFF
+    return np.bitwise_and(np.sort(key.astype(np.int64) << 32 | values), 0xFFFFFFFF, out=out)
 
 
 # ---- rules: the axis (M,) to split each of M nodes along, and how many primitives (M,) go to the left ----------------
@@ -92,10 +93,15 @@ def least_cost(order, rows, centre, first, count, leaf_size, run):
 
 
 def _alike(count):
-    """Batches of nodes of about the same count, that have some BATCH primitives together, or more in one node alone."""
+    """Batches of nodes of about the same count, of FEW to some BATCH primitives, or more in one node alone."""
     by = np.argsort(count, kind="stable")
-    size, full = np.log(count[by]) // np.log(SPREAD), np.cumsum(count[by]) // BATCH
-    return np.split(by, np.flatnonzero(np.diff(size) + np.diff(full)) + 1)
+    size, total = np.log(count[by]) // np.log(SPREAD), np.cumsum(count[by])
+    cuts, before = list(np.flatnonzero(np.diff(total // BATCH)) + 1), 0
+    for cut in np.flatnonzero(np.diff(size)) + 1:
+        if total[cut - 1] - before >= FEW:
+            cuts.append(cut)
+            before = total[cut - 1]
+    return np.split(by, np.unique(cuts).astype(int))
 
 
 def _least_cost(order, rows, leaf_size, first, count, run=map):

@@ -12,6 +12,7 @@ import numpy as np
 
 from pathjax.shapes.accel.binary import RULES, binary_tree
 from pathjax.shapes.accel.collapse import widen
+from pathjax.system.cores import over_cores
 
 
 @dataclass(frozen=True)
@@ -67,18 +68,26 @@ def primitive_bounds(lo, hi):
     if lo.ndim != 2 or lo.shape[1] != 3 or lo.shape != hi.shape or len(lo) == 0:
         raise ValueError(f"a BVH needs lo and hi of shape (P, 3) with P >= 1, not {lo.shape} and {hi.shape}")
     box, unit = np.empty((2, 2, 3, len(lo)), np.float32)
-    for rounded, exact, beyond in ((box[0], lo.T, np.greater), (box[1], hi.T, np.less)):
+
+    def rounded(side, axis):
+        exact, beyond, way = ((lo, np.greater, -np.inf), (hi, np.less, np.inf))[side]
+        exact, row = exact[:, axis], box[side, axis]
         with np.errstate(over="ignore", invalid="ignore"):
-            rounded[:] = exact
+            row[:] = exact
         if exact.dtype != np.float32:
-            outwards = np.nextafter(rounded, np.float32(-np.inf if beyond is np.greater else np.inf))
-            np.copyto(rounded, outwards, where=beyond(rounded, exact))
-    bad = ~((lo.T <= hi.T).all(0) & np.isfinite(box).all((0, 1)))
-    if bad.any():
-        raise ValueError(f"{bad.sum()} bounds are not finite float32s or have lo > hi; first is number {bad.argmax()}")
-    origin = box[0].min(1).astype(np.float64)
-    extent = (box[1].max(1) - origin).max() or 1.0
-    for side in (0, 1):
-        for axis in range(3):
-            unit[side, axis] = (box[side, axis] - origin[axis]) / extent
+            np.copyto(row, np.nextafter(row, np.float32(way)), where=beyond(row, exact))
+
+    def scaled(side, axis):
+        unit[side, axis] = (box[side, axis] - origin[axis]) / extent
+
+    rows = np.indices((2, 3)).reshape(2, -1)
+    with over_cores(len(lo)) as run:
+        list(run(rounded, *rows))
+        bad = ~((lo.T <= hi.T).all(0) & np.isfinite(box).all((0, 1)))
+        if bad.any():
+            what = "bounds are not finite float32s or have lo > hi"
+            raise ValueError(f"{bad.sum()} {what}; first is number {bad.argmax()}")
+        origin = box[0].min(1).astype(np.float64)
+        extent = (box[1].max(1) - origin).max() or 1.0
+        list(run(scaled, *rows))
     return box, unit

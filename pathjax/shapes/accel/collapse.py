@@ -9,17 +9,22 @@ from __future__ import annotations
 import numpy as np
 
 from pathjax.shapes.accel.binary import THICKNESS, half_area, sorted_by
+from pathjax.system.cores import over_cores
 
 
 def widen(box, left, start, count, levels, leaf_of, width):
     """Collapse the binary tree to `width` children a node and lay it out, depth first: the fields of a `Tree`."""
-    order = sorted_by(start[leaf_of], np.arange(len(leaf_of)))
-    leaves = sorted_by(start, np.arange(len(left)))
+    order = sorted_by(np.arange(len(leaf_of)), start[leaf_of])
+    leaves = sorted_by(np.arange(len(left)), start)
     leaves = leaves[left[leaves] == 0]
     bounds = np.empty((2, 3, len(left)), np.float32)
-    for ufunc, out, b in zip((np.minimum, np.maximum), bounds, box, strict=True):
-        for axis in range(3):
-            out[axis, leaves] = ufunc.reduceat(b[axis][order], start[leaves])
+
+    def bound(side, axis):
+        ufunc = (np.minimum, np.maximum)[side]
+        bounds[side, axis, leaves] = ufunc.reduceat(box[side, axis, order], start[leaves])
+
+    with over_cores(len(order)) as run:
+        list(run(bound, *np.indices((2, 3)).reshape(2, -1)))
     for level in levels[::-1]:
         k = np.flatnonzero(left[level]) + level.start
         bounds[0][:, k] = np.minimum(bounds[0][:, left[k]], bounds[0][:, left[k] + 1])
