@@ -20,7 +20,7 @@ from pathjax.system.files import write_text
 
 SHIPPED = "cornell_box", "glass_and_mirror", "glass_ball", "mesh", "triangle_box"
 # Sampling of all twelve, unless users ask for others.
-RES, SPPS, REFERENCE_SPP = 128, [64], 4096
+RES, SPPS, REFERENCE_SPP = 128, [64], 2048
 
 _HEAD = """\
 <scene version="3.0.0">

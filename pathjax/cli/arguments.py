@@ -67,7 +67,7 @@ def parser() -> argparse.ArgumentParser:
     bench.add_argument("--against", choices=("mitsuba",), help="measure this peer in the same run")
     spp = "default: 16,64,256; of the twelve 64"
     bench.add_argument("--spp", type=_comma_separated(_positive), metavar="16,64,256", help=spp)
-    reference = "of the converged reference; default: 16384, of the twelve 4096"
+    reference = "of the converged reference; default: 16384, of the twelve 2048"
     bench.add_argument("--reference-spp", type=_positive, metavar="N", help=reference)
     bench.add_argument("--repeat", type=_positive, default=5, metavar="N", help="timed runs of each; medians are shown")
     bench.add_argument("-o", "--output", metavar="DIR", help="also write bench.md, bench.json and plots to this folder")

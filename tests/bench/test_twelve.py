@@ -146,7 +146,7 @@ def test_without_scenes_the_twelve_are_measured_and_summed_up(small, quick, tmp_
     assert main(["bench", "--against", "mitsuba", "-o", str(folder)]) == 0
     told, report = capsys.readouterr(), json.loads((folder / "bench.json").read_text())
     assert [Path(scene["file"]).stem for scene in report["scenes"]] == [*twelve.SHIPPED, *MADE]
-    assert report["plan"] == {"spp": [64], "reference_spp": 4096, "quick": True, "parameters": {"res": "128"}}
+    assert report["plan"] == {"spp": [64], "reference_spp": 2048, "quick": True, "parameters": {"res": "128"}}
     assert report["summary"]["wall"]["geometric_mean"] == pytest.approx(8)
     assert "scene 12 of 12" in told.err
     assert "Geometric mean of the 12 efficiency ratios: 8.00, the worst 8.00" in told.out
