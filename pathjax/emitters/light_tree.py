@@ -49,17 +49,17 @@ def arranged(boxes: Float[np.ndarray, "K 2 3"]) -> Int[np.ndarray, " K"]:
         fill(lights[:half], first, room // 2)
         fill(lights[half:], first + room // 2, room // 2)
 
-    fill(np.arange(len(boxes)), 0, _leaves(len(boxes)))
+    fill(np.arange(len(boxes)), 0, leaves(len(boxes)))
     return leaf
 
 
-def _leaves(lights: int) -> int:
+def leaves(lights: int) -> int:
     return 1 << (lights - 1).bit_length()
 
 
 def built(boxes: Float[Array, "K 2 3"], leaf: Int[Array, " K"], power: Float[Array, " K"]) -> LightTree:
     """The tree of lights in boxes, at these leaves. power: relative to each other."""
-    light = jnp.full(_leaves(len(leaf)), -1, jnp.int32).at[leaf].set(jnp.arange(len(leaf), dtype=jnp.int32))
+    light = jnp.full(leaves(len(leaf)), -1, jnp.int32).at[leaf].set(jnp.arange(len(leaf), dtype=jnp.int32))
     # An empty leaf follows the lights of its node; its power is 0, and its box that of a light among them.
     near = lax.cummax(jnp.where(light >= 0, jnp.arange(len(light)), 0))
     lo, hi = (boxes[light[near], end] for end in (0, 1))

@@ -1,12 +1,13 @@
 """Scenes of one structure as scenes of the same array sizes, so that they share compiled kernels.
 
 A kernel is compiled for the sizes of a scene's arrays. What is counted in thousands (triangles, nodes and leaves of
-hierarchies, texels) and what is counted in pieces (shapes, bsdfs, textures) is padded up to rungs of a coarse ladder
-here. Whatever is read is found by number, and nothing holds the number of a padded entry: no ray searches it, no light
-is chosen there, and images are those of the scene itself. Their last bits may differ, as the kernel is another program.
+hierarchies, texels) and what is counted in pieces (shapes, bsdfs, textures, lights) is padded up to rungs of a coarse
+ladder here. Whatever is read is found by number, and nothing holds the number of a padded entry: no ray searches it, no
+light is chosen there, and images are those of the scene itself. Their last bits may differ, as the kernel is another
+program.
 
-What stays as it is, and so tells kernels apart: lights, shapes of a kind of which there are so few that rays test them
-all, and environment maps.
+What stays as it is, and so tells kernels apart: whether lights are so many that a tree chooses among them, backgrounds,
+and shapes of a kind of which there are so few that rays test them all.
 """
 
 from __future__ import annotations
@@ -16,9 +17,10 @@ from dataclasses import replace
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Shaped
+from jaxtyping import Int, Shaped
 
-from pathjax.kinds import Table
+from pathjax.emitters import Lights, light_tree
+from pathjax.kinds import Color, Table
 from pathjax.scene.scene import Scene
 from pathjax.shapes import Geometry
 from pathjax.shapes.shape import Table as ShapeTable
@@ -28,6 +30,8 @@ from pathjax.shapes.shape import Table as ShapeTable
 MANY_BYTES, FEW_ROWS, STEP = 1 << 22, 64, 4
 # Levels of a hierarchy: the stack of a search holds one number for each.
 LEVELS = 16
+# Lights are powers of two: the levels of the tree by which they are chosen are then as many as without padding.
+FEW_LIGHTS = light_tree.FEWEST - 1
 
 
 def padded(scene: Scene) -> Scene:
@@ -48,7 +52,9 @@ def padded(scene: Scene) -> Scene:
         phases = tuple(map(_kind, media.phases))
         phase, sides = (_rows(values, _few(len(values))) for values in (media.phase, media.sides))
         media = replace(media, table=_kind(media.table), phases=phases, phase=phase, sides=sides)
-    scene = replace(scene, geometry=_geometry(scene.geometry), materials=materials, media=media)
+    lit, emitters = _emitters(scene.emitters, np.asarray(scene.geometry.light))
+    geometry = _geometry(replace(scene.geometry, light=lit))
+    scene = replace(scene, geometry=geometry, materials=materials, media=media, emitters=emitters)
     return jax.tree.map(jnp.asarray, scene)  # which each call of a kernel would do again
 
 
@@ -63,6 +69,81 @@ def _geometry(geometry: Geometry) -> Geometry:
         return np.concatenate([_rows(part, table.count) for part, table in parts]) if tables else values
 
     return replace(geometry, tables=tables, shape=numbered(geometry.shape), light=numbered(geometry.light))
+
+
+def _emitters(emitters: tuple[Lights, ...], light: Int[np.ndarray, " N"]) -> tuple[np.ndarray, tuple[Lights, ...]]:
+    """Lights with others of power 0 before those of each kind, and `Geometry.light` with the numbers that they have.
+
+    The last light of all stays the last, so that the largest of random numbers chooses it.
+    """
+    extra = [_more_lights(lights) for lights in emitters]
+    made = [_lights(lights, more) for lights, more in zip(emitters, extra, strict=True)]
+    lit, first, moved = light.copy(), 0, 0
+    for lights, more in zip(emitters, extra, strict=True):
+        moved += more
+        lit[(light >= first) & (light < first + lights.count)] += moved
+        first += lights.count
+    if any(lights.boxes is not None for lights in emitters):
+        _plant(emitters, made, extra)
+    return lit, tuple(made)
+
+
+def _plant(emitters: tuple[Lights, ...], made: list[Lights], extra: list[int]) -> None:
+    """Put added lights into empty leaves, with the boxes that these have when empty: so no node of the tree changes."""
+    placed = [place for place, lights in enumerate(emitters) if lights.boxes is not None]
+    boxes = np.concatenate([emitters[place].boxes for place in placed])
+    leaf = np.concatenate([emitters[place].leaf for place in placed])
+    room = light_tree.leaves(sum(made[place].count for place in placed))
+    light = np.full(room, -1)
+    light[leaf] = np.arange(len(leaf))
+    followed = light[np.maximum.accumulate(np.where(light >= 0, np.arange(room), 0))]
+    empty = iter(np.flatnonzero(light < 0))
+    for place in placed:
+        own = np.asarray([next(empty) for _ in range(extra[place])], np.int32)
+        made[place] = replace(
+            made[place],
+            boxes=np.concatenate([boxes[followed[own]], emitters[place].boxes]),
+            leaf=np.concatenate([own, emitters[place].leaf]),
+        )
+
+
+def _more_lights(lights: Lights) -> int:
+    """How many are added. A single one stays so, where nothing is chosen."""
+    dark = lights.lamps is not None or any(isinstance(x, Color) and x.radiance for x in lights.kind.declared.values())
+    if lights.count == 1 or not dark or _all_around(lights):
+        return 0
+    return max(FEW_LIGHTS, light_tree.leaves(lights.count)) - lights.count
+
+
+def _all_around(lights: Lights) -> bool:
+    """Backgrounds, all of which every ray asks that leaves the scene."""
+    return lights.kind.distant and not lights.kind.dirac
+
+
+def _lights(lights: Lights, more: int) -> Lights:
+    def before(values):
+        values = np.asarray(values)
+        return np.concatenate([np.zeros((more, *values.shape[1:]), values.dtype), values])
+
+    if _all_around(lights):
+        return lights
+    if lights.textures is not None:
+        lights = replace(lights, textures=replace(lights.textures, tables=tuple(map(_kind, lights.textures.tables))))
+    if lights.lamps is not None:  # of area 0
+        lamps = jax.tree.map(before, lights.lamps)
+        return replace(lights, table=_kind(lights.table), lamps=lamps, row=before(lights.row))
+
+    def of(declared, column):
+        if column is None or declared.shared:
+            return column
+        values = before(column.values)
+        if not (isinstance(declared, Color) and declared.radiance):
+            values[:more] = values[more]
+        texture = None if column.texture is None else before(column.texture)
+        return replace(column, values=values, texture=texture)
+
+    columns = tuple(map(of, lights.kind.declared.values(), lights.table.columns))
+    return replace(lights, table=replace(lights.table, columns=columns))
 
 
 def _shapes(table: ShapeTable) -> ShapeTable:

@@ -1,0 +1,88 @@
+"""Padding to the ladder: scenes that differ in numbers share kernels, and what is added is never found."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import pathjax as pj
+from pathjax import emitters
+from pathjax.emitters.selection import choose, probability
+from pathjax.scene.ladder import padded
+from pathjax.scene.parameters import nameless
+
+
+def point(x, y):
+    return f"""<emitter type="point"><point name="position" x="{x}" y="{y}" z="1"/>
+        <rgb name="intensity" value="{1 + x}"/></emitter>"""
+
+
+def lamp(x):
+    """A mesh that shines, as a whole."""
+    return f"""<shape type="obj"><string name="filename" value="meshes/octahedron.obj"/>
+        <transform name="to_world"><scale value="0.2"/><translate x="{x}" y="1" z="0"/></transform>
+        <emitter type="area"><rgb name="radiance" value="{1 + x}"/></emitter></shape>"""
+
+
+SUN = '<emitter type="directional"><vector name="direction" x="0" y="-1" z="0"/></emitter>'
+
+
+@pytest.fixture
+def lit(make_scene):
+    """(points, lamps, suns) -> a scene with so many lights."""
+
+    def lit(points, lamps=0, suns=0):
+        body = "".join(point(i % 5, i // 5) for i in range(points)) + "".join(lamp(i / 3) for i in range(lamps))
+        return make_scene('<shape type="sphere"/>' + body + SUN * suns)
+
+    return lit
+
+
+def key(scene):
+    scene = nameless(scene)
+    return jax.tree.structure(scene), [(x.shape, x.dtype) for x in jax.tree.leaves(scene)]
+
+
+@pytest.mark.parametrize(("one", "other"), [((3, 2, 2), (6, 2, 5)), ((20, 9), (30, 16))])
+def test_scenes_that_differ_in_their_numbers_of_lights_share_kernels(lit, one, other):
+    a, b = lit(*one), lit(*other)
+    assert key(a) != key(b) and key(padded(a)) == key(padded(b))
+
+
+@pytest.mark.parametrize("counts", [pytest.param((3, 2, 2), marks=pytest.mark.slow), (11, 10, 3)])
+def test_lights_are_chosen_as_without_padding(lit, counts):
+    """The same light by the same number, the largest and the least too, with the same probability."""
+    scene = lit(*counts)
+    u = jnp.concatenate([jnp.linspace(0, 1 - 2**-24, 101), jnp.array([2**-24])])
+    refs = jnp.array([[0.0, 0, 3], [4, 2, 1], [-2, 1, 0]])
+
+    @jax.jit
+    def found(scene):
+        made = emitters.choice(scene.emitters, "mis")
+        number, pdf, _ = jax.vmap(lambda ref: jax.vmap(lambda u: choose(made, ref, jnp.stack([u, u])))(u))(refs)
+        near = sum(lights.count for lights in scene.emitters if not lights.kind.distant)
+        known = jax.vmap(lambda ref: jax.vmap(lambda n: probability(made, ref, n))(jnp.arange(near)))(refs)
+        return number, pdf, known
+
+    def chosen(scene):
+        return map(np.asarray, found(nameless(scene)))
+
+    (number, pdf, known), (number_padded, pdf_padded, known_padded) = map(chosen, (scene, padded(scene)))
+    # Of each light its number with padding: added ones come before those of their kind.
+    lights, more = scene.emitters, padded(scene).emitters
+    ends = np.cumsum([each.count for each in more])
+    moved = np.concatenate([np.arange(end - each.count, end) for each, end in zip(lights, ends, strict=True)])
+    np.testing.assert_array_equal(number_padded, moved[number])
+    np.testing.assert_allclose(pdf_padded, pdf, rtol=1e-6)
+    near = moved[: known.shape[1]]
+    np.testing.assert_allclose(known_padded[:, near], known, rtol=1e-6)
+    # Where the other child of a node is empty, its share is 1 but for rounding.
+    assert np.delete(known_padded, near, 1).max() <= np.finfo(np.float32).eps
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("counts", [(3, 2, 2), (11, 10, 3)])
+def test_images_are_those_without_padding(lit, counts):
+    scene = lit(*counts)
+    image = np.asarray(pj.render(scene, 16, seed=1))
+    np.testing.assert_allclose(pj.render(padded(scene), 16, seed=1), image, rtol=1e-4, atol=1e-5 * image.max())
