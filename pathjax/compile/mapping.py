@@ -79,7 +79,9 @@ def native_map(f: Callable, xs, *shared, form: str | None = None, devices: int |
 
 
 @usual_promotion
-def native_fold(f: Callable, xs, *shared, start: Callable, finish: Callable, devices: int | None = None):
+def native_fold(
+    f: Callable, xs, *shared, start: Callable, finish: Callable, form: str | None = None, devices: int | None = None
+):
     """What all items together leave in memory that they share (`together`), on all devices.
 
     Items are dealt to parts, whose number depends on theirs alone. Each part has a memory of its own and is done by one
@@ -91,11 +93,20 @@ def native_fold(f: Callable, xs, *shared, start: Callable, finish: Callable, dev
         shared: pytrees that every item sees whole.
         start: number of lanes -> memory before the first item.
         finish: memory after the last item of a part -> pytree of arrays, which are added up.
-        devices: of `native_map`.
+        form, devices: of `native_map`; "vmap" gives each item a memory of its own, as lanes do to each part.
     """
-    nbytes = sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(jax.eval_shape(lambda: finish(start(_LANES)))))
+    form = _form(form)
+    if form == "loop":
+        raise ValueError("items that share memory have no form loop; use lanes or vmap")
+    nbytes = _bytes(lambda: finish(start(_LANES)))
+
+    def alone(x, *shared):
+        return finish(f(x, *shared, start(1)))
 
     def part(xs, width, shared):
+        if form == "vmap":
+            each = _BYTES_PER_LANE + _bytes(lambda: start(1)) + _bytes(lambda: finish(start(1)))
+            return _vmap_sum(alone, xs, jax.tree.map(jnp.asarray, shared), max(_CHUNK_BYTES // each, 1))
         (memory,) = lanes(lambda *args: (f(*args),), width, memory=start(width))(xs, *shared)
         return finish(memory)
 
@@ -169,6 +180,15 @@ def _by_parts(part: Callable, xs, shared, devices: int | None, most: int = MOST_
     return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:parts], results)
 
 
+def _form(form: str | None) -> str:
+    return form or ("lanes" if native() else "vmap")
+
+
+def _bytes(made: Callable) -> int:
+    """Of the arrays that it makes."""
+    return sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(jax.eval_shape(made)))
+
+
 def _used(devices: int | None) -> list[jax.Device]:
     return jax.devices() if devices is None else jax.local_devices()[:devices]
 
@@ -198,7 +218,7 @@ def _dealt(f: Callable, used: list[jax.Device], xs, shared):
 
 def _map(f, xs, shared, form, devices):
     count = jax.tree.leaves(xs)[0].shape[0]
-    form = form or ("lanes" if native() else "vmap")
+    form = _form(form)
     used = _used(devices)
     each = -(-count // len(used))
     run = {
@@ -263,3 +283,21 @@ def _vmap_chunks(f, xs, shared, chunk):
         return y.reshape(chunks * each, *y.shape[2:])[:count]
 
     return jax.tree.map(join, lax.map(lambda rows: vectorised(f, rows, shared), jax.tree.map(split, xs)))
+
+
+def _vmap_sum(f, xs, shared, chunk):
+    """The sum of f over all items, and over items of zeros, which fill the last chunk up."""
+    count = jax.tree.leaves(xs)[0].shape[0]
+    chunks = -(-count // chunk)
+    each = -(-count // chunks)
+
+    def split(x):
+        x = jnp.pad(x, [(0, each * chunks - count), *[(0, 0)] * (x.ndim - 1)])
+        return x.reshape(chunks, each, *x.shape[1:])
+
+    def add(total, rows):
+        return jax.tree.map(lambda total, y: total + y.sum(0), total, vectorised(f, rows, shared)), None
+
+    one = jax.eval_shape(f, jax.tree.map(lambda x: x[0], xs), *shared)
+    zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), one)
+    return lax.scan(add, zeros, jax.tree.map(split, xs))[0]

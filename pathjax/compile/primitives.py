@@ -265,7 +265,14 @@ def _alone(*inputs, f, shared):
     return f(inputs[:shared], jnp.ones((1,), bool), [x[None] for x in inputs[shared:]])
 
 
+def _together_batch(inputs, axes, **params):
+    """Under `jax.vmap` no item shares its memory with others."""
+    outputs = jax.vmap(lambda *inputs: _alone(*inputs, **params), axes)(*inputs)
+    return outputs, [0] * len(outputs)
+
+
 # Derivatives are made of it, and it has none.
 together_p.def_impl(_alone)
+batching.primitive_batchers[together_p] = _together_batch
 together_p.def_abstract_eval(lambda *avals, f, shared: avals[:shared])
 mlir.register_lowering(together_p, mlir.lower_fun(_alone, multiple_results=True))

@@ -273,8 +273,10 @@ def _kernel(scene: Scene, paths: places.Paths, options: Options) -> _Kernel:
     return _Kernel(scene, choice, structure, entries, of_pixel)
 
 
-@partial(jax.jit, static_argnames=("paths", "options", "devices"))
-def pullback(scene: Scene, adjoint, pixels, first_sample, spp, seed, *, paths, options: Options, devices=None):
+@partial(jax.jit, static_argnames=("paths", "options", "form", "devices"))
+def pullback(
+    scene: Scene, adjoint, pixels, first_sample, spp, seed, *, paths, options: Options, form=None, devices=None
+):
     """J^T adjoint: of each of the arrays, its shape.
 
     Args:
@@ -282,6 +284,7 @@ def pullback(scene: Scene, adjoint, pixels, first_sample, spp, seed, *, paths, o
         adjoint: (N, 3) of the means of the pixels.
         pixels, first_sample, spp, seed: (N,) each.
         paths: of the arrays, which `places` knows.
+        form, devices: of `native_fold`.
     """
     scene, choice, structure, entries, sweep_of = _kernel(scene, paths, options)
     first, _ = places.firsts(scene, paths)
@@ -292,7 +295,7 @@ def pullback(scene: Scene, adjoint, pixels, first_sample, spp, seed, *, paths, o
 
     begin, end = partial(start, scene, structure, entries), partial(finish, structure)
     work = adjoint, (pixels, first_sample, spp, seed)
-    total = native_fold(of_pixel, work, scene, choice, start=begin, finish=end, devices=devices)
+    total = native_fold(of_pixel, work, scene, choice, start=begin, finish=end, form=form, devices=devices)
 
     def of_array(path):
         rows = total[first[path] : first[path] + places.count(scene, path)]

@@ -52,14 +52,13 @@ def pull(
     spp: Counts,
     seed: Counts,
     options: Options,
-    devices: int | None = None,
     **how,
 ) -> Changes:
     """J^T v: by name, of the parameter's shape. adjoint: v; the rest as for `push`."""
     paths = _paths(wanted)
     numbers = pixel.numbers(pixels, first_sample, spp, seed)
     options = replace(options, derivative=True, by_vertex=True)
-    arrays = backward.pullback(scene, adjoint, pixels, *numbers, paths=paths, options=options, devices=devices)
+    arrays = backward.pullback(scene, adjoint, pixels, *numbers, paths=paths, options=options, **how)
     by_path = dict(zip(paths, arrays, strict=True))
     return {name: parameter.transposed(by_path[parameter.path]) for name, parameter in wanted.items()}
 

@@ -131,8 +131,8 @@ def histogram(steps, numbers, table):
     return persistent_loop(lambda state: state[0] != steps, step, (jnp.int32(0), table))[1]
 
 
-@pytest.mark.parametrize("count", [3, 1500])
-def test_items_share_memory(monkeypatch, count):
+@pytest.mark.parametrize(("count", "form"), [(3, "lanes"), (1500, "lanes"), (1500, "vmap")])
+def test_items_share_memory(monkeypatch, count, form):
     """Of every number of devices bitwise the same; lanes without an item add nothing."""
     monkeypatch.setattr(mapping, "ITEMS_OF_A_PART", 400)
     numbers = np.array([0, 3, 3, 1, 2], np.int32)
@@ -143,7 +143,7 @@ def test_items_share_memory(monkeypatch, count):
 
     def fold(devices):
         start = lambda lanes: jnp.zeros(4)  # noqa: E731
-        return native_fold(histogram, steps, numbers, start=start, finish=lambda x: x, devices=devices)
+        return native_fold(histogram, steps, numbers, start=start, finish=lambda x: x, form=form, devices=devices)
 
     results = [np.asarray(jax.jit(lambda devices=devices: fold(devices))()) for devices in range(1, MANY + 1)]
     np.testing.assert_allclose(results[0], expected, rtol=1e-5)
