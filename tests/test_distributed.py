@@ -12,6 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import pathjax as pj
+
 PREAMBLE = """
 import sys
 import jax, jax.numpy as jnp, numpy as np
@@ -19,24 +21,23 @@ import pathjax as pj
 from pathjax import distributed
 
 port, processes, process, out = sys.argv[1:5]
-if processes != "1":
-    distributed.start(f"127.0.0.1:{port}", int(processes), int(process))
+distributed.start(f"127.0.0.1:{port}", int(processes), int(process))
 """
 
 
 @pytest.fixture
 def started(root, tmp_path):
-    """(script, processes, devices of each) -> running processes, each of which may save `found` of its own."""
+    """(script, processes) -> running processes of one device each, each of which may save what it has found."""
     running = []
 
-    def start(script, processes, devices=1):
+    def start(script, processes):
         with socket.socket() as free:
             free.bind(("127.0.0.1", 0))
             port = free.getsockname()[1]
-        environment = os.environ | {"JAX_NUM_CPU_DEVICES": str(devices), "PYTHONPATH": str(root)}
+        environment = os.environ | {"JAX_NUM_CPU_DEVICES": "1", "PYTHONPATH": str(root)}
         pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
         for process in range(processes):
-            out = tmp_path / f"{processes}_{devices}_{process}.npz"
+            out = tmp_path / f"{processes}_{process}.npz"
             command = [sys.executable, "-u", "-c", PREAMBLE + script, *map(str, (port, processes, process, out))]
             running.append(subprocess.Popen(command, cwd=root, env=environment, **pipes))
         return running[-processes:]
@@ -49,15 +50,27 @@ def started(root, tmp_path):
 
 @pytest.fixture
 def found(started, tmp_path):
-    """(script, processes, devices of each) -> what each process saved."""
+    """(script, processes) -> what each process saved."""
 
-    def found(script, processes, devices=1):
-        for process in started(script, processes, devices):
+    def found(script, processes):
+        for process in started(script, processes):
             told, _ = process.communicate(timeout=600)
             assert process.returncode == 0, told
-        return [dict(np.load(tmp_path / f"{processes}_{devices}_{process}.npz")) for process in range(processes)]
+        return [dict(np.load(tmp_path / f"{processes}_{process}.npz")) for process in range(processes)]
 
     return found
+
+
+@pytest.fixture
+def here(root, tmp_path, monkeypatch):
+    """(script) -> what it saves in this process, whose devices are all cores."""
+
+    def here(script):
+        monkeypatch.chdir(root)
+        exec(script, {"jax": jax, "jnp": jnp, "np": np, "pj": pj, "out": tmp_path / "here.npz"})
+        return dict(np.load(tmp_path / "here.npz"))
+
+    return here
 
 
 def assert_same(*results):
@@ -105,38 +118,31 @@ for says, call in (
 """
 
 
-def test_kernels_are_dealt_to_all_processes_and_what_differs_is_refused(found, tmp_path):
-    exec(MAPS, {"jax": jax, "jnp": jnp, "np": np, "out": tmp_path / "here.npz"})
-    assert_same(dict(np.load(tmp_path / "here.npz")), *found(MAPS + REFUSED, 2))
+def test_kernels_are_dealt_to_all_processes_and_what_differs_is_refused(found, here):
+    assert_same(here(MAPS), *found(MAPS + REFUSED, 2))
 
 
-# What takes a scene, outside of jit and within a user's own. A film that shares samples adds up runs of pixels, whose
-# sums depend on how many devices there are.
+# What takes a scene, outside of jit and within a user's own.
 EVERYTHING = """
-scene = pj.load_scene("scenes/cornell_box.xml", res=16)
+scene = pj.load_scene("scenes/cornell_box.xml", res=12)
 names = ["white.reflectance", "light.radiance"]
-values = {name: pj.parameters(scene)[name] for name in names}
 image, J = pj.jacobian(scene, names, spp=4, seed=1)
 normal = pj.normal_equations(scene, names, 1.1 * np.asarray(image), spp=4)
 
-def rendered(values):
-    return pj.render(pj.with_parameters(scene, values), 4, 1)
+def loss(values):
+    return jnp.mean((pj.render(pj.with_parameters(scene, values), 4, 1) - 0.5) ** 2)
 
-again, pull = jax.vjp(rendered, values)
-loss = lambda values: jnp.mean((rendered(values) - 0.5) ** 2)
-value, slope = jax.jit(jax.value_and_grad(loss))(values)
-textured = pj.load_scene("tests/scenes/textures.xml", res=16)
+textured = pj.load_scene("tests/scenes/textures.xml", res=12)
 name = next(n for n, x in pj.parameters(textured).items() if np.ndim(x) == 3)
 texels = pj.parameters(textured)[name]
-_, pulled = jax.vjp(lambda x: pj.render(pj.with_parameters(textured, {name: x}), 4, 1), texels)
+seen, pull = jax.vjp(lambda x: pj.render(pj.with_parameters(textured, {name: x}), 4, 1), texels)
 everything = {
-    "image": pj.render(scene, 4, 1), "jacobian": (image, J.derivatives), "again": again, "J^T v": pull(image),
-    "J v": jax.jvp(rendered, (values,), (values,)), "in jit": (value, slope), "texels": pulled(image),
+    "image": pj.render(scene, 4, 1), "jacobian": (image, J.derivatives), "J^T v of texels": pull(seen),
+    "in jit": jax.jit(jax.grad(loss))({name: pj.parameters(scene)[name] for name in names}),
     "normal": (normal.matrix, normal.gradient, normal.loss, normal.scatter, normal.residuals),
-    "bounces": pj.render_bounces(scene, 3, spp=8).terms, "aovs": pj.render_aovs(scene, ["depth"], spp=8),
 }
 leaves, _ = jax.tree_util.tree_flatten_with_path(everything)
-np.savez(out, **{jax.tree_util.keystr(path).replace("/", "|"): np.asarray(x) for path, x in leaves})
+np.savez(out, **{jax.tree_util.keystr(path): np.asarray(x) for path, x in leaves})
 """
 FITS = """
 scene = pj.load_scene("scenes/cornell_box.xml", res=12)
@@ -157,15 +163,13 @@ for number in range(1, 1000):
 
 
 @pytest.mark.slow
-def test_images_derivatives_and_normal_equations_are_those_of_one_process(found):
-    one = found(EVERYTHING, 1, 2)
-    assert_same(*one, *found(EVERYTHING, 2))
-    assert_same(*one, *found(EVERYTHING, 3))
+def test_images_derivatives_and_normal_equations_are_those_of_one_process(found, here):
+    assert_same(here(EVERYTHING), *found(EVERYTHING, 2), *found(EVERYTHING, 3))
 
 
 @pytest.mark.slow
-def test_fits_of_few_numbers_and_of_textures_are_those_of_one_process(found):
-    assert_same(*found(FITS, 1, 2), *found(FITS, 2))
+def test_fits_of_few_numbers_and_of_textures_are_those_of_one_process(found, here):
+    assert_same(here(FITS), *found(FITS, 2))
 
 
 @pytest.mark.slow
