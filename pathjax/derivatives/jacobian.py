@@ -192,8 +192,13 @@ def takes_sweep(scene: Scene, parameters, options: Options, form: str | None = N
     lanes = form == "lanes" or (form is None and native())
     if not lanes or options.shared or len(parameters) <= MOST_TANGENTS:
         return False
+    return has_rows(scene, parameters) and all(parameter.shape == (3,) for parameter in parameters)
+
+
+def has_rows(scene: Scene, parameters) -> bool:
+    """Whether `backward.rows` finds the derivatives in them: in colours alone, which move no path."""
     paths = {parameter.path for parameter in parameters}
-    if not paths <= places.paths(scene) or any(parameter.shape != (3,) for parameter in parameters):
+    if not paths <= places.paths(scene) or any(parameter.shape[-1:] != (3,) for parameter in parameters):
         return False
     slots = places.slots(scene, tuple(paths))
     # What also stands for a number has a derivative across channels.

@@ -30,6 +30,7 @@ from pathjax.errors import InputError
 from pathjax.integrators.options import check_counts
 from pathjax.inverse import problem, uncertainty, weights
 from pathjax.inverse.approach import approach
+from pathjax.inverse.dense import Dense, is_dense
 from pathjax.inverse.many import Search
 from pathjax.inverse.prior import Prior
 from pathjax.inverse.problem import Problem
@@ -164,7 +165,7 @@ def fit(
 def _fit_many(problem: Problem, spp: int, seed: int, smoothness, tell) -> Fit:
     prior = Prior(problem.vector, problem.start, smoothness)
     with Interrupts() as interrupts:
-        search = Search(problem, spp, seed, prior, tell, interrupts)
+        search = (Dense if is_dense(problem) else Search)(problem, spp, seed, prior, tell, interrupts)
         try:
             with distributed.interruptible(interrupts):
                 converged, message = search.run()

@@ -1,4 +1,4 @@
-"""Fits of many numbers, such as the texels of textures: Gauss-Newton without J, on J v and J^T v.
+"""Fits of many numbers, such as the texels of textures: Gauss-Newton without J, on J v and J^T v. `dense` keeps J' W J.
 
     (J' W J + P + damping) step = J' W (target - image) + P (mean - values)
 
@@ -35,8 +35,6 @@ LEVELS = 16, 4, 1
 # Samples of the products of J: one with J' W J costs as much as two or three images of so many.
 PRODUCT_SPP = 8
 MAX_STEPS, MAX_ITERATIONS, TOLERANCE = 4, 30, 0.03
-# Pixels are left out that tell less than this part of what those tell that half of all is known from.
-LEAST_TOLD = 0.02
 # A level is left when what the image misses is no more than this part of the variance of noise.
 SETTLED = 1.0
 # Where the last step led is looked at with this part of the samples.
@@ -49,14 +47,18 @@ OTHER_NOISE = 1.5
 MOST_AGREEMENT = 0.05
 # Draws of the posterior: variances of texels are means over windows of so many texels, those of other numbers are not.
 TEXEL_DRAWS, OTHER_DRAWS, WINDOW = 3, 16, 5
-# Renders from which the variance of a pixel is found; smoothed over so many pixels, and floored at a part of the mean.
-BATCHES, SMOOTHED, FLOOR = 4, 0.8, 0.02
+# Renders from which the variance of a pixel is found, smoothed over so many pixels; and floors: parts of what it is
+# around, over so many pixels, and of its mean over all.
+BATCHES, SMOOTHED, FLOOR, LEAST = 4, (0.8, 2.0), 0.1, 1e-3
 # Arrays of the size of the parameters, in float64, that a fit holds at once.
 ARRAYS = 24
 
 
 class Search:
     """Values, and what the last renders said."""
+
+    # Pixels are left out that tell less than this part of what those tell that half of all is known from.
+    least_told = 0.02
 
     def __init__(
         self, problem: Problem, spp: int, seed: int, prior: Prior, tell: Callable | None, interrupts: Interrupts
@@ -102,7 +104,7 @@ class Search:
             self.record(samples)
             self.deviation = self.draw()
             self.prior.estimate(self.values, self.deviation)
-            if excess < SETTLED:
+            if excess < SETTLED and (not last or self.renders > 1):
                 break
 
     def check(self) -> float:
@@ -112,8 +114,7 @@ class Search:
         self.weights, self.render_part = equations
         # The expectation of this square is the number of parameters that the pixels determine: so many values are
         # fitted to noise, and the others miss the noise of the target.
-        determined = (self.weights * self.push(self.deviation) ** 2).sum()
-        left = max((self.weights > 0).sum() - determined, 1)
+        left = max(((self.weights > 0) * self.trust).sum() - self.determined(), 1)
         self.target_part = float(np.clip(self.missed / left, 0, 1))
         return self.render_part + self.target_part
 
@@ -124,7 +125,8 @@ class Search:
         problem, products = self.problem, self.products
         products.keep([np.ones(t.image.shape[:2], bool) for t in problem.targets])
         self.accepted = None  # what was missed is of other pixels from now on
-        self.renders, self.variances = 0, [np.zeros(t.image.shape) for t in problem.targets]
+        self.trust = np.ones((products.count, 1))  # how much of what each pixel tells is no noise of J
+        self.renders, self.each, self.variances = 0, 0, [np.zeros(t.image.shape) for t in problem.targets]
         self.target = products.kept([t.image for t in problem.targets])
         spread = [products.spread(half) for half in self.render(2 * weights.NOISE_SPP)]
         self.halves = list(zip(*spread, strict=True))
@@ -136,10 +138,11 @@ class Search:
         most = np.sort(np.concatenate([each.ravel() for each in told]))[::-1]
         if not most[0] > 0:
             raise InputError("no pixel of the target that may be used depends on what is to be fitted")
-        least = LEAST_TOLD * most[np.searchsorted(np.cumsum(most), most.sum() / 2)]
+        least = self.least_told * most[np.searchsorted(np.cumsum(most), most.sum() / 2)]
         self.usable = usable
         products.keep([each > least for each in told])
         self.target = products.kept([t.image for t in problem.targets])
+        self.trust = np.ones((products.count, 1))
 
     def render(self, samples: int) -> tuple[np.ndarray, np.ndarray]:
         """Residuals (N, 3) of two independent renders, of half the samples each; adds to what is known of noise."""
@@ -148,7 +151,10 @@ class Search:
         variance = np.var(batches, axis=0, ddof=1)
         if self.renders:
             # Means of many samples may be better than the number of samples says.
-            self.render_part = float(np.mean(variance / products.kept(self.variance()))) / BATCHES
+            ratio = float(np.mean(variance / products.kept(self.variance())))
+            self.render_part = max(ratio, 1 / samples**2) / BATCHES
+        if each > self.each:  # of few samples the noise may be another, as theirs are spread less evenly
+            self.each, self.renders, self.variances = each, 0, [np.zeros_like(v) for v in self.variances]
         spread = products.spread(variance * each)
         self.variances = [known + more for known, more in zip(self.variances, spread, strict=True)]
         self.renders += 1
@@ -159,8 +165,8 @@ class Search:
         """(H, W, 3) of one sample, of each view."""
         found = []
         for total, mask in zip(self.variances, self.products.masks, strict=True):
-            smooth = ndimage.gaussian_filter(total / self.renders, (SMOOTHED, SMOOTHED, 0), truncate=2)
-            found.append(smooth + FLOOR * smooth[mask].mean(0) + self.problem.rounding**2)
+            smooth, around = (ndimage.gaussian_filter(total / self.renders, (s, s, 0), truncate=2) for s in SMOOTHED)
+            found.append(smooth + FLOOR * around + LEAST * smooth[mask].mean(0) + self.problem.rounding**2)
         return found
 
     def look(self, samples: int) -> float:
@@ -174,9 +180,10 @@ class Search:
         rounding = products.kept([np.broadcast_to(t.step, t.image.shape) for t in problem.targets]) ** 2 / 12
         usable = products.kept(self.usable)
         a, b = self.render(samples)
+        self.samples = samples
         target_part = self.render_part if self.target_part is None else self.target_part
         self.weights = usable / (variance * (self.render_part + target_part) + rounding)
-        missed = (usable * a * b / variance).sum(-1)
+        missed = (usable * self.trust * a * b / variance).sum(-1)
         mean, error = missed.mean(), missed.std() / np.sqrt(len(missed))
         if self.accepted is not None and mean > self.accepted[1] + GROWN * error:
             self.values, self.damping = self.accepted[0], max(10 * self.damping, DAMPING)
@@ -184,9 +191,13 @@ class Search:
         else:
             self.accepted, self.damping = (self.values, mean), self.damping / 10
         self.residual = (a + b) / 2
-        self.missed = float((usable * a * b / variance).sum())
-        self.loss = float((self.weights * a * b).sum() / 2)
-        return 2 * self.loss / max(usable.sum(), 1)
+        self.missed = float((usable * self.trust * a * b / variance).sum())
+        self.loss = float((self.weights * self.trust * a * b).sum() / 2)
+        return 2 * self.loss / max((usable * self.trust).sum(), 1)
+
+    def determined(self) -> float:
+        """The number of parameters that the pixels determine, up to chance."""
+        return float((self.weights * self.push(self.deviation) ** 2).sum())
 
     # ---- parameters -------------------------------------------------------------------------------------------------
 
@@ -197,8 +208,7 @@ class Search:
         self.pull = lambda adjoint: products.pull(values, adjoint, PRODUCT_SPP, draw)
         self.push = lambda change: products.push(values, change, PRODUCT_SPP, draw)
         gradient = self.pull(w * self.residual) + prior.gradient(values)
-        # What is at a bound and would leave it stays there.
-        free = ~((values <= self.low) & (gradient > 0) | (values >= self.high) & (gradient < 0))
+        free = self.inside(gradient)
         # As J >= 0 for what light is multiplied by, sums of rows are bounds of the diagonal.
         self.rows = np.abs(self.pull(w * self.push(np.ones(n))))
         self.diagonal = self.rows + prior.diagonal()
@@ -213,6 +223,10 @@ class Search:
         self.preconditioner = LinearOperator(shape, lambda x: x / self.diagonal, dtype=float)
         self.free = free
         self.values = np.clip(values + self.solve(-gradient), self.low, self.high)
+
+    def inside(self, gradient: np.ndarray) -> np.ndarray:
+        """(n,) bool: not of what is at a bound and would leave it, which stays there."""
+        return ~((self.values <= self.low) & (gradient > 0) | (self.values >= self.high) & (gradient < 0))
 
     def step_again(self) -> None:
         """Another step, on the image as J has it after the last one.

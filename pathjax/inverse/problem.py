@@ -14,6 +14,7 @@ from pathjax.errors import InputError
 from pathjax.images.metrics import ROUNDING
 from pathjax.inverse.parameter_vector import ParameterVector
 from pathjax.inverse.target import Target
+from pathjax.kinds.parameter import Parameter
 from pathjax.scene import parameters as named
 from pathjax.scene.metadata import Names
 from pathjax.scene.scene import Scene
@@ -54,6 +55,11 @@ class Views:
         """
         mixed = (seed * jnp.uint32(4099) + 2 * draw + half) * jnp.uint32(2053) + jnp.asarray(self.numbers, jnp.uint32)
         return mixed | jnp.uint32(1 << 31)
+
+    @property
+    def wanted(self) -> dict[str, Parameter]:
+        """The fitted parameters that these views hold."""
+        return {name: named.find(self.scene, name) for name in self.names}
 
     def with_values(self, scene: Scene, values) -> Scene:
         return named.with_parameters(scene, {name: values[name] for name in self.names})

@@ -1,24 +1,31 @@
 """What a fit of many numbers evaluates: images of some pixels, J v and J^T v, of all views, without J.
 
 What is of pixels is (N, 3), of the kept pixels of all views one after another; what is of parameters (n,), in float64.
-Each evaluation is one kernel for a part of the pixels, so that a fit compiles three kernels, whichever pixels it keeps.
+Each evaluation is one kernel for a part of the pixels, so that a fit compiles few kernels, whichever pixels it keeps.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from pathjax.derivatives import backward
+from pathjax.derivatives import places as entries
+from pathjax.integrators import pixel
+from pathjax.integrators.options import Options
 from pathjax.inverse.compiled_cache import compiled
 from pathjax.inverse.problem import Problem, Views
 from pathjax.rendering.render import render_pixels
+from pathjax.scene import parameters as named
 
 # Pixels are rendered in so many parts, but in parts that are worth a kernel's start.
 PARTS, LEAST_PART = 8, 4096
+# Rows of J are made for fewer pixels at once: so many bytes, but not too few pixels for a kernel.
+ROWS_BYTES, LEAST_ROWS = 1 << 26, 1024
 
 
 class Products:
@@ -77,6 +84,22 @@ class Products:
             total += self._run(_pull, values, views, pixels, spp, draw, mine)
         return total
 
+    def rows(self, values: np.ndarray, spp: int, draws: tuple) -> Iterator[tuple[np.ndarray, ...]]:
+        """Of parts of the pixels their places (n,) in (N,), and of each draw J (3, n, Q), of each channel in its own.
+
+        All parameters are colours, Q in all.
+        """
+        for views, pixels, places in self.parts:
+            most = max(ROWS_BYTES // (len(pixels) * len(values) * 4), LEAST_ROWS)
+            each = -(-pixels.shape[1] // -(-pixels.shape[1] // most))
+            for first in range(0, pixels.shape[1], each):
+                begin = min(first, pixels.shape[1] - each)  # the last one as large as the others: one kernel
+                here = places[:, begin : begin + each]
+                new = here < self.count
+                new[:, : first - begin] = False
+                found = (self._run(_rows, values, views, pixels[:, begin : begin + each], spp, d)[new] for d in draws)
+                yield here[new], *(np.ascontiguousarray(np.moveaxis(rows, -1, 0)) for rows in found)
+
     def spread(self, kept: np.ndarray) -> list[np.ndarray]:
         """(N, C) of the kept pixels to (H, W, C) of each view, with 0 elsewhere."""
         parts = np.split(kept, np.cumsum([int(mask.sum()) for mask in self.masks])[:-1])
@@ -117,3 +140,33 @@ def _push(values, views, pixels, spp, seeds, change, vector):
 
 def _pull(values, views, pixels, spp, seeds, adjoint, vector):
     return jax.vjp(lambda values: _image(values, views, pixels, spp, seeds, vector), values)[1](adjoint)[0]
+
+
+def _rows(values, views, pixels, spp, seeds, vector):
+    """(V, part, Q, 3)."""
+    by_name, options = vector.unpack(values), Options(derivative=True, by_vertex=True)
+    paths = tuple(dict.fromkeys(parameter.path for parameter in views.wanted.values()))
+
+    def one(scene, work):
+        seed, pixels = work
+        scene = named.nameless(named.attached(views.with_values(scene, by_name)))
+        _, found = backward.rows(scene, pixels, *pixel.numbers(pixels, 0, spp, seed), paths=paths, options=options)
+        first, _ = entries.firsts(scene, paths)
+
+        def of_pixel(row):
+            columns = []
+            for name, parameter in vector.parameters:
+                shape = *parameter.shape[:-1], 3
+                if name in views.names:
+                    parameter = views.wanted[name]
+                    array = named.get(scene, parameter.path)
+                    here = row[first[parameter.path] :][: entries.count(scene, parameter.path)]
+                    slope = parameter.transposed(here.reshape(array.shape))
+                else:
+                    slope = jnp.zeros(shape, row.dtype)
+                columns.append(slope.reshape(-1, 3))
+            return jnp.concatenate(columns) * views.exposure
+
+        return jax.vmap(of_pixel)(found)
+
+    return views.map(one, (seeds, pixels))

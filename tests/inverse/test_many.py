@@ -6,6 +6,7 @@ import pytest
 
 import pathjax as pj
 from pathjax.images import write_exr
+from pathjax.inverse import dense
 from pathjax.inverse.parameter_vector import ParameterVector
 from pathjax.inverse.prior import Prior
 from pathjax.kinds.parameter import Parameter
@@ -46,9 +47,12 @@ def target(wall):
     return np.asarray(pj.render(wall, 64, seed=9))
 
 
-@pytest.fixture(scope="module")
-def fit(wall, truth, target):
-    return pj.fit(wall, target, [NAME], start={NAME: np.full(truth.shape, 0.5)}, spp=16)
+@pytest.fixture(scope="module", params=["by their matrix", "without it"])
+def fit(request, wall, truth, target):
+    with pytest.MonkeyPatch.context() as patch:
+        if request.param == "without it":
+            patch.setattr(dense, "MOST_NUMBERS", 0)
+        return pj.fit(wall, target, [NAME], start={NAME: np.full(truth.shape, 0.5)}, spp=16)
 
 
 @pytest.mark.slow

@@ -1,0 +1,102 @@
+"""Errors that fits of many numbers state are as large as those that they make."""
+
+import numpy as np
+import pytest
+from scipy import linalg, ndimage
+
+import pathjax as pj
+from pathjax.inverse.dense import Dense, Equations
+
+
+def fitted(scene, name, start, spp, **how):
+    """The fit of a render of another seed, the truth, and errors over stated errors of what is seen."""
+    truth = np.asarray(pj.parameters(scene)[name])
+    target = np.asarray(pj.render(scene, 1024, seed=5))
+    fit = pj.fit(scene, target, [name], start={name: np.full(truth.shape, start)}, spp=spp, **how)
+    stated = fit.standard_errors[name]
+    seen = np.isfinite(stated)
+    return fit, truth, ((fit.values[name] - truth) / np.where(seen, stated, 1))[seen]
+
+
+def assert_calibrated(ratios, least, most):
+    """Of n independent ratios the root mean square is 1 +- 1/sqrt(2 n); neighbours are a third as many."""
+    deviation = 1 / np.sqrt(2 * len(ratios) / 3)
+    rms = np.sqrt(np.mean(ratios**2))
+    assert least - 4 * deviation < rms < most + 4 * deviation, rms
+
+
+@pytest.mark.slow
+def test_errors_of_an_environment_map_seen_in_two_balls_are_as_stated():
+    random = np.random.default_rng(0)
+    sky = np.exp(ndimage.gaussian_filter(3 * random.normal(size=(16, 32, 3)), (1.5, 1.5, 0), mode="wrap"))
+    film = {"type": "hdrfilm", "width": 48, "height": 48, "rfilter": {"type": "box"}}
+    camera = pj.Transform().look_at(origin=[0, 0.5, 6], target=[0, 0, 0], up=[0, 1, 0])
+    diffuse = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.6, 0.6, 0.6]}}
+    scene = pj.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "path", "max_depth": 4},
+            "sensor": {"type": "perspective", "fov": 40, "to_world": camera, "film": film},
+            "sky": {"type": "envmap", "data": (sky / sky.mean()).astype(np.float32)},
+            "mirror": {"type": "sphere", "center": [-1.1, 0, 0], "bsdf": {"type": "conductor", "material": "none"}},
+            "ball": {"type": "sphere", "center": [1.1, 0, 0], "bsdf": diffuse},
+        }
+    )
+    fit, truth, ratios = fitted(scene, "sky.radiance", 1.0, 64)
+    assert fit.converged, fit.message
+    assert 0.5 < len(ratios) / truth.size < 0.9
+    # Noise of single pixels is known to 20 %.
+    assert_calibrated(ratios, 0.8, 1.25)
+    assert np.mean(np.abs(ratios) > 3) < 0.03
+    # Texels of which no pixel knows are named: those that the balls and the camera leave out.
+    assert not fit.seen["sky.radiance"].all()
+
+
+@pytest.mark.slow
+def test_errors_of_the_colours_of_vertices_are_as_stated():
+    random, side = np.random.default_rng(2), 12
+    x, z = (a.ravel() for a in np.meshgrid(*[np.linspace(-1, 1, side)] * 2))
+    first = (np.arange(side - 1)[:, None] * side + np.arange(side - 1)).ravel()
+    corners = np.stack([first, first + 1, first + side, first + side + 1], -1)
+    cloth = {
+        "type": "mesh",
+        "vertices": np.stack([x, 0.1 * np.sin(4 * x) * z, z], -1),
+        "faces": np.concatenate([corners[:, [0, 2, 1]], corners[:, [1, 2, 3]]]),
+        "vertex_color": random.uniform(0.2, 0.8, (side**2, 3)),
+        "bsdf": {"type": "diffuse", "reflectance": {"type": "mesh_attribute", "name": "vertex_color"}},
+    }
+    camera = pj.Transform().look_at(origin=[0, 3, 1], target=[0.2, 0, 0], up=[0, 0, -1])
+    film = {"type": "hdrfilm", "width": 40, "height": 40, "rfilter": {"type": "box"}}
+    scene = pj.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "path", "max_depth": 3},
+            "sensor": {"type": "perspective", "fov": 32, "to_world": camera, "film": film},
+            "lamp": {"type": "point", "position": [1, 3, 1], "intensity": {"type": "rgb", "value": [9, 9, 9]}},
+            "sky": {"type": "constant", "radiance": {"type": "rgb", "value": [0.3, 0.3, 0.3]}},
+            "cloth": cloth,
+        }
+    )
+    fit, truth, ratios = fitted(scene, "cloth.vertex_color", 0.5, 16)
+    assert fit.converged, fit.message
+    assert len(ratios) > truth.size / 2
+    assert_calibrated(ratios, 0.8, 1.25)
+
+
+def test_errors_of_linear_equations_are_those_of_many_repetitions():
+    """Pixels of unequal noise, of which some weigh less than they should: the errors of what is done all the same."""
+    random = np.random.default_rng(3)
+    J, deviation, trust = random.uniform(size=(40, 6)), random.uniform(0.5, 2, 40), random.uniform(0.1, 1, 40)
+    weights, P = trust / deviation**2, 4 * np.eye(6)
+    matrix, scatter = J.T @ (weights[:, None] * J), J.T @ ((trust * weights)[:, None] * J)
+    search = object.__new__(Dense)
+    of_channels = [np.stack([x] * 3) for x in (matrix, scatter)]
+    found = Equations(of_channels[0], np.zeros((6, 3)), np.full((6, 3), np.inf), of_channels[1])
+    search.sums, search.prior_matrix = lambda scatter: found, P
+    search.prior = type("Prior", (), {"scale": np.full(18, 10.0)})
+    search.find_errors(1.0)
+    truth = random.normal(size=(6, 20000)) / 2
+    pixels = J @ truth + deviation[:, None] * random.normal(size=(40, 20000))
+    errors = linalg.solve(matrix + P, J.T @ (weights[:, None] * pixels)) - truth
+    # 20000 repetitions tell a standard deviation to 0.5 %.
+    np.testing.assert_allclose(search.standard_errors.reshape(6, 3)[:, 0], errors.std(1), rtol=0.025)
