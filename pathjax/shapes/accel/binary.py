@@ -107,17 +107,23 @@ def _alike(count):
 def _least_cost(order, rows, leaf_size, first, count, run=map):
     """Of a batch of nodes: the best of some splits, then the best of those between its neighbours."""
     start = first + order.shape[1] * np.arange(3)[:, None]  # (3, M) of each axis in all of `order`
-    find = partial(_least_between, order.ravel(), rows, leaf_size, start, count, run=run)
+    costs = partial(_costs, order.ravel(), rows, leaf_size, start, count, run=run)
     nothing = np.full((6, *start.shape), -np.inf, np.float32)
-    key, *between = find(np.zeros_like(count)[None], count[None], nothing, nothing)
+    keys, ends, left, right = costs(np.zeros_like(count)[None], count[None], nothing, nothing)
     if count.max() > PLACES:
-        key, *_ = find(*between)
-    uneven = (key.min(0) & 0xFFFFFFFF) >> 1
-    return key.argmin(0), (count + np.where(key.min(0) & 1, uneven, -uneven)) >> 1
+        place, ends = keys.argmin(0)[None], np.broadcast_to(ends, left.shape[1:])
+        low, high = (np.take_along_axis(ends, place + k, axis=0)[0] for k in (0, 2))
+        before = np.take_along_axis(left, place[None], axis=1)[:, 0]
+        after = np.take_along_axis(right, place[None] + 2, axis=1)[:, 0]
+        keys, *_ = costs(low, high, before, after)
+    keys = keys.min(0)
+    key, axis = keys.min(0), keys.argmin(0)
+    uneven = (key & 0xFFFFFFFF) >> 1
+    return axis, (count + np.where(key & 1, uneven, -uneven)) >> 1
 
 
-def _least_between(order, rows, leaf_size, start, count, low, high, before, after, run):
-    """The least cost of splits with more than `low` primitives on the left and less than `high`.
+def _costs(order, rows, leaf_size, start, count, low, high, before, after, run):
+    """Splits with more than `low` primitives on the left and less than `high`.
 
     A side costs its area times (its primitives + the places in the leaves that they fill at least). Up to PLACES - 1
     splits are tried, with equal numbers of primitives in between, up to one.
@@ -126,8 +132,9 @@ def _least_between(order, rows, leaf_size, start, count, low, high, before, afte
         start: (3, M) where the node begins in the flat `order`, by axis; low, high: (1 or 3, M).
         before, after: (6, 3, M) bounds, as in `rows`, of what comes before `low` and from `high` on.
     Returns:
-        (3, M) the cost above, and below it how uneven the split is, and which way; then low, high, before and after of
-        what lies between the splits tried next to it.
+        keys:  (splits, 3, M) int64: the cost above, and below it how uneven the split is, and which way.
+        ends:  (splits + 2, 1 or 3, M) how many primitives each leaves on the left; first `low`, last `high`.
+        left, right: (6, splits + 2, 3, M) bounds of the sides.
     """
     wide = high - low
     ends = np.arange(min(wide.max(), PLACES) + 1)[:, None, None] * (wide / np.minimum(wide, PLACES))
@@ -154,11 +161,8 @@ def _least_between(order, rows, leaf_size, start, count, low, high, before, afte
     weight_l[nl == high] = np.inf
     cost = area_l * weight_l + area_r * weight_r
     # The bits of positive floats order as these do. Of costs equal but for rounding, the most even.
-    key = (cost.view(np.int32) & ~7).astype(np.int64) << 32 | (np.abs(nl - nr) << 1 | (nl > nr))
-    place = key.argmin(0)[None]
-    low, high = (np.take_along_axis(np.broadcast_to(ends, left.shape[1:]), place + k, axis=0)[0] for k in (0, 2))
-    before, after = (np.take_along_axis(of, place[None] + k, axis=1)[:, 0] for of, k in ((left, 0), (right, 2)))
-    return key.min(0), low, high, before, after
+    keys = (cost.view(np.int32) & ~7).astype(np.int64) << 32 | (np.abs(nl - nr) << 1 | (nl > nr))
+    return keys, ends, left, right
 
 
 def half_area(x, y, z):
@@ -214,9 +218,9 @@ def _partition(order, first, count, axis, nl, side, nodes, run=map):
     """Of neighbouring nodes; stable."""
     begin = first[nodes.start]
     part = order[:, begin : begin + count[nodes].sum()]
-    segment = np.repeat(np.arange(nodes.start, nodes.stop), count[nodes])
-    right = np.arange(begin, begin + len(segment)) >= (first + nl)[segment]
-    side[part[axis[segment], np.arange(len(segment))]] = right
+    at = np.arange(begin, begin + part.shape[1])
+    right = at >= np.repeat((first + nl)[nodes], count[nodes])
+    side[np.take(order.ravel(), at + np.repeat(order.shape[1] * axis[nodes], count[nodes]))] = right
     to_left, to_right = np.flatnonzero(~right), np.flatnonzero(right)
 
     def move(row):
