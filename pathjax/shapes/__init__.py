@@ -124,7 +124,7 @@ def build(
         tables.append(made)
         trees |= built
     lamps.sort(key=lambda lamp: (shapes[lamp.shape].geometry.comes_last, lamp.shape))
-    shape = np.concatenate([np.zeros(0), *shape_of]).astype(np.int32)
+    shape = np.concatenate([np.zeros(0, int), *shape_of]).astype(np.int32)
     geometry = Geometry(tuple(tables), shape, None, tangents, along)
     return geometry, lamps, {kind: tree for kind, tree in trees.items() if tree is not None}
 

@@ -52,14 +52,14 @@ class Facets(Primitives):
         some = self.vertices[:_SOME]
         largest = some[np.argmax(_areas(some))]
         corner, edge, normal = largest[0], largest[1] - largest[0], unit_normal(largest)
-        uneven = Faces(self.vertices, None, None, glass, lamp)
+        bent = Faces(self.vertices, None, None, glass, lamp)
         farthest = [np.abs(self.vertices[:, :, axis]).max() for axis in range(3)]
         if np.abs((some - corner) @ normal).max() > 2 * precision(dtype) * (farthest @ np.abs(normal)):
-            return uneven  # without a look at all of a large mesh
+            return bent  # without a look at all of a large mesh
         from_corner = self.vertices - corner
         reach = (np.abs(self.vertices) @ np.abs(normal)).max()
         if np.abs(from_corner @ normal).max() > 2 * precision(dtype) * reach:
-            return uneven
+            return bent
         axes = np.stack([edge, np.cross(normal, edge)]) / np.linalg.norm(edge)
         places = from_corner @ axes.T
         (x0, y0), (x1, y1) = places.min((0, 1)), places.max((0, 1))

@@ -2,9 +2,10 @@
 
 The primitives stay sorted by centroid along each axis, so a split is an axis and a count whatever the rule, and
 centroids that coincide are no special case. The surface area heuristic is evaluated between any two primitives of a
-small node (Wald and Havran 2006, "On building fast kd-trees for ray tracing, and on doing that in O(N log N)"), and at
-PLACES places of equal counts of a larger one. Nodes of about the same count lie side by side in memory, a place of each
-in a row: running bounds of all of them are then a few operations on whole rows, which NumPy vectorises.
+small node (Wald and Havran 2006, "On building fast kd-trees for ray tracing, and on doing that in O(N log N)"); of a
+larger one at PLACES places of equal counts, then at as many around the best of these. Nodes of about the same count lie
+side by side in memory, a place of each in a row: running bounds of all of them are then a few operations on whole rows,
+which NumPy vectorises.
 
 Nothing depends on the number of cores: what is done at once are nodes, or exact maxima of parts.
 """
@@ -20,7 +21,7 @@ from pathjax.system.cores import over_cores
 THICKNESS = np.float32(1e-6)  # of the scene, added to every extent: flat and linear boxes have areas to compare too
 PLACES = 128  # with twice or half as many, rays visit the same number of nodes within 1 %
 BATCH = 1 << 16  # primitives whose nodes are split together: their arrays stay in the cache
-SPREAD = 1.15  # of counts in a batch, which fills all of its nodes up to the largest
+SPREAD = 1.15  # of counts in a batch, in which all nodes are filled up to the largest
 FEW = 1 << 12  # primitives that are not worth a batch of their own
 
 
