@@ -151,6 +151,7 @@ few = pj.fit(scene, target, ["white.reflectance"], start={"white.reflectance": 0
 textured = pj.load_scene("tests/scenes/textures.xml", res=16)
 name = next(n for n, x in pj.parameters(textured).items() if np.ndim(x) == 3)
 many = pj.fit(textured, pj.render_until(textured, spp=64).image, [name], spp=8, smoothness=0.1)
+assert "interrupted" not in (few.message, many.message)
 np.savez(out, few=few.values["white.reflectance"], covariance=few.covariance, many=many.values[name],
          errors=many.standard_errors[name], steps=[len(few.history), len(many.history)])
 """
