@@ -67,13 +67,13 @@ def run(
     if resume and (folder / "bench.json").exists():
         report = _begun(folder / "bench.json", report)
         report["scenes"] = [scene for scene in report["scenes"] if scene["file"] in files]
+        report["summary"] = summary(report["scenes"]) if report["scenes"] else None
     done = {scene["file"] for scene in report["scenes"]}
     todo = [(name, file) for name, file in _plot_names(files) if file not in done]
     for _, file in todo:
         pathjax.load_scene(file, parameters=defines)  # a wrong one is refused before an hour of work on the others
     if plan.against == "mitsuba" and todo:
         _find_mitsuba(todo[0][1], defines)
-    whole = True
     with Interrupts() as interrupts:
         for name, file in todo:
             say(f"scene {len(report['scenes']) + 1} of {len(files)}")
@@ -89,12 +89,11 @@ def run(
                 return report, False
             for failure in scene["failures"]:
                 say(f"{file}: {failure}")
-            whole &= not scene["failures"]
             report["scenes"].append({**scene, "plot": None})
             report["summary"] = summary(report["scenes"])
             if folder is not None:
                 _write(report, folder, name, output)
-    return report, whole
+    return report, not any(scene["failures"] for scene in report["scenes"])
 
 
 def _write(report: dict, folder: Path, name: str, output: Output) -> None:
