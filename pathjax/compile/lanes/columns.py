@@ -41,6 +41,8 @@ def components(value) -> np.ndarray:
     """Components of any value, those of a shared one being ()."""
     if differs(value):
         return value
+    if not np.shape(value):
+        return as_components((), [jnp.asarray(value)])
     flat = jnp.ravel(value)
     return as_components(np.shape(value), [lax.index_in_dim(flat, k, keepdims=False) for k in range(flat.size)])
 
