@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -67,15 +67,18 @@ def one_by_one(f: Callable) -> Callable:
     return called
 
 
-class Search(NamedTuple):
+F = TypeVar("F", bound=Callable)
+
+
+class Search(NamedTuple, Generic[F]):
     """A search in parts, functions that may close over arrays. Its state is a pytree; of zeros, it is done."""
 
-    begin: Callable  # () -> state, of which `visit` does not come next
-    opens: Callable  # state -> whether `open` comes next
-    open: Callable  # state -> state: the usual step; leaves a search done that is done
-    visits: Callable  # state -> whether `visit` comes next; if neither does, the search is done
-    visit: Callable  # state -> state: a step that comes less often, or costs more
-    result: Callable  # state -> results
+    begin: F  # () -> state, of which `visit` does not come next
+    opens: F  # state -> whether `open` comes next
+    open: F  # state -> state: the usual step; leaves a search done that is done
+    visits: F  # state -> whether `visit` comes next; if neither does, the search is done
+    visit: F  # state -> state: a step that comes less often, or costs more
+    result: F  # state -> results
 
 
 @dataclass(frozen=True)
@@ -88,6 +91,12 @@ class Part:
     def __call__(self, inputs, *state):
         return jaxpr_as_fun(self.program)(*(inputs[place] for place in self.places), *state)
 
+    def reads(self) -> list[int]:
+        """Which of the arrays of the state it reads."""
+        jaxpr = self.program.jaxpr
+        read = {id(v) for v in [*jaxpr.outvars, *(v for eqn in jaxpr.eqns for v in eqn.invars)]}
+        return [k for k, v in enumerate(jaxpr.invars[len(self.places) :]) if id(v) in read]
+
 
 def interleaved(search: Search):
     """Results of a search, of which lanes run several at once, as each alone waits for memory most of the time.
@@ -96,7 +105,7 @@ def interleaved(search: Search):
     """
     inputs: list[Any] = []
     state: list[jax.ShapeDtypeStruct] = []
-    parts: list[Callable] = []
+    parts: list[Part] = []
     structures: dict[str, Any] = {}
     for name, f in search._asdict().items():
 
@@ -115,7 +124,7 @@ def interleaved(search: Search):
     return jax.tree.unflatten(structures["result"], one_by_one_p.bind(*inputs, program=program, search=programs))
 
 
-def _search_alone(search: Search, inputs):
+def _search_alone(search: Search[Part], inputs):
     def opens(state):
         return search.opens(inputs, *state)[0]
 
@@ -265,14 +274,7 @@ def _alone(*inputs, f, shared):
     return f(inputs[:shared], jnp.ones((1,), bool), [x[None] for x in inputs[shared:]])
 
 
-def _together_batch(inputs, axes, **params):
-    """Under `jax.vmap` no item shares its memory with others."""
-    outputs = jax.vmap(lambda *inputs: _alone(*inputs, **params), axes)(*inputs)
-    return outputs, [0] * len(outputs)
-
-
 # Derivatives are made of it, and it has none.
 together_p.def_impl(_alone)
-batching.primitive_batchers[together_p] = _together_batch
 together_p.def_abstract_eval(lambda *avals, f, shared: avals[:shared])
 mlir.register_lowering(together_p, mlir.lower_fun(_alone, multiple_results=True))
