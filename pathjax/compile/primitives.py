@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import Any, Generic, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -70,7 +70,8 @@ def one_by_one(f: Callable) -> Callable:
 F = TypeVar("F", bound=Callable)
 
 
-class Search(NamedTuple, Generic[F]):
+@dataclass(frozen=True)
+class Search(Generic[F]):
     """A search in parts, functions that may close over arrays. Its state is a pytree; of zeros, it is done."""
 
     begin: F  # () -> state, of which `visit` does not come next
@@ -107,7 +108,7 @@ def interleaved(search: Search):
     state: list[jax.ShapeDtypeStruct] = []
     parts: list[Part] = []
     structures: dict[str, Any] = {}
-    for name, f in search._asdict().items():
+    for name, f in vars(search).items():
 
         def flat(*leaves, name=name, f=f):
             args = [jax.tree.unflatten(structures["begin"], leaves)] if name != "begin" else []
@@ -274,7 +275,14 @@ def _alone(*inputs, f, shared):
     return f(inputs[:shared], jnp.ones((1,), bool), [x[None] for x in inputs[shared:]])
 
 
+def _together_batch(inputs, axes, **params):
+    """Under `jax.vmap` no item shares its memory with others."""
+    outputs = jax.vmap(lambda *inputs: _alone(*inputs, **params), axes)(*inputs)
+    return outputs, [0] * len(outputs)
+
+
 # Derivatives are made of it, and it has none.
 together_p.def_impl(_alone)
+batching.primitive_batchers[together_p] = _together_batch
 together_p.def_abstract_eval(lambda *avals, f, shared: avals[:shared])
 mlir.register_lowering(together_p, mlir.lower_fun(_alone, multiple_results=True))

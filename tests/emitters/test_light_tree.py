@@ -51,7 +51,7 @@ def test_each_light_has_a_leaf_of_its_own_near_its_neighbours(count):
     assert len(set(leaf.tolist())) == count
     assert 0 <= leaf.min() <= leaf.max() < 2 * count
     along = np.argsort(middles[:, 0, np.ptp(middles[:, 0], axis=0).argmax()])
-    rooms = light_tree._leaves(count) // 2
+    rooms = light_tree.leaves(count) // 2
     assert set(along[: (count + 1) // 2]) == set(np.flatnonzero(leaf < rooms))
 
 

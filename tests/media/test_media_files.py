@@ -47,7 +47,7 @@ def test_defaults_are_those_of_mitsuba(read):
 def test_named_media_are_shared(read):
     refs = '<ref name="interior" id="fog"/><ref name="exterior" id="fog"/>'
     scene = read(f'{FOG}<shape type="cube">{NULL}{refs}</shape>', inside='<ref id="fog"/>')
-    assert scene.medium is scene.shapes[0].interior is scene.shapes[0].exterior and scene.medium.name == "fog"
+    assert scene.view.medium is scene.shapes[0].interior is scene.shapes[0].exterior and scene.view.medium.name == "fog"
 
 
 def test_parameters_are_named_after_the_shape_or_the_id(file):
