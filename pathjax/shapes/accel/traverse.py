@@ -59,7 +59,7 @@ class _State(NamedTuple):
     free: Int[Array, ""]  # the entry of the stack above those in use
     entry: Int[Array, ""]  # what comes next; 0: the search is done
     child: Int[Array, ""]  # its first child: >= 0 a node, < 0 the leaf ~child
-    stack: Int[Array, " depth+1"]
+    stack: Int[Array, " levels"]
     t: Float[Array, ""]
     found: Any
 
