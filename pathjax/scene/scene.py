@@ -68,8 +68,8 @@ class Scene:
         return replace(self, camera=camera, film=film, about=replace(about, description=description))
 
     @property
-    def described(self) -> About:
-        """`about`, where it is there.
+    def described(self) -> About | Names:
+        """`about`, where it is there: outside of fits the whole of it.
 
         Raises:
             InputError: the scene was stripped of it.
