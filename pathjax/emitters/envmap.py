@@ -11,6 +11,7 @@ about that of what shines there. (At the rim of a sun, four texels wide, most pa
 
 from __future__ import annotations
 
+import gc
 import math
 from collections.abc import Mapping
 from typing import ClassVar
@@ -35,6 +36,8 @@ _STEP = 2.0**-23
 TABLED = "luminance", "rows", "columns", "from_pole", "per_solid_angle", "brightness"
 # What is added to the brightness of each corner of a patch, of their mean.
 _LEAST = 1 / 16
+# Bytes at a multiple of which JAX takes arrays of NumPy as they are.
+_ALIGNED = 64
 # Rows of patches whose probabilities are made at once, so that little memory is used beside what is kept.
 _ROWS = 64
 
@@ -71,8 +74,7 @@ class Envmap(Background):
             texels = np.maximum(texels, 0)
         others = "scale", "to_world", "sampling_weight"
         given = {key: cls.declared[key].read(loader, fields, key, name) for key in others}
-        # Where the scene will use it, so that one copy of it is all there is.
-        return cls.instance(name, texels=np.asarray(jax.device_put(texels)), **given)
+        return cls.instance(name, texels=_placed(texels), **given)
 
     @classmethod
     def build(cls, instances, dtype, path, parameters, code):
@@ -84,9 +86,10 @@ class Envmap(Background):
         radiance = Parameter(where, (0,), texels.shape, (0, math.inf), "texels", rows=texels.size)
         parameters.known[f"{instance.name}.radiance"] = radiance
         table = super().build(instances, dtype, path, parameters, code)
-        for key, values in {"texels": texels.reshape(-1), **_probabilities(texels)}.items():
-            table = table.with_column(key, np.asarray(values, dtype))
-        return table
+        made = {"texels": texels.reshape(-1), **_probabilities(texels)}
+        for key in list(made):
+            table = table.with_column(key, _placed(np.asarray(made.pop(key), dtype)))
+        return table.with_column("luminance", _placed(_luminances(texels)))
 
     @classmethod
     def derived(cls, table, changed=()):
@@ -97,7 +100,8 @@ class Envmap(Background):
         size = _size(Row(table, 0))
 
         def on_host(texels):
-            made = _probabilities(np.reshape(texels, (*size, 3)))
+            image = np.reshape(texels, (*size, 3))
+            made = {"luminance": _luminances(image), **_probabilities(image)}
             return {key: np.asarray(values, texels.dtype) for key, values in made.items()}
 
         if is_traced(texels):
@@ -213,6 +217,13 @@ def _ends(p: Row, y: Int[Array, ""]) -> tuple[Float[Array, ""], Float[Array, ""]
     return upper, jnp.where(2 * y == _size(p)[0] - 2, 2 - lower, lower)
 
 
+def _placed(values: np.ndarray) -> np.ndarray:
+    """The same where the scene will use it, so that one copy of it is all there is."""
+    placed = np.asarray(jax.device_put(values).block_until_ready())
+    gc.collect(0)  # only then JAX lets go of what it has copied
+    return placed
+
+
 def _size(p: Row) -> tuple[int, int]:
     """Height and width of the picture."""
     height = len(p.rows)
@@ -255,7 +266,7 @@ def _search(
 
 
 def _probabilities(texels: np.ndarray) -> dict[str, np.ndarray]:
-    """The tables of an image whose texels are given: all but the texels."""
+    """The tables of an image whose texels are given: all but the texels and their luminance."""
     height, width, _ = texels.shape
     theta = np.linspace(0, np.pi, height)
     # Of a row of patches: solid angle over that of a turn, and integrals of sin over it, weighted by 1 - t and by t.
@@ -273,13 +284,23 @@ def _probabilities(texels: np.ndarray) -> dict[str, np.ndarray]:
     rows = _cumulated(np.where(mass.any(), mass, solid))
     per_solid_angle = np.diff(rows) / (solid * (2 * np.pi / width))
     return {
-        "luminance": np.asarray(luminance(texels)).ravel(),
         "rows": rows,
         "columns": columns.ravel(),
         "from_pole": 2 * np.sin(np.minimum(theta, np.pi - theta) / 2) ** 2,
         "per_solid_angle": per_solid_angle,
         "brightness": brightness[None],
     }
+
+
+def _luminances(texels: np.ndarray) -> np.ndarray:
+    """(H W,) of each texel, with little memory beside it, and where JAX need not copy it."""
+    count, dtype = texels[..., 0].size, texels.dtype
+    memory = np.empty(count * dtype.itemsize + _ALIGNED, np.uint8)
+    start = -memory.ctypes.data % _ALIGNED
+    found = memory[start : start + count * dtype.itemsize].view(dtype).reshape(texels.shape[:2])
+    for first in range(0, len(texels), _ROWS):
+        found[first : first + _ROWS] = luminance(texels[first : first + _ROWS])
+    return found.ravel()
 
 
 def _cumulated(weights: np.ndarray) -> np.ndarray:

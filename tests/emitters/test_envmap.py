@@ -406,7 +406,7 @@ def test_images_are_mitsubas(make_scene, mitsuba, sky, estimate, agree, estimate
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="reads what Linux tells of memory")
 def test_a_large_picture_is_loaded_without_copies(write_scene, sky):
-    """Beside its 100 MB there are a third as much of tables, and what is there in passing: at most 1.5 as much again.
+    """Beside its 100 MB there are two thirds as much of tables, and in passing 1.5 as much again at most.
 
     In a process of its own, whose peak is that of this picture: getrusage tells that of the process it came from, if
     that was higher.
