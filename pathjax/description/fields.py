@@ -11,7 +11,7 @@ import numpy as np
 
 from pathjax.description import spectra
 from pathjax.description.elements import Document, Element, nearest, require_attributes
-from pathjax.description.transform import Transform, rotation
+from pathjax.description.numbers import number, numbers, transform, triple
 from pathjax.errors import InputError
 from pathjax.kinds import Unused
 
@@ -22,7 +22,6 @@ OBJECTS = ("integrator", "sensor", "sampler", "film", "rfilter", "shape", "bsdf"
 
 # Spectra that are plugins of their own.
 TYPED = ("uniform", "d65", "srgb")
-NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 REQUIRED = object()
 
 
@@ -285,98 +284,6 @@ class Fields:
         return element
 
 
-def number(element: Element, text: str) -> float:
-    """One decimal number, finite in float32 too."""
-    if not NUMBER.fullmatch(text.strip()) or not abs(float(text)) < 3e38:
-        raise element.error(f"{element}: {text.strip()[:40]!r} is not a finite number")
-    return float(text)
-
-
-def numbers(element: Element, text: str) -> list[float]:
-    """Numbers between commas or blanks; at least one."""
-    return [number(element, part) for part in re.split(r"[\s,]+", text.strip().rstrip(","))]
-
-
-def triple(element: Element, default: float | None, extra: tuple[str, ...] = ()) -> np.ndarray:
-    """(3,) from x, y, z attributes or `value` (one number stands for three); `default` None: all must be there."""
-    require_attributes(element, optional=("value", "x", "y", "z", *extra))
-    attributes = element.attributes
-    if "value" in attributes:
-        if set("xyz") & set(attributes):
-            raise element.error(f"{element} mixes value with x, y, z; give one or the other")
-        values = numbers(element, attributes["value"])
-        if len(values) not in (1, 3):
-            raise element.error(f"{element} has {len(values)} numbers; it takes 1 or 3")
-        return np.broadcast_to(np.array(values), 3).copy()
-    missing = [axis for axis in "xyz" if axis not in attributes]
-    if missing and default is None:
-        raise element.error(f'{element} lacks the attribute "{missing[0]}"')
-    return np.array([number(element, attributes[axis]) if axis in attributes else default for axis in "xyz"])
-
-
-def transform(element: Element) -> np.ndarray:
-    """(4, 4) float64, affine and invertible: the steps of a <transform>, the first in the file applied first."""
-    require_attributes(element, required=("name",))
-    matrix = np.eye(4)
-    for step in element.children:
-        if step.tag not in STEPS:
-            raise step.error(f"{step} is not supported inside {element}; use one of: {', '.join(STEPS)}")
-        if step.children:
-            raise step.error(f"{step} takes nothing inside")
-        matrix = STEPS[step.tag](step) @ matrix
-        if not (np.abs(matrix) < 3e38).all():
-            raise step.error(f"{step} makes {element} overflow")
-        if np.linalg.cond(matrix[:3, :3]) > 1e12:
-            raise step.error(f"{step} makes {element} singular: it flattens space")
-    return matrix
-
-
-def _translate(step: Element) -> np.ndarray:
-    return Transform().translate(triple(step, default=0.0)).matrix
-
-
-def _scale(step: Element) -> np.ndarray:
-    return Transform().scale(triple(step, default=1.0)).matrix
-
-
-def _rotate(step: Element) -> np.ndarray:
-    axis = triple(step, default=0.0, extra=("angle",))
-    require_attributes(step, required=("angle",), optional=("value", "x", "y", "z"))
-    if not axis.any():
-        raise step.error(f"{step}: the axis is the zero vector")
-    # As Mitsuba, which takes the axis as it is: one that is not of unit length scales too.
-    return rotation(axis, number(step, step.attributes["angle"]))
-
-
-def _lookat(step: Element) -> np.ndarray:
-    require_attributes(step, required=("origin", "target"), optional=("up",))
-    vectors = [_vector(step, step.attributes.get(key, "0, 0, 0")) for key in ("origin", "target", "up")]
-    try:
-        return Transform().look_at(*vectors).matrix
-    except InputError as error:
-        raise step.error(f"{step}: {str(error).removeprefix('look_at: ')}") from None
-
-
-def _matrix(step: Element) -> np.ndarray:
-    require_attributes(step, required=("value",))
-    values = numbers(step, step.attributes["value"])
-    if len(values) not in (9, 16):
-        raise step.error(f"{step} has {len(values)} numbers; it takes 9 or 16")
-    matrix = np.eye(4)
-    side = 3 if len(values) == 9 else 4
-    matrix[:side, :side] = np.reshape(values, (side, side))
-    if not np.array_equal(matrix[3], [0, 0, 0, 1]):
-        raise step.error(f"{step}: the last row must be 0 0 0 1, since transforms are affine")
-    return matrix
-
-
-def _vector(step: Element, text: str) -> np.ndarray:
-    values = numbers(step, text)
-    if len(values) != 3:
-        raise step.error(f"{step}: {text.strip()[:40]!r} must be three numbers")
-    return np.array(values)
-
-
 def _pairs_of_file(path: Path, element: Element) -> list[list[float]]:
     """Wavelengths and values, a pair a line; what begins with # is a comment."""
     try:
@@ -396,6 +303,3 @@ def _pairs_of_file(path: Path, element: Element) -> list[list[float]]:
 def _value(element: Element) -> str:
     require_attributes(element, required=("name", "value"))
     return element.attributes["value"]
-
-
-STEPS = {"translate": _translate, "rotate": _rotate, "scale": _scale, "lookat": _lookat, "matrix": _matrix}
