@@ -1,7 +1,8 @@
 """The twelve scenes of `pathjax bench` without a scene: five that are shipped, and seven that are made here.
 
-What is made depends on nothing but this file, so the same scenes are measured everywhere. nine_spheres.xml is shipped
-and not among them: Mitsuba's float32 makes it up to 10 % too dark, which would count as error.
+What is made depends on this file and trimesh's icosphere alone, so the same scenes are measured everywhere.
+nine_spheres.xml is shipped and not among them: Mitsuba's float32 makes it up to 10 % too dark, which would count as
+error.
 """
 
 from __future__ import annotations
@@ -10,8 +11,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float, Int
 
-from pathjax.bench.solids import bump, icosphere
 from pathjax.errors import InputError
 from pathjax.images import write_exr, write_png
 from pathjax.io.mesh import load, ply_writer
@@ -87,12 +88,12 @@ def _shipped() -> Path:
 
 def blob(folder: Path, level: int = 6) -> str:
     """A solid of 20 * 4^level triangles in the Cornell box."""
-    return _in_box(folder / "blob.ply", *bump(*icosphere(level)))
+    return _in_box(folder / "blob.ply", *bumpy(level, waves=12))
 
 
 def million(folder: Path, level: int = 8) -> str:
     """The same of 1.3 million."""
-    return _in_box(folder / "million.ply", *bump(*icosphere(level), waves=40))
+    return _in_box(folder / "million.ply", *bumpy(level, waves=40))
 
 
 def scan(folder: Path, file: Path) -> str:
@@ -222,6 +223,19 @@ def _scene(*parts: str) -> str:
 
 def _head(origin: str, target: str, fov: float, depth: int = 8) -> str:
     return _HEAD.format(origin=origin, target=target, fov=fov, depth=depth).rstrip()
+
+
+def bumpy(level: int, waves: float) -> tuple[Float[np.ndarray, "V 3"], Int[np.ndarray, "F 3"]]:
+    """A closed solid of 20 * 4^level triangles: a sphere with lobes that hide each other, and `waves` ridges."""
+    try:
+        import trimesh
+    except ImportError:
+        raise InputError("the twelve scenes need trimesh: pip install 'pathjax[bench]'") from None
+    ball = trimesh.creation.icosphere(subdivisions=level)
+    x, y, z = ball.vertices.T
+    lobes = 0.3 * np.sin(3 * x + 1) * np.sin(4 * y) * np.sin(3 * z + 0.5)
+    ridges = np.sin(waves * x) * np.sin(waves * y + 1) * np.sin(waves * z + 2)
+    return ball.vertices * (1 + lobes + ridges / waves)[:, None], np.asarray(ball.faces)
 
 
 def _in_box(file: Path, vertices: np.ndarray, faces: np.ndarray) -> str:

@@ -53,8 +53,9 @@ def setup() -> None:
     afterwards it only warns. Later calls do nothing. What the user chose stands: flags in XLA_FLAGS, a number of
     devices in JAX's configuration, PJRT_NPROC.
 
-    Side effect on other code in the process: a user's own JAX loop over large element-wise arrays is compiled for one
-    thread too. `PATHJAX_NATIVE_LOOPS=0` in the environment opts out; pathjax still works, slowly.
+    Side effects on other code in the process: a user's own JAX loop over large element-wise arrays is compiled for one
+    thread too, and all is optimised to LLVM's second level, of three. `PATHJAX_NATIVE_LOOPS=0` in the environment opts
+    out; pathjax still works, slowly.
 
     Warns:
         UserWarning: the backend was started before, with the remedy.

@@ -1,6 +1,7 @@
 """The twelve scenes: made alike everywhere, loaded by both programs, and of one image in both."""
 
 import json
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +9,6 @@ import pytest
 
 import pathjax as pj
 from pathjax.bench import bench, peers, twelve
-from pathjax.bench.solids import bump, icosphere
 from pathjax.bench.summary import summary
 from pathjax.cli import main
 from pathjax.io.mesh import load
@@ -46,13 +46,15 @@ def test_solids_have_the_triangles_that_are_told(name, size):
     assert 20 * 4**level == size
 
 
-@pytest.mark.parametrize("waves", [None, 12, 40])
+def test_what_makes_solids_is_named_where_it_is_missing(monkeypatch, tmp_path):
+    monkeypatch.setitem(sys.modules, "trimesh", None)
+    with pytest.raises(pj.InputError, match="pathjax\\[bench\\]"):
+        twelve.blob(tmp_path)
+
+
+@pytest.mark.parametrize("waves", [12, 40])
 def test_solids_are_closed_and_turned_outwards(waves):
-    vertices, faces = icosphere(4)
-    if waves is None:
-        np.testing.assert_allclose(np.linalg.norm(vertices, axis=1), 1)
-    else:
-        vertices, faces = bump(vertices, faces, waves)
+    vertices, faces = twelve.bumpy(4, waves)
     assert len(faces) == 20 * 4**4 and len(vertices) == 10 * 4**4 + 2
     edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
     assert len(np.unique(edges, axis=0)) == len(edges)  # each is walked once in each direction
