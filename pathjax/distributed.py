@@ -25,7 +25,7 @@ import numpy as np
 from pathjax.compile import calls_at_once, concurrently
 from pathjax.compile.jax_compat import gathered
 from pathjax.errors import InputError
-from pathjax.system.interrupts import Interrupts
+from pathjax.system.interrupts import Interrupts, leave
 from pathjax.system.meeting import meet
 
 T = TypeVar("T")
@@ -68,6 +68,7 @@ def start(coordinator: str | None = None, processes: int | None = None, process:
     except (RuntimeError, ValueError) as error:
         said = str(error).partition("\n")[0]
         raise InputError(f"this process could not join the others ({said}); start each of them anew") from None
+    _end_at_once_after_errors()
     here = np.frombuffer(socket.gethostname().encode()[:64].ljust(64, b"\0"), np.uint8)
     with _stdout_as_stderr():
         found = exchanged((here, np.int32(os.getpid())))
@@ -112,6 +113,17 @@ def same(digests: Mapping[str, str]) -> None:
             for what, differs in zip(digests, (theirs != own).any(1), strict=True):
                 if differs:
                     raise InputError(f"process {index()} has another {what} than process {other}; give all the same")
+
+
+def _end_at_once_after_errors() -> None:
+    """Let an error that ends this process end it: else Python waits for the others, which wait for this one."""
+    tell = sys.excepthook
+
+    def end(*error) -> None:
+        tell(*error)
+        leave(1, at_once=True)
+
+    sys.excepthook = end
 
 
 def _package() -> str:
@@ -160,6 +172,11 @@ def heard(interrupts: Interrupts) -> None:
 def highest(number: int) -> int:
     """Of the numbers that processes give."""
     return int(max(exchanged(np.int32(number)))) if count() > 1 else number
+
+
+def total(number: float) -> float:
+    """Of the numbers that processes give."""
+    return float(sum(exchanged(np.float32(number)))) if count() > 1 else number
 
 
 def dealt(f: Callable[[T], np.ndarray], items: Iterable[T], stopped: Callable[[], object]) -> Iterator[tuple]:

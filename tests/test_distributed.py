@@ -190,3 +190,16 @@ def test_a_process_is_killed_between_calls_or_within_one_and_the_other_ends(star
     assert time.monotonic() - killed < 15
     assert running[1 - victim].returncode not in (0, None)
     assert spp > 8 or f"process {victim} has ended" in told or "distributed service" in told
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("faulty", [0, 1])
+def test_an_error_in_one_process_ends_it_and_the_other(started, faulty):
+    """Python would first wait for the other one, which waits for it."""
+    fails = f'if process == "{faulty}":\n    raise KeyError("of this script")\n'
+    running = started(fails + LOOP.format(spp=8), 2)
+    told, _ = running[faulty].communicate(timeout=60)
+    assert running[faulty].returncode == 1
+    assert "of this script" in told
+    running[1 - faulty].communicate(timeout=15)
+    assert running[1 - faulty].returncode not in (0, None)

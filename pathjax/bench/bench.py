@@ -10,8 +10,10 @@ import platform
 from pathlib import Path
 
 import jax
+import numpy as np
 
 import pathjax
+from pathjax import distributed
 from pathjax.bench import peers, plot
 from pathjax.bench.measure import Plan, measure
 from pathjax.bench.report import markdown
@@ -49,6 +51,8 @@ def run(
 ) -> tuple[dict, bool]:
     """Measure scenes one after another; after each one the report of all is in the folder, if there is one.
 
+    Several processes share the renders; the first one alone has a folder and a peer, and its report is whole.
+
     Args:
         folder: `prepare`d; resume: go on after the scenes of the report that is there.
     Returns:
@@ -64,31 +68,32 @@ def run(
         "scenes": [],
         "summary": None,
     }
-    if resume and (folder / "bench.json").exists():
+    if resume and folder is not None and (folder / "bench.json").exists():
         report = _begun(folder / "bench.json", report)
         report["scenes"] = [scene for scene in report["scenes"] if scene["file"] in files]
         report["summary"] = summary(report["scenes"]) if report["scenes"] else None
     done = {scene["file"] for scene in report["scenes"]}
-    todo = [(name, file) for name, file in _plot_names(files) if file not in done]
+    missing = distributed.of_first(np.array([file not in done for file in files]))
+    todo = [scene for scene, misses in zip(_plot_names(files), missing, strict=True) if misses]
     for _, file in todo:
         pathjax.load_scene(file, parameters=defines)  # a wrong one is refused before an hour of work on the others
     if plan.against == "mitsuba" and todo:
         _find_mitsuba(todo[0][1], defines)
     with Interrupts() as interrupts:
         for name, file in todo:
-            say(f"scene {len(report['scenes']) + 1} of {len(files)}")
+            plan.say(f"scene {len(report['scenes']) + 1} of {len(files)}")
             try:
-                with interrupts.raised():
+                with distributed.interruptible(interrupts):
                     scene = measure(file, defines, plan)
             except (KeyboardInterrupt, Exception) as error:
                 if not report["scenes"]:
                     raise
                 stopped = isinstance(error, KeyboardInterrupt)
                 why = "interrupted" if stopped else f"{file}: {type(error).__name__}: {error}"
-                say(f"{why}; {len(report['scenes'])} of {len(files)} scenes are done")
+                plan.say(f"{why}; {len(report['scenes'])} of {len(files)} scenes are done")
                 return report, False
             for failure in scene["failures"]:
-                say(f"{file}: {failure}")
+                plan.say(f"{file}: {failure}")
             report["scenes"].append({**scene, "plot": None})
             report["summary"] = summary(report["scenes"])
             if folder is not None:
@@ -139,7 +144,8 @@ def _plot_names(files: list[str]):
 def machine() -> dict:
     return {
         "processor": _processor(),
-        "devices": len(jax.local_devices()),
+        "devices": jax.device_count(),
+        "processes": distributed.count(),
         "python": platform.python_version(),
         "jax": jax.__version__,
         "pathjax": pathjax.__version__,

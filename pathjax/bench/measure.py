@@ -14,6 +14,7 @@ import jax
 import numpy as np
 
 import pathjax
+from pathjax import distributed
 from pathjax.bench import figures, peers, rays
 from pathjax.bench.figures import Reference
 from pathjax.bench.peers.mitsuba3 import SAMPLERS
@@ -106,13 +107,14 @@ def _more(subject: Subject, rows, plan: Plan, failures) -> dict:
     sampler = _sampler(subject, rows)
     say(f"{file}: strategies")
     strategies = _strategies(subject, plan)
+    more = {"sampler": sampler, "strategies": strategies}
+    if distributed.index() > 0:  # the rest is not shared
+        return more
     say(f"{file}: float32 and float64")
     precision, memory = _precision(subject, plan, failures)
     say(f"{file}: closest hits")
     closest_hits, beside_embree = rays.rates(subject.scene, plan.repeat)
-    return {
-        "sampler": sampler,
-        "strategies": strategies,
+    return more | {
         "precision": precision,
         "peak_memory_bytes": memory,
         "closest_hits": closest_hits,
@@ -139,13 +141,14 @@ def _reference(scene: Scene, spp: int) -> Reference:
 
 
 def _timed(scene: Scene, kinds: dict, seeds) -> dict:
-    """(seconds, images, CPU seconds) of every kind {name: (spp, strategy)}, one of each seed; kinds take turns."""
+    """Of every kind {name: (spp, strategy)}, one of each seed: seconds, images, CPU seconds. Kinds take turns."""
     done = {name: ([], [], []) for name in kinds}
     for seed in seeds:
         for name, (spp, strategy) in kinds.items():
             started, worked = time.perf_counter(), time.process_time()
             image = np.asarray(pathjax.render(scene, spp, seed, strategy))
-            result = time.perf_counter() - started, image, time.process_time() - worked
+            seconds, cpu_seconds = time.perf_counter() - started, time.process_time() - worked
+            result = seconds, image, distributed.total(cpu_seconds)
             for values, value in zip(done[name], result, strict=True):
                 values.append(value)
     return done

@@ -22,8 +22,9 @@ def markdown(report: dict) -> str:
     programs = list(dict.fromkeys(row["program"] for scene in scenes for row in scene["mitsuba"]))
     versions = [f"Python {about['python']}", f"jax {about['jax']}", f"pathjax {about['pathjax']}", *programs]
     halves = _HALVES if report["against"] else ""
+    processes = f" in {about['processes']} processes" if about["processes"] > 1 else ""
     lines = [
-        f"{about['processor']}, {about['devices']} devices of JAX; {', '.join(versions)}",
+        f"{about['processor']}, {about['devices']} devices of JAX{processes}; {', '.join(versions)}",
         "",
         _ABOUT.format(repeat=report["repeat"], halves=halves),
     ]

@@ -76,6 +76,7 @@ def parser() -> argparse.ArgumentParser:
     bench.add_argument("--bunny", metavar="MESH.ply", help=bunny)
     bench.add_argument("--resume", action="store_true", help="go on after the scenes in DIR/bench.json")
     bench.add_argument("--json", action="store_true", help="print one JSON object on stdout")
+    _add_processes(bench)
 
     compare = subparsers.add_parser(
         "compare",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import tempfile
 from pathlib import Path
 
+from pathjax import distributed
 from pathjax.bench import bench, twelve
 from pathjax.bench.measure import Plan
 from pathjax.bench.report import markdown
@@ -16,10 +17,11 @@ from pathjax.system.output import Output, say
 
 
 def run(options, output: Output) -> int:
-    folder = None if options.output is None else Path(options.output)
+    first = distributed.index() == 0  # of several processes, the one that tells, writes and starts the peer
+    folder = Path(options.output) if options.output is not None and first else None
     if options.scenes and options.bunny:
         raise InputError("--bunny is for the twelve scenes, which are measured where none is named")
-    if options.resume and folder is None:
+    if options.resume and options.output is None:
         raise InputError("--resume goes on with the report in a folder: name it by -o")
     bench.prepare(folder)
     defines = dict(options.defines)
@@ -35,10 +37,11 @@ def run(options, output: Output) -> int:
             sorted(set(options.spp or spps)),
             options.repeat,
             options.reference_spp or reference_spp,
-            options.against,
+            options.against if first else None,
             options.quick or not options.scenes,
-            say,
+            say if first else lambda message: None,
         )
         report, whole = bench.run(scenes, defines, plan, folder, output, options.resume)
-        output.text(json_text(report) if options.json else markdown(report))
+        if first:
+            output.text(json_text(report) if options.json else markdown(report))
     return DONE if whole else FAILED

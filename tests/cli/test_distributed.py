@@ -139,3 +139,18 @@ def test_fits_are_those_of_one_process(together, tmp_path, run):
     for name in ("values", "standard_errors", "covariance", "message"):
         assert one[name] == two[name]
     assert (tmp_path / "1.png").read_bytes() == (tmp_path / "2.png").read_bytes()
+
+
+@pytest.mark.slow
+def test_a_bench_is_shared_and_goes_on_where_the_first_process_stopped(together, tmp_path):
+    """All processes agree on what is left, although the first alone has the report."""
+    report = tmp_path / "report"
+    options = "-D", "res=12", "--spp", "1,4", "--reference-spp", 8, "--repeat", 2, "--json"
+    alone = outcome(together(1, SCENE, *options, devices=2, command="bench"))
+    outcome(together(2, SCENE, "--quick", *options, "-o", report, command="bench"))
+    shared = (SCENE, "scenes/glass_ball.xml", "--quick", *options, "-o", report, "--resume")
+    both = outcome(together(2, *shared, command="bench"))
+    assert alone["machine"] | {"processes": 2} == both["machine"]
+    assert [scene["file"] for scene in both["scenes"]] == [SCENE, "scenes/glass_ball.xml"]
+    for one, two in zip(alone["scenes"][0]["pathjax"], both["scenes"][0]["pathjax"], strict=True):
+        assert one["rel_mse"] == two["rel_mse"]
