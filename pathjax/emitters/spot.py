@@ -40,7 +40,8 @@ class Spot(Point):
         cutoff = cls.cutoff_angle.read(loader, fields, "cutoff_angle", name)
         beam = fields.float("beam_width", None, at_least=0)
         if beam is not None and beam > cutoff:
-            raise fields.error("beam_width", f"must not exceed cutoff_angle, {cutoff:g}; is {beam:g}")
+            loader.note(fields.where("beam_width"), f"is wider than cutoff_angle, {cutoff:g}, where the light ends")
+            beam = cutoff
         weight = cls.sampling_weight.read(loader, fields, "sampling_weight", name)
         to_world = fields.transform("to_world")
         axes = to_world[:3, :3] / np.linalg.norm(to_world[:3, 2])

@@ -39,7 +39,7 @@ class ThinLens(Perspective):
 
     @staticmethod
     def read_lens(fields: Fields, far: float) -> dict[str, float]:
-        radius = fields.float("aperture_radius", above=0)
+        radius = fields.float("aperture_radius", at_least=0)
         return {"aperture_radius": radius, "focus_distance": fields.float("focus_distance", far, above=0)}
 
     def build(self, film: HDRFilm, dtype) -> ThinLensCamera:
