@@ -61,10 +61,20 @@ class PRBVolPath(PRB, VolPath):
     same = "volpath"
 
 
+class PTracer(Path):
+    """Mitsuba's tracer of paths from the lights, which come to the same image."""
+
+    @classmethod
+    def read(cls, loader, fields):
+        meets = "what mirrors and clear glass show to the camera is in it, which paths from lights do not find"
+        loader.note(fields.element, f"traces from the lights; path is used, whose image is the same, but {meets}")
+        return super().read(loader, fields)
+
+
 class Direct:
     unused = Path.unused | dict.fromkeys(
         ("shading_samples", "emitter_samples", "bsdf_samples"),
-        Unused("integer", "one sample of each is taken; spp sets the noise", at_least=1),
+        Unused("integer", "one sample of each is taken, so lights of no size and mirrors are seen; spp sets the noise"),
     )
 
     @classmethod
@@ -82,14 +92,24 @@ class Wrapper:
     def read(cls, loader, fields: Fields) -> d.Integrator:
         nested = fields.objects("integrator")
         if not nested:
-            raise fields.element.error(f"{fields.element} needs an <integrator> inside")
+            return cls.alone(loader, fields)
         loader.note(fields.element, f"is left out, and the integrator inside is used; {cls.left_out}")
         return loader.make(nested[0], KINDS)
+
+    @classmethod
+    def alone(cls, loader, fields: Fields) -> d.Integrator:
+        """Of one that has nothing inside."""
+        raise fields.element.error(f"{fields.element} needs an <integrator> inside")
 
 
 class AOV(Wrapper):
     unused = Wrapper.unused | {"aovs": Unused("string", "`pathjax render --aov` writes output variables")}
     left_out = "output variables are those of render_aovs"
+
+    @classmethod
+    def alone(cls, loader, fields):
+        loader.note(fields.element, f"holds no integrator, so path is used; {cls.left_out}")
+        return d.Integrator()
 
 
 class Moment(Wrapper):
@@ -108,6 +128,7 @@ KINDS = {
     "volpathmis": VolPathMIS,
     "prb": PRB,
     "prbvolpath": PRBVolPath,
+    "ptracer": PTracer,
     "aov": AOV,
     "moment": Moment,
     "stokes": Stokes,
