@@ -48,6 +48,7 @@ class Document:
     ids: Mapping[str, Element]
     folders: tuple[Path, ...]  # searched in this order for what the file names
     found: dict[Element, Path] = field(default_factory=dict)  # the files that elements name
+    notes: tuple[str, ...] = ()  # what `info` should tell of how it was read
 
     def resolve(self, element: Element) -> Element:
         """The element itself, or what it refers to if it is a <ref>."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +11,7 @@ import numpy as np
 from pathjax.description.transform import Transform
 from pathjax.errors import InputError
 from pathjax.io import gltf, mesh
+from pathjax.shapes import Shape
 
 # By the end of the file's name.
 SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl")
@@ -40,6 +41,7 @@ def scene(path: Path, parameters: Mapping[str, object]) -> tuple[dict, list[str]
     if not cameras:
         cameras = {
             gltf.unused("camera", objects): _framing(np.concatenate([each["vertices"] for each in shapes]), path)
+            | {"aspect": ASPECT}
         }
         notes.append(f"{path}: has no camera; one that frames it is used")
     width = _whole(parameters.get("res", WIDTH), path)
@@ -66,17 +68,26 @@ def _mesh(path: Path) -> tuple[dict[str, dict], list[str], list[Path]]:
     return {"mesh": {"type": "mesh", **shape, "bsdf": {"type": "twosided", "bsdf": bsdf}}}, notes, [path]
 
 
-def _framing(vertices: np.ndarray, path: Path) -> dict:
-    """A camera from the front, somewhat above, whose view the sphere around the box of all vertices fits into."""
-    low, high = vertices.min(axis=0), vertices.max(axis=0)
+def framing(geometries: Sequence[Shape], file: str) -> dict:
+    """A camera from the front, somewhat above, whose view the sphere around the box of all shapes fits into.
+
+    Raises:
+        InputError: they have no extent, or one that is not finite.
+    """
+    corners = [corner for geometry in geometries for corner in geometry.primitives(flip=False).boxes()]
+    return _framing(np.concatenate([np.reshape(corner, (-1, 3)) for corner in corners]), file)
+
+
+def _framing(points: np.ndarray, file: object) -> dict:
+    low, high = points.min(axis=0), points.max(axis=0)
     center, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
     if not 0 < radius < math.inf:
-        raise InputError(f"{path}: has no extent, or one that is not finite")
+        raise InputError(f"{file}: has no extent, or one that is not finite")
     distance = radius / math.sin(math.radians(FOV / 2))
     origin = center + TOWARDS * (distance / np.linalg.norm(TOWARDS))
     to_world = Transform().look_at(origin, center, [0, 1, 0])
     clip = {"near_clip": distance / 1000, "far_clip": distance * 1000}
-    return {"type": "perspective", "to_world": to_world, "fov": FOV, "fov_axis": "smaller", **clip, "aspect": ASPECT}
+    return {"type": "perspective", "to_world": to_world, "fov": FOV, "fov_axis": "smaller", **clip}
 
 
 def _with_film(camera: dict, width: int) -> dict:

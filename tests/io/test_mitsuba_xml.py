@@ -1,11 +1,13 @@
 """Scene files: what they mean, and what is refused. Numbers that Mitsuba defines are compared with Mitsuba itself."""
 
+import itertools
 import math
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+import pathjax as pj
 from pathjax import description as d
 from pathjax.bsdfs.ior import IOR
 from pathjax.errors import InputError
@@ -396,7 +398,6 @@ def test_conductor_is_an_ideal_mirror_unless_told_otherwise(read):
         ("diffuse", '<bsdf type="diffuse"/>', "has no place inside"),
         ("diffuse", '<texture type="checkerboard"/>', "lacks name="),
         ("diffuse", "<colour/>", "<colour> is not supported inside"),
-        ("diffuse", "0.5", "stray text"),
         ("dielectric", '<float name="int_ior" value="0"/>', "must be above 0, is 0"),
         ("dielectric", '<float name="ext_ior" value="-1"/>', "must be above 0, is -1"),
         ("dielectric", '<string name="int_ior" value="1.5"/>', "use a number or one of vacuum"),
@@ -659,7 +660,7 @@ def test_sensors_that_are_not_modelled_are_refused(refused, inside, words):
 @pytest.mark.parametrize(
     ("body", "words"),
     [
-        ('<integrator type="ptracer"/>', "is not supported yet; use one of path, direct"),
+        ('<integrator type="depth"/>', "is not supported yet; use one of path, direct"),
         ('<integrator type="pth"/>', 'did you mean "path"'),
         ('<integrator type="moment"/>', "needs an <integrator> inside"),
         (f'<integrator type="moment">{2 * PATH}</integrator>', "takes at most 1"),
@@ -668,8 +669,7 @@ def test_sensors_that_are_not_modelled_are_refused(refused, inside, words):
         ('<integrator type="path"><integer name="max_depth" value="0"/></integrator>', "renders black"),
         ('<integrator type="path"><integer name="max_depth" value="-2"/></integrator>', "from -1"),
         ('<integrator type="path"><integer name="rr_depth" value="0"/></integrator>', "from 1"),
-        ('<integrator type="direct"><integer name="emitter_samples" value="0"/></integrator>', "must be from 1"),
-        ('<film type="hdrfilm"/>', "not supported directly in <scene>"),
+        ('<integrator type="direct"><integer name="emitter_samples" value="-1"/></integrator>', "must be from 0"),
         ('<float name="x" value="1"/>', "not supported directly in <scene>"),
         ('<sensr type="perspective"/>', 'did you mean "sensor"?'),
     ],
@@ -678,8 +678,53 @@ def test_top_level_elements_that_are_not_modelled_are_refused(refused, body, wor
     assert words in refused(body)
 
 
-def test_a_scene_needs_a_sensor(refused):
-    assert "no <sensor>" in refused("", line=1, sensor="")
+def test_a_scene_without_sensor_is_seen_by_one_that_frames_it(tmp_path):
+    """Also where it was written again."""
+    place = '<transform name="to_world"><scale value="3"/><translate x="40" z="7"/></transform>'
+    body = shape(place, "cube") + '<emitter type="constant"/>'
+    (tmp_path / "scene.xml").write_text(f'<scene version="3.0.0">{body}</scene>')
+    scene = pj.load_scene(tmp_path / "scene.xml")
+    assert any("has no <sensor>; one that frames its shapes is used" in note for note in scene.about.description.notes)
+    pj.save_scene(scene, tmp_path / "again.xml")
+    for each in (scene, pj.load_scene(tmp_path / "again.xml")):
+        corners = np.array(list(itertools.product((37, 43), (-3, 3), (4, 10)))) - each.camera.origin
+        x, y, z = each.camera.axes @ corners.T
+        on_film = (np.stack([x / z, y / z], 1) - each.camera.corner) / each.camera.extent
+        assert 0 < on_film.min() < on_film.max() < 1 and np.ptp(on_film, 0).max() > 0.5
+
+
+def test_what_holds_nothing_to_be_seen_has_a_camera_at_the_origin(read):
+    scene = read("", sensor="")
+    np.testing.assert_array_equal(scene.view.camera.to_world, np.eye(4))
+    assert any("one at the origin is used" in note for note in scene.notes)
+
+
+def test_a_sensor_on_a_shape_is_left_out_or_refused_where_there_is_no_other(read, refused):
+    meter = shape('<sensor type="irradiancemeter"/>', "rectangle")
+    assert any("it measures what falls on a shape" in note for note in read(meter).notes)
+    assert "add a <sensor> outside of the shapes" in refused(meter, sensor="")
+
+
+def test_films_and_samplers_may_be_referred_to(read):
+    film = '<film type="hdrfilm" id="film"><integer name="width" value="12"/></film>'
+    drawn = '<sampler type="independent" id="drawn"><integer name="sample_count" value="9"/></sampler>'
+    scene = read(film + drawn, sensor='<sensor type="perspective"><ref id="film"/><ref id="drawn"/></sensor>')
+    assert scene.view.film.width == 12 and scene.view.spp == 9
+    assert any('<film type="hdrfilm"> is used by nothing' in note for note in read('<film type="hdrfilm"/>').notes)
+
+
+def test_text_between_elements_is_noted_at_its_line(read):
+    notes = read(f"{shape()}>\n{shape()} word").notes
+    assert [note[note.index("scene.xml") :] for note in notes if "text between" in note] == [
+        "scene.xml:2: text between elements has no effect: '>'",
+        "scene.xml:3: text between elements has no effect: 'word'",
+    ]
+
+
+def test_merged_shapes_stand_for_themselves(read):
+    inside = shape(kind="cube", attributes='id="box"') + shape('<emitter type="area"/>', "rectangle", 'id="lamp"')
+    scene = read(shape(inside, "merge"))
+    assert [each.name for each in scene.shapes] == ["box", "lamp"] and scene.shapes[1].emitter is not None
 
 
 def test_objects_that_nothing_uses_are_checked_and_noted(read, refused):
@@ -794,6 +839,7 @@ def test_mitsuba_takes_what_has_no_effect(mitsuba, picture, tmp_path, place, nam
         ('<integrator type="volpath">{}</integrator>', "without media is the same as path"),
         ('<integrator type="volpathmis">{}</integrator>', "without media is the same as path"),
         ('<integrator type="prb">{}</integrator>', "its image is that of path"),
+        ('<integrator type="ptracer">{}</integrator>', "traces from the lights; path is used"),
         (
             '<integrator type="aov"><string name="aovs" value="a:depth"/>'
             '<integrator type="path">{}</integrator></integrator>',
@@ -809,6 +855,11 @@ def test_integrators_that_estimate_the_same_are_path_and_noted(read, integrator,
     volume = "volpath" in integrator
     assert scene.integrator == d.Integrator(max_depth=3, rr_depth=2, free_passes=volume, media=volume)
     assert any(words in note for note in scene.notes)
+
+
+def test_output_variables_alone_go_with_path(read):
+    scene = read('<integrator type="aov"><string name="aovs" value="a:depth"/></integrator>')
+    assert scene.integrator == d.Integrator() and any("holds no integrator, so path is used" in x for x in scene.notes)
 
 
 def test_prb_ends_at_its_own_depth(read):
@@ -916,7 +967,7 @@ def test_older_files_mean_what_they_mean_to_mitsuba(mitsuba, old):
 
 def test_names_of_older_files_are_no_names_of_newer_ones(old):
     old.write_text(OLD.replace("0.6.0", "3.0.0"))
-    with pytest.raises(InputError, match=r'old\.xml:7: <integer name="sampleCount"> is not a parameter'):
+    with pytest.raises(InputError, match=r'old\.xml:2: <integer name="maxDepth"> is not a parameter'):
         load(old)
 
 

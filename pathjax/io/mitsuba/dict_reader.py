@@ -40,6 +40,13 @@ def read(scene: Mapping, name: str = "scene") -> Document:
     return _Reader(name).document(scene)
 
 
+def element(name: str, value: Mapping, parent: Element) -> Element:
+    """What a dictionary stands for as one more object of a document, placed where `parent` stands."""
+    made = _Reader(parent.place).object(name, value, parent.place, top=False)
+    del made.attributes["name"]
+    return made
+
+
 def rooms() -> dict[str, Mapping[str, object]]:
     """The tables of all rooms by the tag of elements."""
     return {

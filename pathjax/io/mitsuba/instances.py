@@ -15,6 +15,7 @@ from pathjax.shapes import Shape
 
 # Above, the tables of a scene would not fit into the memory of usual machines, or its numbers into 32 bits.
 MOST_TRIANGLES = 1 << 28
+MOST_SHAPES = 1 << 20  # inside one element
 # Vertices, normals, uv, and what searches keep of a triangle.
 BYTES = 200
 
@@ -30,14 +31,25 @@ class ShapeGroup:
     def read(cls, loader, fields: Fields) -> list[d.Shape]:
         """Its shapes, in its own space."""
         made = []
-        for element in fields.objects("shape", limit=1 << 20):
-            if element.attributes.get("type") in KINDS:
+        for element in fields.objects("shape", limit=MOST_SHAPES):
+            if element.attributes.get("type") in ("shapegroup", "instance"):
                 raise element.error(f"{element} cannot stand inside {fields.element}; groups hold shapes alone")
             shapes = loader.shapes(element)
             if any(shape.emitter is not None for shape in shapes):
                 raise element.error(f"{element} emits light, which instances cannot; put it outside of the group")
             made += shapes
         return made
+
+
+class Merge:
+    """Shapes that Mitsuba searches as one, where they have the same bsdf; the image is the same."""
+
+    unused = Shape.unused
+
+    @classmethod
+    def read(cls, loader, fields: Fields) -> list[d.Shape]:
+        loader.note(fields.element, "is left out, and the shapes inside are used")
+        return [shape for element in fields.objects("shape", limit=MOST_SHAPES) for shape in loader.shapes(element)]
 
 
 class Instance:
@@ -62,4 +74,4 @@ def _placed(fields: Fields, shape: d.Shape, to_world: np.ndarray, name: str) -> 
 
 
 # By the name that scene files give them.
-KINDS = {"shapegroup": ShapeGroup, "instance": Instance}
+KINDS = {"shapegroup": ShapeGroup, "instance": Instance, "merge": Merge}

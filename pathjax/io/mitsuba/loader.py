@@ -68,7 +68,7 @@ class _Loader:
 
     def __init__(self, document: Document):
         self.document = document
-        self.notes: list[str] = []
+        self.notes = list(document.notes)
         self.names = set(document.ids)
         self.counts: defaultdict[str, Iterator[int]] = defaultdict(count)
         self.named: set[tuple[str, str]] = set()  # types and names of bsdfs and textures
@@ -76,6 +76,7 @@ class _Loader:
         self.made: dict[Element, object] = {}
         self.copied = 0  # triangles of instances
         self.on_shapes: dict[Element, Element] = {}  # a light by reference, and the shape that it shines from
+        self.on_surfaces: list[Element] = []  # sensors inside of shapes
 
     def description(self, file: str, sensor: int | str = 0) -> d.Description:
         scene: dict[str, list[Element]] = {tag: [] for tag in TOP_LEVEL}
@@ -94,12 +95,6 @@ class _Loader:
         for element in scene["integrator"][1:]:
             first = scene["integrator"][0].place
             raise element.error(f"{element}: one <integrator> is supported here; the first is at {first}")
-        if not scene["sensor"]:
-            raise self.document.root.error('the scene has no <sensor>; add <sensor type="perspective">')
-        names = [element.id or str(number) for number, element in enumerate(scene["sensor"])]
-        name = d.chosen(names, sensor, scene["sensor"][0].file)
-        seen = scene["sensor"][names.index(name)]
-        views = {each: self.view(element, seen) for each, element in zip(names, scene["sensor"], strict=True)}
         if scene["integrator"]:
             integrator = self.make(scene["integrator"][0], integrators.KINDS)
         else:
@@ -114,6 +109,15 @@ class _Loader:
             if not _kind_of_light(element).on_surfaces
         )
         shapes = tuple(shape for element in scene["shape"] for shape in self.shapes(element))
+        for element in self.on_surfaces:
+            if not scene["sensor"]:
+                raise element.error(f"{element} measures what falls on a shape; add a <sensor> outside of the shapes")
+            self.note(element, "is left out: it measures what falls on a shape")
+        sensors = scene["sensor"] or [self.camera(shapes)]
+        names = [element.id or str(number) for number, element in enumerate(sensors)]
+        name = d.chosen(names, sensor, sensors[0].file)
+        seen = sensors[names.index(name)]
+        views = {each: self.view(element, seen) for each, element in zip(names, sensors, strict=True)}
         if self.copied:
             size = self.copied * instances.BYTES / 1e6
             self.notes.append(f"triangles of instances are copies: {self.copied} of them, about {size:.0f} MB")
@@ -121,9 +125,11 @@ class _Loader:
             if _kind_of_light(element).on_surfaces and element not in self.on_shapes:
                 self.note(element, "is used by nothing; put it, or a <ref> to it, inside the <shape> that shines")
                 self.emitter(element, element.id, inside=True)
-        for element in scene["bsdf"] + scene["texture"] + scene["medium"] + scene["phase"]:
-            if element not in self.made:
-                self.note(element, "is used by nothing")
+        for element in (each for tag in SHARED for each in scene[tag] if each not in self.made):
+            self.note(element, "is used by nothing")
+            if element.tag in ("film", "sampler", "rfilter"):
+                self.make(element, dict_reader.rooms()[element.tag])
+            else:
                 self.shared(element, element.id or element.tag)
         self.check_media(scene["integrator"], integrator, shapes, views[name].medium)
         return d.Description(
@@ -138,6 +144,16 @@ class _Loader:
             views,
             name,
         )
+
+    def camera(self, shapes: tuple[d.Shape, ...]) -> Element:
+        """A sensor that frames the shapes, for a scene without one; it becomes part of the document."""
+        root = self.document.root
+        what = bare.framing([shape.geometry for shape in shapes], root.file) if shapes else {"type": "perspective"}
+        element = dict_reader.element("sensor", what, root)
+        root.children.append(element)
+        where = "one that frames its shapes" if shapes else "one at the origin"
+        self.note(root, f"has no <sensor>; {where} is used")
+        return element
 
     def view(self, element: Element, seen: Element) -> d.View | InputError:
         """Of a sensor. One other than that which is used may be what is not supported, and has one note alone."""
@@ -229,6 +245,8 @@ class _Loader:
             case instances.ShapeGroup:
                 self.group(element)
                 return []
+            case instances.Merge:
+                return self.make(element, kinds)
             case instances.Instance:
                 return self.make(element, kinds, element.id or self.numbered("shape"))
         made = self.make(element, kinds, element.id or self.numbered("shape"), read=_shape)
@@ -294,6 +312,7 @@ def _shape(loader: _Loader, fields: Fields, name: str) -> d.Shape | None:
         if other is not fields.element:
             raise fields.element.error(f"{element} shines from {other} already, at {other.place}; give each its own")
         emitter = loader.emitter(element, element.id or name, inside=True)
+    loader.on_surfaces += fields.objects("sensor")
     inherited = fields.element.id or None
     (nested,) = fields.objects("bsdf") or [_usual_bsdf(fields.element, lit=emitter is not None)]
     bsdf = loader.bsdf(nested, nested.id or inherited or loader.numbered("bsdf"))
@@ -372,4 +391,6 @@ class _Settings:
         pass
 
 
-TOP_LEVEL = ("integrator", "sensor", "emitter", "bsdf", "texture", "shape", "medium", "phase", "volume")
+# What is of use by reference alone.
+SHARED = ("bsdf", "texture", "medium", "phase", "film", "sampler", "rfilter")
+TOP_LEVEL = ("integrator", "sensor", "emitter", "shape", "volume", *SHARED)

@@ -35,7 +35,7 @@ def read(path: str | Path, parameters: Mapping[str, object]) -> Document:
         InputError: unreadable or malformed XML, a document type, an include cycle, an unknown `$name`, a duplicate id.
     """
     reader = _Reader(Path(path), {name: _as_text(value) for name, value in parameters.items()})
-    root = reader.expand(_parse(Path(path), str(path)), chain=(Path(path).resolve(),))
+    root = reader.expand(_parse(Path(path), str(path), reader.notes), chain=(Path(path).resolve(),))
     reader.check_parameters(str(path))
     ids = by_id(root)
     for alias in reader.aliases:
@@ -45,7 +45,7 @@ def read(path: str | Path, parameters: Mapping[str, object]) -> Document:
         if name in ids:
             raise alias.error(f'the id "{name}" is taken already, at {ids[name].file}:{ids[name].line}')
         ids[name] = ids[alias.id]
-    return Document(root, ids, tuple(reader.folders), reader.found)
+    return Document(root, ids, tuple(reader.folders), reader.found, tuple(reader.notes))
 
 
 def by_id(root: Element) -> dict[str, Element]:
@@ -71,6 +71,7 @@ class _Reader:
         self.files = 1
         self.aliases: list[Element] = []
         self.found: dict[Element, Path] = {}
+        self.notes: list[str] = []
 
     def expand(self, root: Element, chain: tuple[Path, ...]) -> Element:
         if root.tag != "scene":
@@ -111,7 +112,7 @@ class _Reader:
         self.files += 1
         if self.files > MAX_FILES or len(chain) > MAX_DEPTH:
             raise element.error(f"more than {MAX_FILES} included files, or {MAX_DEPTH} within one another")
-        return self.expand(_parse(path, str(path)), (*chain, path.resolve())).children
+        return self.expand(_parse(path, str(path), self.notes), (*chain, path.resolve())).children
 
     def _substitute(self, top: Element) -> None:
         for element in _walk(top):
@@ -142,7 +143,7 @@ class _Reader:
                 )
 
 
-def _parse(path: Path, shown: str) -> Element:
+def _parse(path: Path, shown: str, notes: list[str]) -> Element:
     data = _read_bytes(path, shown)
     parser = expat.ParserCreate()
     stack: list[Element] = []
@@ -157,7 +158,8 @@ def _parse(path: Path, shown: str) -> Element:
 
     def text(data: str) -> None:
         if data.strip():
-            raise InputError(f"{shown}:{parser.CurrentLineNumber}: stray text {data.strip()[:40]!r} between elements")
+            line = parser.CurrentLineNumber
+            notes.append(f"{shown}:{line}: text between elements has no effect: {data.strip()[:40]!r}")
 
     def doctype(*_: object) -> None:
         raise InputError(f"{shown}:{parser.CurrentLineNumber}: a document type (<!DOCTYPE>) is not allowed; remove it")
