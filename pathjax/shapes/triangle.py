@@ -138,11 +138,16 @@ class Triangles(Table):
         axes, ray = prepared
         _, _, width = self.leaves.shape
 
+        if self.tree is None:
+            # Of all nine numbers, which lanes share, those of an axis are selected, not gathered.
+            block = numbers_of(at(self.leaves, leaf)[:9], ray.dtype).reshape(3, 3, width)
+
         def coordinates(axis):
-            first = 3 * axis if self.tree is None else axis
-            start = [jnp.asarray(i, jnp.uint32) for i in (leaf, first, 0)]
-            block = lax.dynamic_slice(self.leaves, start, (1, 3, width), allow_negative_indices=False)[0]
-            return list(numbers_of(block, ray.dtype))
+            if self.tree is None:
+                return list(at(block, axis))
+            start = [jnp.asarray(i, jnp.uint32) for i in (leaf, axis, 0)]
+            found = lax.dynamic_slice(self.leaves, start, (1, 3, width), allow_negative_indices=False)[0]
+            return list(numbers_of(found, ray.dtype))
 
         # Vertex by vertex: XLA does not vectorise loops over (3, W).
         z = [c - ray[2] for c in coordinates(axes[2])]
