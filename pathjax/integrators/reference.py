@@ -81,8 +81,8 @@ def radiance(scene: Scene, choice: Choice | None, ray: Ray, numbers: Callable) -
         drawn, d = sample(scene, here, u.bsdf)
         throughput, passive = throughput * drawn.weight, passive * drawn.passive
 
-        # Roulette, by the share of light that is left, which refraction does not change.
-        survival = jnp.where(depth >= scene.rr_depth, jnp.clip(jnp.max(throughput) / passive, 0.05, 0.95), 1)
+        # Roulette, by the share of light that is left, which refraction does not change: `roulette` says why 3 times.
+        survival = jnp.where(depth >= scene.rr_depth, jnp.clip(3 * jnp.max(throughput) / passive, 0.05, 0.95), 1)
         alive = goes_on & (drawn.pdf > 0) & jnp.any(throughput > 0) & (u.roulette < survival)
         # What goes straight on comes from where it came from.
         pdf = jnp.where(passes, pdf, jnp.where(drawn.delta, jnp.inf, drawn.pdf))

@@ -10,6 +10,12 @@ from pathjax.compile import compute_once
 from pathjax.core.math import larger, safe_divide, smaller
 from pathjax.scene.scene import Scene
 
+# Where paths of throughput t go on with probability q, the variance that they add is in proportion to t^2 / q, and
+# their time to q. So the product of all variance and all time is least for a q in proportion to t, by the root of what
+# such paths vary over what all others do, times the time spent before over that to come (Rath et al. 2022, "EARS:
+# Efficiency-aware Russian roulette and splitting"). Samples of a pixel are one lattice, so the others vary little. On
+# the scenes of the bench 3 was within 8 % of the best of 1, 2, 3, 4, 5, 6 and 10, and 1 up to a third below it.
+EFFORT = 3
 # Roulette never spares a path for certain, so that every path ends even between perfect mirrors; and never ends one for
 # certain, so that what is black keeps its derivative.
 MIN_SURVIVAL, MAX_SURVIVAL = 0.05, 0.95
@@ -18,7 +24,7 @@ MIN_SURVIVAL, MAX_SURVIVAL = 0.05, 0.95
 def survival(
     scene: Scene, depth: Int[Array, ""], throughput: Float[Array, "3"], passive: Float[Array, ""] | None
 ) -> Float[Array, ""]:
-    """Probability with which a path goes on: its largest throughput, detached; 1 before the scene's rr_depth.
+    """Probability with which a path goes on: EFFORT times its largest throughput, detached; 1 before `scene.rr_depth`.
 
     Args:
         depth, throughput: behind the vertex.
@@ -28,7 +34,7 @@ def survival(
     left = lax.stop_gradient(largest(throughput))
     if passive is not None:
         left = safe_divide(left, passive)
-    return compute_once(jnp.where(depth >= scene.rr_depth, bounded(left), 1))
+    return compute_once(jnp.where(depth >= scene.rr_depth, bounded(EFFORT * left), 1))
 
 
 def bounded(survival: Float[Array, ""]) -> Float[Array, ""]:
