@@ -26,7 +26,7 @@ from pathjax.compile.xla import native
 _LANES, _FEW_LANES = 256, 64
 MANY_ITEMS = 2 * _LANES
 # Of a sum over items: so many for a part, so that few lanes wait for its last one; and bytes of the sums of all parts.
-ITEMS_OF_A_PART, MOST_PARTS, MOST_BYTES = 4096, 16, 1 << 26
+ITEMS_OF_A_PART, MOST_PARTS, MOST_BYTES = 8192, 16, 1 << 26
 # Bytes of live values that one lane of a vmapped path keeps; sizes the chunks on an accelerator.
 _BYTES_PER_LANE = 4096
 _CHUNK_BYTES = 1 << 30
@@ -98,7 +98,8 @@ def native_fold(
     form = _form(form)
     if form == "loop":
         raise ValueError("items that share memory have no form loop; use lanes or vmap")
-    nbytes = _bytes(lambda: finish(start(_LANES)))
+    sums = jax.eval_shape(lambda: finish(start(_LANES)))
+    zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), sums)
 
     def alone(x, *shared):
         return finish(f(x, *shared, start(1)))
@@ -110,8 +111,7 @@ def native_fold(
         (memory,) = lanes(lambda *args: (f(*args),), width, memory=start(width))(xs, *shared)
         return finish(memory)
 
-    sums = _by_parts(part, xs, shared, devices, max(1, MOST_BYTES // nbytes))
-    return jax.tree.map(lambda x: reduce(jnp.add, list(x)), sums)
+    return _by_parts(part, xs, shared, devices, max(1, MOST_BYTES // _bytes(lambda: zeros)), zeros)
 
 
 @usual_promotion
@@ -154,14 +154,16 @@ def native_rows(f: Callable, xs, *shared, start: Callable, finish: Callable, dev
     return run(xs, *shared)
 
 
-def _by_parts(part: Callable, xs, shared, devices: int | None, most: int = MOST_PARTS):
-    """part(items, lanes, shared) of all parts, one after another: pytree of arrays (parts, ...).
+def _by_parts(part: Callable, xs, shared, devices: int | None, most: int = MOST_PARTS, total=None):
+    """part(items, lanes, shared) of all parts, one after another, added to the total: pytree of arrays.
 
+    total: None: nothing is added up, and the arrays are (parts, ...).
     Item i belongs to part i % parts. Each device does some parts; how many there are depends on the items alone.
     """
     count = jax.tree.leaves(xs)[0].shape[0]
     used = _used(devices)
-    parts = min(MOST_PARTS, -(-count // ITEMS_OF_A_PART), most)
+    # A power of 2, which most numbers of devices share evenly.
+    parts = 1 << (min(MOST_PARTS, -(-count // ITEMS_OF_A_PART), most).bit_length() - 1)
     rounds = -(-parts // len(used))
     each = -(-count // parts)
     width = _LANES if each >= MANY_ITEMS else _FEW_LANES
@@ -176,8 +178,16 @@ def _by_parts(part: Callable, xs, shared, devices: int | None, most: int = MOST_
     def on_one_device(xs, *shared):
         return lax.map(lambda xs: part(xs, width, shared), xs)
 
+    def added(total, result):
+        return jax.tree.map(jnp.add, total, result)
+
+    if len(used) == 1 and total is not None:
+        # Parts that are not kept till all are done need far less memory.
+        parted = jax.tree.map(lambda x: deal(x)[0], xs)
+        return lax.scan(lambda total, xs: (added(total, part(xs, width, shared)), None), total, parted)[0]
     results = _dealt(on_one_device, used, jax.tree.map(deal, xs), shared)
-    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:parts], results)
+    results = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:parts], results)
+    return results if total is None else jax.tree.map(lambda first, x: reduce(jnp.add, list(x), first), total, results)
 
 
 def _form(form: str | None) -> str:

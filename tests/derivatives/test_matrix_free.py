@@ -10,7 +10,7 @@ import pytest
 
 import pathjax as pj
 from pathjax.compile import mapping
-from pathjax.derivatives import backward, jacobian, matrix_free
+from pathjax.derivatives import backward, jacobian, matrix_free, record
 from pathjax.images import write_exr
 from pathjax.integrators.options import Options
 from pathjax.scene import parameters as named
@@ -190,10 +190,28 @@ def test_a_jacobian_in_many_colours_is_that_by_tangents(make_scene, monkeypatch)
         np.testing.assert_allclose(one, other, rtol=3e-6, atol=3e-6 * np.abs(other).max())
 
 
+@pytest.mark.parametrize("near", [0, 1 << 30])
+def test_lanes_add_to_a_list_that_is_far_as_to_one_that_is_near(monkeypatch, near):
+    """Several lanes to the same places, some nothing; the list may hold what is not finite."""
+    monkeypatch.setattr(backward, "NEAR", near)
+    random = np.random.default_rng(4)
+    places = random.integers(0, 50, (4, 64)).astype(np.int32)
+    shares, change = (random.random((n, 64)).astype(np.float32) for n in (4, 3))
+    change[:, ::3] = 0
+    total = np.zeros((60, 3), np.float32)
+    total[55] = np.nan, np.inf, -np.inf
+    expected = total.copy()
+    for place, share in zip(places, shares, strict=True):
+        np.add.at(expected, place, (share * change).T)
+    slot = record.Slot(tuple(jnp.asarray(places)), tuple(jnp.asarray(shares)), None, None)
+    found = jax.jit(lambda *args: backward.add(*args))(jnp.asarray(total), slot, list(jnp.asarray(change)))
+    np.testing.assert_allclose(found, expected, rtol=1e-5)  # sums in another order
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(len(jax.local_devices()) < 2, reason="needs two devices")
 def test_sums_are_bitwise_the_same_on_any_number_of_devices(room, monkeypatch):
-    monkeypatch.setattr(mapping, "ITEMS_OF_A_PART", 24)  # three parts of an image
+    monkeypatch.setattr(mapping, "ITEMS_OF_A_PART", 16)  # four parts of an image
     scene, v = limited(room(), 6, 3), jnp.ones((RES * RES, 3))
     backward.pullback.clear_cache()  # of other parts
     one, many = (parts(scene, devices=devices)[2](v) for devices in (1, None))
