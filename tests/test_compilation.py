@@ -148,8 +148,12 @@ def test_image_and_derivatives_are_one_native_kernel_and_finite(jacobian_kernel_
 
 
 @pytest.mark.slow
-def test_a_sweep_is_native(shipped):
-    """The paths of a part, and its last sweep."""
+@pytest.mark.parametrize(("few", "near"), [(backward.FEW, backward.NEAR), (0, backward.NEAR), (0, 0)])
+def test_a_sweep_is_native(monkeypatch, shipped, few, near):
+    """The paths of a part, and its last sweep, of few entries, of lists in near caches and of larger ones."""
+    monkeypatch.setattr(backward, "FEW", few)
+    monkeypatch.setattr(backward, "NEAR", near)
+    backward.pullback.clear_cache()
     scene = shipped("cornell_box", res=16)
     pixels = jnp.arange(pixel_count(scene.film), dtype=jnp.int32)
     paths = tuple({parameter.path for parameter in scene.about.parameters.values()})
