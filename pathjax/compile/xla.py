@@ -22,12 +22,17 @@ from pathjax.system.cores import cores
 
 _OPTION = "xla_cpu_small_while_loop_byte_threshold"
 _FLAG = f"--xla_backend_extra_options={_OPTION}=1000000000000"
+# What takes time of compilation, and gives kernels of lanes nothing, as measured: LLVM's last level, a sixth; its
+# unrolling of loops, another; and MLIR, a tenth, for what little stands outside of a kernel. (An extra option that a
+# version of XLA does not know means nothing to it; another one ends the process.)
+_QUICK_FLAGS = {
+    "xla_backend_optimization_level": "--xla_backend_optimization_level=2",
+    "xla_cpu_disable_loop_unrolling": "--xla_backend_extra_options=xla_cpu_disable_loop_unrolling=true",
+    "xla_cpu_disable_new_fusion_emitters": "--xla_backend_extra_options=xla_cpu_disable_new_fusion_emitters=true",
+}
 # XLA halves the vectors of processors that have them this wide; kernels of lanes gain a tenth or more from whole ones.
 _WIDTH_OPTION = "xla_cpu_prefer_vector_width"
 _WIDTH_FLAG = f"--{_WIDTH_OPTION}=512"
-# LLVM's last level takes a sixth of compilation, and kernels of lanes gain nothing by it.
-_LEVEL_OPTION = "xla_backend_optimization_level"
-_LEVEL_FLAG = f"--{_LEVEL_OPTION}=2"
 _DEVICE_FLAG = "xla_force_host_platform_device_count"
 # A Python thread that starts computations on several devices faster than they end, 32 on each, holds a thread of the
 # pool for each device until one ends. XLA makes a thread for each core, and where all are held, the part of an
@@ -54,8 +59,8 @@ def setup() -> None:
     devices in JAX's configuration, PJRT_NPROC.
 
     Side effects on other code in the process: a user's own JAX loop over large element-wise arrays is compiled for one
-    thread too, and all is optimised to LLVM's second level, of three. `PATHJAX_NATIVE_LOOPS=0` in the environment opts
-    out; pathjax still works, slowly.
+    thread too, and all is optimised to LLVM's second level, of three, without unrolling, and emitted without MLIR.
+    `PATHJAX_NATIVE_LOOPS=0` in the environment opts out; pathjax still works, slowly.
 
     Warns:
         UserWarning: the backend was started before, with the remedy.
@@ -65,9 +70,9 @@ def setup() -> None:
     wanted = native and _OPTION not in flags
     if wanted:
         width = "" if _WIDTH_OPTION in flags else _WIDTH_FLAG
-        level = "" if _LEVEL_OPTION in flags else _LEVEL_FLAG
+        quick = [flag for option, flag in _QUICK_FLAGS.items() if option not in flags]
         patience = "" if _PATIENCE_OPTION in flags else _PATIENCE_FLAGS
-        os.environ["XLA_FLAGS"] = " ".join(filter(None, (flags, _FLAG, width, level, patience)))
+        os.environ["XLA_FLAGS"] = " ".join(filter(None, (flags, _FLAG, width, *quick, patience)))
     devices_chosen = _DEVICE_FLAG in flags or jax.config.jax_num_cpu_devices >= 0
     devices = max(cores(), jax.config.jax_num_cpu_devices, *map(int, re.findall(rf"{_DEVICE_FLAG}=(\d+)", flags)))
     os.environ.setdefault(_POOL_VARIABLE, str(_POOL_OF_A_DEVICE * devices))
