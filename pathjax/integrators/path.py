@@ -112,7 +112,7 @@ def meet(scene: Scene, path: Path, u: Bounce, options: Options) -> tuple[Hit, Ve
     """What the ray of a path meets, None in a scene without shapes; and u as it was."""
     ray = path.ray
     if scene.scatters:
-        distance = media.distance(scene.media, path.medium, path.throughput, u.flight)
+        distance = media.distance(scene.media, path.medium, ray, path.throughput, u.flight)
         distance, u = compute_once((distance, u))
         hit = geometry.closest_hit(scene.geometry, ray._replace(t_max=smaller(distance, ray.t_max)))
         here = within(vertex(scene, ray, hit, u.leaf, options.derivative), ray, path.medium, distance)
@@ -139,7 +139,7 @@ def onward(
     ray, first = path.ray, path.depth == 0
     if scene.media is not None:
         flown, scattered = smaller(hit.t, ray.t_max), here.scattered if scene.scatters else None
-        weight = media.flight_weight(scene.media, path.medium, path.throughput, flown, scattered)
+        weight = media.flight_weight(scene.media, path.medium, ray, path.throughput, flown, scattered)
         path = path._replace(throughput=path.throughput * weight)
     light = sky = None
     if here is not None and next_event.draws_background(scene, choice, options):

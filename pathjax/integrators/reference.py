@@ -102,7 +102,7 @@ def meet(
     """The particle or the surface that comes first, and the weight of the way there."""
     distance = jnp.full_like(ray.t_max, jnp.inf)
     if scene.scatters:
-        distance = media.distance(scene.media, medium, throughput, u.flight)
+        distance = media.distance(scene.media, medium, ray, throughput, u.flight)
     hit = geometry.closest_hit(scene.geometry, ray._replace(t_max=jnp.minimum(distance, ray.t_max)))
     here = vertex(scene, ray, hit, u.leaf)
     if scene.scatters:
@@ -110,7 +110,7 @@ def meet(
     if medium is None:
         return here, jnp.ones_like(throughput)
     way, scattered = jnp.minimum(here.hit.t, ray.t_max), here.scattered if scene.scatters else None
-    return here, media.flight_weight(scene.media, medium, throughput, way, scattered)
+    return here, media.flight_weight(scene.media, medium, ray, throughput, way, scattered)
 
 
 def share(pdf: Float[Array, ""], other_pdf: Float[Array, ""]) -> Float[Array, ""]:

@@ -55,12 +55,12 @@ def transmitted(
         medium: in which the ray starts; None in scenes without media.
     """
 
-    def dimmed(medium, share, distance):
-        return share if medium is None else share * media.transmittance(scene.media, medium, distance)
+    def dimmed(medium, share, ray, distance):
+        return share if medium is None else share * media.transmittance(scene.media, medium, ray, distance)
 
     if not bsdfs.occurs(scene.materials, "passes"):
         visible = (ray.t_max >= 0) & ~geometry.occluded(scene.geometry, ray, target)
-        return dimmed(medium, visible.astype(ray.t_max.dtype), larger(ray.t_max, 0)), jnp.int32(0), None
+        return dimmed(medium, visible.astype(ray.t_max.dtype), ray, larger(ray.t_max, 0)), jnp.int32(0), None
     # A line meets no primitive more than twice: rounding that found one again and again comes to an end.
     ever = jnp.int32(2 * scene.geometry.shape.shape[0])
     most = ever if scene.free_passes else jnp.minimum(most, ever)
@@ -81,7 +81,7 @@ def transmitted(
         free = bsdfs.passing(scene.materials, hit.shape, surface, front, nudges)
         through = jnp.where(way.passes < most, free, 0)
         share = jnp.where(arrives, way.share, way.share * through)
-        share = dimmed(way.medium, share, smaller(hit.t, way.ray.t_max))
+        share = dimmed(way.medium, share, way.ray, smaller(hit.t, way.ray.t_max))
         within = way.medium
         if within is not None:
             within = media.beyond(scene.media, within, hit.shape, surface.n, way.ray.d)

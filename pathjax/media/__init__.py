@@ -6,7 +6,8 @@ one of three colours, chosen by chance in proportion to what the path still carr
 mixture, so no colour's weight grows beyond the inverse of its chance (the balance heuristic of Veach 1997, as in Wilkie
 et al. 2014, "Hero wavelength spectral sampling"). Distances and densities are detached: weights carry the derivatives.
 
-Of media that only absorb nothing is drawn, and no scattering is compiled.
+Of media that only absorb nothing is drawn, and no scattering is compiled. The albedo may vary in space, and so may the
+extinction of what is heterogeneous, each by a grid: see `grids`.
 """
 
 from __future__ import annotations
@@ -20,19 +21,37 @@ from jaxtyping import Array, Bool, Float, Int
 
 from pathjax.compile import register_dataclass
 from pathjax.core.math import at, dot, safe_divide
-from pathjax.core.types import BSDFSample
+from pathjax.core.types import BSDFSample, Ray
 from pathjax.kinds import Instance, Parameters, Row, Table, ordered
 from pathjax.kinds import register as register_kind
+from pathjax.media import grids
+from pathjax.media.grids import Grids
+from pathjax.media.gridvolume import GridVolume
 from pathjax.media.hg import HG
-from pathjax.media.homogeneous import VOLUMES, Homogeneous
+from pathjax.media.homogeneous import VOLUMES, Heterogeneous, Homogeneous
 from pathjax.media.isotropic import Isotropic
 from pathjax.media.phase import Phase
+from pathjax.media.rayleigh import Rayleigh
 
-__all__ = ["HG", "KINDS", "PHASES", "VOLUMES", "Homogeneous", "Isotropic", "Media", "Phase", "register"]
+__all__ = [
+    "HG",
+    "KINDS",
+    "PHASES",
+    "VOLUMES",
+    "GridVolume",
+    "Grids",
+    "Heterogeneous",
+    "Homogeneous",
+    "Isotropic",
+    "Media",
+    "Phase",
+    "Rayleigh",
+    "register",
+]
 
 # By the name that scene files give them.
-KINDS = {"homogeneous": Homogeneous}
-PHASES: dict[str, type[Phase]] = {"isotropic": Isotropic, "hg": HG}
+KINDS = {"homogeneous": Homogeneous, "heterogeneous": Heterogeneous}
+PHASES: dict[str, type[Phase]] = {"isotropic": Isotropic, "hg": HG, "rayleigh": Rayleigh}
 # In the place of a row: no medium; and of shapes that say nothing, which leave paths in the medium that they are in.
 NONE, SAME = -1, -2
 # Least probability of each colour: what the path carries nothing of may have a derivative.
@@ -47,11 +66,14 @@ def register(name: str):
 @register_dataclass
 @dataclass(frozen=True)
 class Media:
-    table: Table  # of what is homogeneous; without albedo where nothing scatters
+    table: Table  # of all media, whatever their kind; without albedo where nothing scatters
     phases: tuple[Table, ...]  # one for each kind of phase function present
     phase: Int[Array, "R 2"]  # of each medium: kind and row of its phase function
     sides: Int[Array, "S 2"]  # of each shape: rows of the media inside and outside, or NONE, or SAME twice
     camera: Int[Array, ""]  # row of the medium in which paths begin, or NONE
+    # What the extinctions and albedos of the table are multiplied by; None: none varies in space.
+    extinctions: Grids | None = None
+    albedos: Grids | None = None
 
     @property
     def scatters(self) -> bool:
@@ -75,9 +97,10 @@ def build(
     if not present:
         return None
     number = {each: row for row, each in enumerate(present)} | {None: NONE}
-    scatters = any(np.any(each.values["albedo"]) for each in present)
+    scatters = any(np.any(_numbers(each.values["albedo"])) for each in present)
     rows = present if scatters else [_absorbing(each, parameters) for each in present]
-    table = Homogeneous.build(rows, dtype, (*path, "table"), parameters, None)
+    table = Homogeneous.build([_constant(each) for each in rows], dtype, (*path, "table"), parameters, None)
+    extinctions, albedos = (_grids(rows, key, dtype, parameters) for key in ("sigma_t", "albedo"))
     phases, code = [], {}
     if scatters:
         for kind, instances in ordered(dict.fromkeys(each.values["phase"] for each in present), PHASES).items():
@@ -86,7 +109,28 @@ def build(
     phase = [code.get(each.values["phase"], (NONE, NONE)) for each in present]
     rows = [(SAME, SAME) if pair == (None, None) else tuple(number[each] for each in pair) for pair in sides]
     sides = np.asarray(rows, np.int32).reshape(-1, 2)
-    return Media(table, tuple(phases), np.asarray(phase, np.int32), sides, np.int32(number[camera]))
+    phase, camera = np.asarray(phase, np.int32), np.int32(number[camera])
+    return Media(table, tuple(phases), phase, sides, camera, extinctions, albedos)
+
+
+def _numbers(value: object) -> object:
+    return value.data if isinstance(value, GridVolume) else value
+
+
+def _constant(medium: Instance) -> Instance:
+    """The same with ones in the place of grids, which multiply them."""
+    values = {key: np.ones(3) if isinstance(value, GridVolume) else value for key, value in medium.values.items()}
+    return Instance(medium.kind, medium.name, values)
+
+
+def _grids(rows: list[Instance], key: str, dtype, parameters: Parameters) -> Grids | None:
+    """Of what of media is grids; no parameter stands in its place. None: nothing is."""
+    values = {each: each.values[key] for each in rows if isinstance(each.values[key], GridVolume)}
+    for each in values:
+        name = f"{each.name}.{key}"
+        parameters.known.pop(name, None)
+        parameters.refused[name] = f"{name} is a grid, whose values are no parameters"
+    return grids.build([values.get(each) for each in rows], dtype) if values else None
 
 
 def _absorbing(medium: Instance, parameters: Parameters) -> Instance:
@@ -102,7 +146,9 @@ def names(media: Media) -> list[str]:
     """What scene files call the kinds that are present, as `info` tells them."""
     known = {kind: name for name, kind in (KINDS | PHASES).items()}
     present = [media.table.kind, *(table.kind for table in media.phases)]
-    return [known[kind] for kind in present] + ([] if media.scatters else ["absorption alone"])
+    more = [] if media.extinctions is None and media.albedos is None else ["grids"]
+    more += [] if media.scatters else ["absorption alone"]
+    return [known[kind] for kind in present] + more
 
 
 # ---- at a vertex ----------------------------------------------------------------------------------------------------
@@ -121,9 +167,9 @@ def beyond(
 
 
 def distance(
-    media: Media, medium: Int[Array, ""], throughput: Float[Array, "3"], u: Float[Array, "2"]
+    media: Media, medium: Int[Array, ""], ray: Ray, throughput: Float[Array, "3"], u: Float[Array, "2"]
 ) -> Float[Array, ""]:
-    """Draw how far light goes until it meets a particle, detached; inf where there is none.
+    """Draw how far light goes along a ray until it meets a particle, detached; inf where there is none.
 
     u: uniform in (0, 1).
     """
@@ -131,40 +177,70 @@ def distance(
     red, green = u[0] < chances[0], u[0] < chances[0] + chances[1]
     of_colour = lax.stop_gradient(jnp.where(red, sigma[0], jnp.where(green, sigma[1], sigma[2])))
     some = of_colour > 0
-    return jnp.where(some, -jnp.log1p(-u[1]) / jnp.where(some, of_colour, 1), jnp.inf)
+    # In units of the values of a grid; else it is the distance.
+    wanted = jnp.where(some, -jnp.log1p(-u[1]) / jnp.where(some, of_colour, 1), jnp.inf)
+    if media.extinctions is None:
+        return wanted
+    values, ray = lax.stop_gradient((media.extinctions, ray))
+    channel = jnp.where(red, 0, jnp.where(green, 1, 2))
+    return _in_grid(values, medium, lambda grid: grids.reach(values, grid, ray, channel, wanted), lambda: wanted)
 
 
 def flight_weight(
     media: Media,
     medium: Int[Array, ""],
+    ray: Ray,
     throughput: Float[Array, "3"],
     distance: Float[Array, ""],
     scatters: Bool[Array, ""] | None,
 ) -> Float[Array, "3"]:
-    """What a path carries of its throughput over a distance, to a surface, or to where it is scattered.
+    """What a path carries of its throughput along a ray over a distance, to a surface, or to where it is scattered.
 
     scatters: whether it ends in the medium, at a distance that `distance` drew; None: nothing scatters.
     """
-    passed = transmittance(media, medium, distance)
+    passed = transmittance(media, medium, ray, distance)
     if scatters is None:
         return passed
+
+    def at_end(number, values):
+        if values is None:
+            return number
+        p = ray.o + jnp.where(scatters, distance, 0) * ray.d
+        one = jnp.ones_like(p)
+        return number * _in_grid(values, medium, lambda grid: one * grids.look_up(values, grid, p), lambda: one)
+
+    sigma = at_end(extinction(media, medium), media.extinctions)
     # Of each colour, the density with which it would have had the light end here, or go on further than this.
-    density = jnp.where(scatters, extinction(media, medium), 1) * passed
+    density = jnp.where(scatters, sigma, 1) * passed
     drawn = lax.stop_gradient(dot(_chances(throughput), density))
-    albedo = Row(media.table, jnp.maximum(medium, 0)).albedo
+    albedo = at_end(Row(media.table, jnp.maximum(medium, 0)).albedo, media.albedos)
     return jnp.where(scatters, albedo, 1) * safe_divide(density, drawn)
 
 
-def transmittance(media: Media, medium: Int[Array, ""], distance: Float[Array, ""]) -> Float[Array, "3"]:
+def transmittance(media: Media, medium: Int[Array, ""], ray: Ray, distance: Float[Array, ""]) -> Float[Array, "3"]:
     """Share of the light that comes through; of an endless way, which has no derivative, all or nothing."""
-    sigma, ends = extinction(media, medium), distance < jnp.inf
-    return jnp.where(ends, jnp.exp(-sigma * jnp.where(ends, distance, 0)), jnp.where(sigma > 0, 0, 1))
+    sigma = extinction(media, medium)
+
+    def through():
+        ends = distance < jnp.inf
+        return jnp.where(ends, jnp.exp(-sigma * jnp.where(ends, distance, 0)), jnp.where(sigma > 0, 0, 1))
+
+    values = media.extinctions
+    if values is None:
+        return through()
+    return _in_grid(values, medium, lambda grid: jnp.exp(-sigma * grids.depth(values, grid, ray, distance)), through)
 
 
 def extinction(media: Media, medium: Int[Array, ""]) -> Float[Array, "3"]:
-    """1 over the unit of length; 0 without medium."""
+    """1 over the unit of length, 0 without medium; of what is a grid, what its values are multiplied by."""
     p = Row(media.table, jnp.maximum(medium, 0))
     return jnp.where(medium >= 0, p.sigma_t * p.scale, 0)
+
+
+def _in_grid(values, medium, of_grid, otherwise):
+    """What a function finds of the grid of a medium, or what stands for it where it has none."""
+    grid = jnp.where(medium >= 0, at(values.of, jnp.maximum(medium, 0)), NONE)
+    return lax.cond(grid >= 0, lambda: of_grid(jnp.maximum(grid, 0)), otherwise)
 
 
 def _chances(throughput):
@@ -175,9 +251,7 @@ def _chances(throughput):
     return LEAST + (1 - 3 * LEAST) * share
 
 
-def evaluate(
-    media: Media, medium: Int[Array, ""], wo: Float[Array, "3"]
-) -> tuple[Float[Array, "3"], Float[Array, ""]]:
+def evaluate(media: Media, medium: Int[Array, ""], wo: Float[Array, "3"]) -> tuple[Float[Array, "3"], Float[Array, ""]]:
     """The phase function, as a bsdf is evaluated, and its density."""
     f = _of_phase(media, medium, lambda kind, p: kind.evaluate(p, wo))
     return jnp.broadcast_to(f, wo.shape), lax.stop_gradient(f)

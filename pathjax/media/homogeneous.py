@@ -1,15 +1,16 @@
-"""A medium that is the same everywhere."""
+"""Media: what is the same everywhere, and what grids of volumes say otherwise of."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import ClassVar
 
 import numpy as np
 
 from pathjax.kinds import Color, Instance, Kind, Number, Unused
+from pathjax.media.gridvolume import GridVolume, boxed
 from pathjax.media.isotropic import Isotropic
 
 EVEN = Isotropic.instance("isotropic")
@@ -26,7 +27,7 @@ class ConstVolume:
 
 
 # By the name that scene files give them.
-VOLUMES = {"constvolume": ConstVolume}
+VOLUMES = {"constvolume": ConstVolume, "gridvolume": GridVolume}
 
 
 @dataclass(frozen=True)
@@ -34,16 +35,38 @@ class VolumeColor(Color):
     """A colour; in files a volume may stand in its place."""
 
     textured: bool = False
+    kinds: Mapping[str, type] = field(default_factory=lambda: VOLUMES)
 
     def read(self, loader, fields, name, owner):
         element = fields.texture(name, "volume")
         if element is not None:
-            return loader.make(element, VOLUMES, self.bounds[1])
+            return loader.make(element, self.kinds, self.bounds[1])
         return super().read(loader, fields, name, owner)
 
 
+class BoxedVolume:
+    """A constant volume as what it is the same in: the unit cube, which `to_world` places."""
+
+    unused: ClassVar[Mapping[str, Unused]] = {}
+
+    @classmethod
+    def read(cls, loader, fields, high: float) -> GridVolume:
+        return boxed(ConstVolume.read(loader, fields, high), fields.transform("to_world"))
+
+
+@dataclass(frozen=True)
+class BoxedColor(VolumeColor):
+    """A volume that ends with its box; a colour fills the unit cube, as in Mitsuba."""
+
+    kinds: Mapping[str, type] = field(default_factory=lambda: VOLUMES | {"constvolume": BoxedVolume})
+
+    def read(self, loader, fields, name, owner):
+        made = super().read(loader, fields, name, owner)
+        return made if isinstance(made, GridVolume) else boxed(made, np.eye(4))
+
+
 class Homogeneous(Kind):
-    """Absorbs and scatters alike in all places and directions.
+    """Absorbs alike in all places and directions, and scatters what `albedo` says, which may be a grid.
 
     sigma_t times `scale` is the extinction: how much of the light each unit of length takes out of a ray. The share
     `albedo` of it is scattered, the rest absorbed. It emits nothing. Distances are drawn by the extinction, detached,
@@ -52,7 +75,7 @@ class Homogeneous(Kind):
     An `Instance` holds the phase function under "phase".
     """
 
-    sigma_t = VolumeColor(1.0, bounds=(0, math.inf))
+    sigma_t = VolumeColor(1.0, bounds=(0, math.inf), kinds={"constvolume": ConstVolume})
     albedo = VolumeColor(0.75)
     scale = Number(1.0, bounds=(0, math.inf))
     unused: ClassVar[Mapping[str, Unused]] = {
@@ -62,7 +85,8 @@ class Homogeneous(Kind):
     @classmethod
     def read(cls, loader, fields, name):
         made, phases = super().read(loader, fields, name), fields.objects("phase")
-        grey = np.ptp(made.values["sigma_t"]) == 0
+        extinction = made.values["sigma_t"]
+        grey = np.ptp(extinction.data if isinstance(extinction, GridVolume) else extinction, -1).max() == 0
         if not fields.boolean("has_spectral_extinction", True) and not grey:
             raise fields.error("has_spectral_extinction", "is false, but sigma_t has a colour; leave it out")
         return cls.scattering(made, loader.shared(phases[0], name) if phases else EVEN)
@@ -71,3 +95,9 @@ class Homogeneous(Kind):
     def scattering(made: Instance, phase: Instance) -> Instance:
         """The medium with a phase function."""
         return Instance(made.kind, made.name, {**made.values, "phase": phase})
+
+
+class Heterogeneous(Homogeneous):
+    """The same, whose extinction is that of a volume, beyond whose box there is nothing."""
+
+    sigma_t = BoxedColor(1.0, bounds=(0, math.inf))

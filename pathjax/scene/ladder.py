@@ -51,7 +51,9 @@ def padded(scene: Scene) -> Scene:
     if media is not None:
         phases = tuple(map(_kind, media.phases))
         phase, sides = (_rows(values, _few(len(values))) for values in (media.phase, media.sides))
-        media = replace(media, table=_kind(media.table), phases=phases, phase=phase, sides=sides)
+        varying = {"extinctions": media.extinctions, "albedos": media.albedos}
+        varying = {key: x and replace(x, of=_rows(x.of, _few(len(x.of)))) for key, x in varying.items()}
+        media = replace(media, table=_kind(media.table), phases=phases, phase=phase, sides=sides, **varying)
     lit, emitters = _emitters(scene.emitters, np.asarray(scene.geometry.light))
     geometry = _geometry(replace(scene.geometry, light=lit))
     scene = replace(scene, geometry=geometry, materials=materials, media=media, emitters=emitters)

@@ -12,6 +12,7 @@ import pytest
 import pathjax as pj
 from pathjax.cli import main
 from pathjax.errors import InputError
+from pathjax.media.gridvolume import write_vol
 
 MOST_LINES = 150
 LINK = re.compile(r"\[[^]]*\]\(([^)]+)\)")
@@ -93,6 +94,7 @@ NEEDS = {
     "thinlens": [f'<float name="aperture_radius" value="1"/>{fov}' for fov in ("", '<float name="fov" value="40"/>')],
     "instance": ['<shape type="shapegroup"/>'],
     **dict.fromkeys(("uniform", "constvolume"), ['<float name="value" value="1"/>']),
+    "gridvolume": ['<string name="filename" value="grid.vol"/>'],
     "mesh_attribute": ['<string name="name" value="vertex_color"/>'],
     **dict.fromkeys(("bitmap", "envmap"), ['<string name="filename" value="marks.png"/>']),
     **dict.fromkeys(("twosided", "mask"), ['<bsdf type="diffuse"/>']),
@@ -116,6 +118,7 @@ def refusal(root, tmp_path_factory):
     folder = tmp_path_factory.mktemp("kinds")
     (folder / "marks.png").write_bytes((root / "tests" / "scenes" / "textures" / "marks.png").read_bytes())
     (folder / "mesh.serialized").write_bytes(SERIALIZED)
+    write_vol(folder / "grid.vol", np.ones((1, 1, 1, 1)))
     for kind in MESHES[:-1]:
         mesh = trimesh.creation.box()
         if kind == "gltf":

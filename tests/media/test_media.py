@@ -9,8 +9,10 @@ import pytest
 
 import pathjax as pj
 from pathjax import media
+from pathjax.core.types import Ray
 
 NULL = {"type": "null"}
+RAY = Ray(jnp.zeros(3), jnp.array([0.0, 0.0, 1.0]), jnp.float32(jnp.inf), jnp.int32(-1))
 slow = pytest.mark.slow
 
 
@@ -212,8 +214,8 @@ def test_weights_of_a_flight_average_to_1():
     u = jnp.asarray(np.random.default_rng(1).random((200_000, 2)), jnp.float32)
 
     def weight(u):
-        t = media.distance(made, jnp.int32(0), throughput, u)
-        return media.flight_weight(made, jnp.int32(0), throughput, jnp.minimum(t, surface), t < surface)
+        t = media.distance(made, jnp.int32(0), RAY, throughput, u)
+        return media.flight_weight(made, jnp.int32(0), RAY, throughput, jnp.minimum(t, surface), t < surface)
 
     weights = np.asarray(jax.jit(jax.vmap(weight))(u), float)
     error = weights.std(0) / np.sqrt(len(u))

@@ -78,9 +78,9 @@ def test_older_files_name_the_extinction_in_their_way(tmp_path):
         (ball(medium='<float name="sigma_t" value="-1"/>'), '"sigma_t" of .* must not be negative'),
         (ball(medium='<float name="scale" value="-1"/>'), '"scale" of .* must be at least 0'),
         (ball(medium='<phase type="hg"><float name="g" value="1"/></phase>'), '"g" of .*must be above -1 and below 1'),
-        (ball(medium='<phase type="rayleigh"/>'), "rayleigh.*not supported yet; use one of isotropic"),
+        (ball(medium='<phase type="sggx"/>'), "sggx.*not supported yet; use one of isotropic"),
         (ball(medium='<phase type="isotropc"/>'), 'did you mean "isotropic"'),
-        (ball(medium='<volume name="albedo" type="gridvolume"/>'), "gridvolume.*not supported yet; use one of const"),
+        (ball(medium='<volume name="albedo" type="gridvolume"/>'), 'needs <string name="filename"'),
         (ball(medium='<rgb name="sigma_s" value="1, 1, 1"/>'), "sigma_s.* is not a parameter of .*homogeneous"),
         (
             ball(medium='<rgb name="sigma_t" value="1, 2, 3"/><boolean name="has_spectral_extinction" value="false"/>'),
@@ -88,7 +88,7 @@ def test_older_files_name_the_extinction_in_their_way(tmp_path):
         ),
         ('<shape type="sphere"><ref name="interior" id="smoke"/></shape>' + FOG, "there is no such id"),
         ('<shape type="sphere"><ref id="fog"/></shape>' + FOG, 'takes one <medium name="interior"> and one'),
-        (ball() .replace("homogeneous", "heterogeneous"), "heterogeneous.*not supported yet; use one of homogeneous"),
+        (ball().replace("homogeneous", "hetero"), "hetero.*not supported; use one of homogeneous"),
         (ball(inside='<bsdf type="diffuse"><volume name="reflectance" type="constvolume"/></bsdf>'), "be a <volume>"),
     ],
 )  # fmt: skip

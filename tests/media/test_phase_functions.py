@@ -68,14 +68,18 @@ class Rayleigh(media.Phase):
 
 @pytest.fixture
 def rayleigh():
-    media.register("rayleigh")(Rayleigh)
+    media.register("own")(Rayleigh)
     yield
-    del media.PHASES["rayleigh"]
+    del media.PHASES["own"]
+
+
+def test_rayleigh_is_drawn_by_its_density():
+    testing.check_phase(media.Rayleigh, samples=50_000)
 
 
 def test_a_registered_phase_function_is_read_from_scenes(rayleigh):
     testing.check_phase(Rayleigh, samples=50_000)
-    fog = {"type": "homogeneous", "phase": {"type": "rayleigh"}}
+    fog = {"type": "homogeneous", "phase": {"type": "own"}}
     ball = {"type": "sphere", "bsdf": {"type": "null"}, "interior": fog}
     sensor = {"type": "perspective", "film": {"type": "hdrfilm", "width": 2, "height": 2}}
     rest = {"integrator": {"type": "volpath"}, "sky": {"type": "constant"}}

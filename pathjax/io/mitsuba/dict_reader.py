@@ -132,7 +132,7 @@ class _Reader:
             return _element("point", key, place, _text(array))
         if array.ndim == 1:
             raise InputError(f"{place}: must be one number or three, has {len(array)}")
-        name = "data" if key == "bitmap" else key  # the same, where Mitsuba takes one of its bitmaps
+        name = "data" if key in ("bitmap", "grid") else key  # the same, where Mitsuba takes one of its own objects
         return Element("array", {"name": name}, place, 0, data=array)
 
     def object(self, key: str, value: Mapping, place: str, top: bool) -> Element:

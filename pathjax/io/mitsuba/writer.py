@@ -28,6 +28,7 @@ from pathjax.io.mitsuba import dict_reader
 from pathjax.io.mitsuba.loader import read_again
 from pathjax.io.mitsuba.plugins import PLUGINS
 from pathjax.kinds import Instance
+from pathjax.media.gridvolume import write_vol
 from pathjax.system.files import check_writable, write_text
 
 
@@ -177,6 +178,10 @@ class _Writer:
             return child
         if child.attributes["name"] != "data":
             raise child.error(f"{child} of {parent}: no scene file holds such an array")
+        if parent.tag == "volume":
+            file = self.file(name, ".vol")
+            self.files[file] = lambda: write_vol(file, self.made[parent].data)
+            return Element("string", {"name": "filename", "value": file.name}, child.file, child.line)
         data = np.atleast_3d(child.data)
         data = np.broadcast_to(data, (*data.shape[:2], 3))
         if data.dtype == np.uint16:

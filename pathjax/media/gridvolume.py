@@ -1,0 +1,103 @@
+"""Volumes whose values stand in a grid: what scene files and `.vol` files say of them."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+
+from pathjax.errors import InputError
+from pathjax.kinds import Unused
+from pathjax.system.files import write_whole
+
+_HEADER = struct.Struct("<3sB5i6f")  # "VOL", version, encoding, x, y, z, channels, the corners of the box
+_VERSION, _FLOAT32 = 3, 1
+
+
+@dataclass(frozen=True, eq=False)
+class GridVolume:
+    """Values at the centres of the cells of a box, and between them the trilinear interpolation.
+
+    Beyond the outermost centres they stay the same.
+    """
+
+    data: np.ndarray  # (Z, Y, X, C), C being 1 or 3
+    to_grid: np.ndarray  # (3, 4), from world space to where the centre of cell i lies at i; x, y, z
+    box: np.ndarray  # (2, 3) lower and upper corner in world space of the box around it, beyond which nothing is
+
+    unused: ClassVar[Mapping[str, Unused]] = {
+        "accel": Unused("boolean"),
+        "max_value": Unused("float", "it bounds Mitsuba's steps", at_least=0),
+        "raw": Unused("boolean", "its colours are linear RGB"),
+        "wrap_mode": Unused("string", "beyond the grid its outermost values count", choices=("clamp", "mirror")),
+        "filter_type": Unused("string", "values are interpolated", choices=("trilinear",)),
+    }
+
+    @classmethod
+    def read(cls, loader, fields, high: float) -> GridVolume:
+        data, box = fields.array("data", None), np.array([[0.0] * 3, [1.0] * 3])
+        if data is None:
+            path = loader.find(fields, "filename")
+            data, of_file = read_vol(path)
+            if fields.boolean("use_grid_bbox", False):
+                box = of_file
+        else:
+            path = fields.element.place
+            data = np.asarray(data, np.float64)
+            data = data[..., None] if data.ndim == 3 else data
+            if data.ndim != 4 or data.shape[3] not in (1, 3) or not data.size:
+                raise fields.error("data", f"must have the shape (Z, Y, X) or (Z, Y, X, 1 or 3), has {data.shape}")
+        if not ((data >= 0) & (data <= high)).all():  # also where one is NaN
+            what = "not be negative" if high == np.inf else f"lie between 0 and {high:g}"
+            raise fields.element.error(f"{path}: its values must {what}, and are {data.min():g} to {data.max():g}")
+        return cls(data, *_placed(fields.transform("to_world"), box, data.shape[2::-1]))
+
+
+def boxed(value: np.ndarray, to_world: np.ndarray) -> GridVolume:
+    """One value (3,) in a unit cube that a (4, 4) places."""
+    data = np.reshape(value, (1, 1, 1, 3))
+    return GridVolume(data, *_placed(to_world, np.array([[0.0] * 3, [1.0] * 3]), (1, 1, 1)))
+
+
+def _placed(to_world: np.ndarray, box: np.ndarray, size: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """`to_grid` and `box` of a grid of cells x, y, z that fills a box of its own space."""
+    extent = box[1] - box[0]
+    to_cells = np.diag([*(np.array(size) / extent), 1.0])
+    to_cells[:3, 3] = -box[0] * np.array(size) / extent - 0.5
+    corners = np.stack(np.meshgrid(*box.T, indexing="ij"), -1).reshape(-1, 3) @ to_world[:3, :3].T + to_world[:3, 3]
+    return (to_cells @ np.linalg.inv(to_world))[:3], np.stack([corners.min(0), corners.max(0)])
+
+
+def read_vol(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Values (Z, Y, X, C) and the box (2, 3) of a file of Mitsuba's own format.
+
+    Raises:
+        InputError: it cannot be read, is of another format, or is cut off.
+    """
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
+    if len(content) < _HEADER.size or content[:3] != b"VOL" or content[3] != _VERSION:
+        raise InputError(f"{path}: not a volume of Mitsuba's format, version {_VERSION}")
+    _, _, encoding, x, y, z, channels, *box = _HEADER.unpack_from(content)
+    if encoding != _FLOAT32 or channels not in (1, 3):
+        raise InputError(f"{path}: has encoding {encoding} and {channels} channels; use float32, and 1 or 3 channels")
+    if min(x, y, z) < 1 or len(content) - _HEADER.size < 4 * x * y * z * channels:
+        raise InputError(f"{path}: cut off: {x} x {y} x {z} cells are announced")
+    data = np.frombuffer(content, "<f4", x * y * z * channels, _HEADER.size)
+    box = np.reshape(box, (2, 3))
+    if not (np.isfinite(box).all() and (box[1] > box[0]).all()):
+        raise InputError(f"{path}: its box is empty")
+    return data.reshape(z, y, x, channels).astype(np.float64), box
+
+
+def write_vol(path: Path, data: np.ndarray) -> None:
+    """Write values (Z, Y, X, C), in the unit cube, as float32."""
+    z, y, x, channels = data.shape
+    header = _HEADER.pack(b"VOL", _VERSION, _FLOAT32, x, y, z, channels, 0, 0, 0, 1, 1, 1)
+    write_whole(path, lambda file: file.write(header + data.astype("<f4").tobytes()))
