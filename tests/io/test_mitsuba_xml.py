@@ -713,6 +713,19 @@ def test_films_and_samplers_may_be_referred_to(read):
     assert any('<film type="hdrfilm"> is used by nothing' in note for note in read('<film type="hdrfilm"/>').notes)
 
 
+def test_what_is_no_xml_to_the_letter_is_read_as_mitsuba_does(tmp_path):
+    """Comments with -- and bytes of other encodings, a declaration after an empty line, a bare ampersand."""
+    inside = (
+        '<!-- ---- a\n-- b -- --><bsdf type="diffuse" id="a &amp; b & c"/><!-- \xe9 --><shape type="cube" wrong=""/>'
+    )
+    text = f'\n<?xml version="1.0"?>\n<scene version="3.0.0">{SENSOR}{inside}</scene>'
+    (tmp_path / "scene.xml").write_bytes(text.encode("latin-1"))
+    with pytest.raises(InputError, match=r'scene\.xml:4: <shape type="cube"> has no attribute "wrong"'):
+        load(tmp_path / "scene.xml")
+    (tmp_path / "scene.xml").write_bytes(text.replace('wrong=""', "").encode("latin-1"))
+    assert "a & b & c" in load(tmp_path / "scene.xml").document.ids
+
+
 def test_text_between_elements_is_noted_at_its_line(read):
     notes = read(f"{shape()}>\n{shape()} word").notes
     assert [note[note.index("scene.xml") :] for note in notes if "text between" in note] == [

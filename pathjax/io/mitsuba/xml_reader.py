@@ -24,6 +24,8 @@ MAX_FILES = 1_000
 MAX_VALUE = 10_000
 
 REFERENCE = re.compile(r"\$(\w+)")
+_DECLARATION = re.compile(rb"\s*<\?xml\b[^>]*\?>")
+_AMPERSAND = re.compile(rb"&(?!#?\w{1,8};)")
 
 
 def read(path: str | Path, parameters: Mapping[str, object]) -> Document:
@@ -144,7 +146,7 @@ class _Reader:
 
 
 def _parse(path: Path, shown: str, notes: list[str]) -> Element:
-    data = _read_bytes(path, shown)
+    data = _well_formed(_read_bytes(path, shown))
     parser = expat.ParserCreate()
     stack: list[Element] = []
     roots: list[Element] = []
@@ -178,6 +180,20 @@ def _parse(path: Path, shown: str, notes: list[str]) -> Element:
     except (ValueError, LookupError) as error:  # an encoding that Python does not know
         raise InputError(f"{shown}:1: cannot be decoded: {error}") from None
     return roots[0]
+
+
+def _well_formed(data: bytes) -> bytes:
+    """What is XML to the letter, where Mitsuba's parser is lenient: with `--` and any bytes in comments, white space
+    before the declaration, and & for itself. Lines stay where they are.
+    """
+    parts, end = [], 0
+    while (start := data.find(b"<!--", end)) >= 0 and (close := data.find(b"-->", start + 4)) >= 0:
+        parts += [data[end:start], b"\n" * data.count(b"\n", start, close)]
+        end = close + 3
+    data = b"".join([*parts, data[end:]])
+    if data[:1].isspace() and (declared := _DECLARATION.match(data)):
+        data = b"\n" * data.count(b"\n", 0, declared.end()) + data[declared.end() :]
+    return _AMPERSAND.sub(b"&amp;", data)
 
 
 def _read_bytes(path: Path, shown: str) -> bytes:
