@@ -348,3 +348,14 @@ def test_mutated_dictionaries_load_or_are_refused(made):
 
 def test_the_unchanged_dictionary_loads():
     assert len(load_dict(RICH).shapes) == 3
+
+
+def test_points_and_colours_of_mitsuba_are_taken():
+    """Whose points have an attribute `matrix` too, which is no matrix."""
+    mi = pytest.importorskip("mitsuba")
+    mi.set_variant("scalar_rgb")
+    bsdf = {"type": "diffuse", "reflectance": mi.ScalarColor3f(0.1, 0.2, 0.3)}
+    ball = {"type": "sphere", "id": "ball", "center": mi.ScalarPoint3f(1, 2, 3), "bsdf": bsdf}
+    made = pj.load_dict({"type": "scene", "camera": {"type": "perspective"}, "ball": ball, "sky": {"type": "constant"}})
+    np.testing.assert_allclose(made.about.description.shapes[0].geometry.center, [1, 2, 3])
+    np.testing.assert_allclose(pj.parameters(made)["ball.reflectance"], [0.1, 0.2, 0.3])

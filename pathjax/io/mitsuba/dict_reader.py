@@ -25,6 +25,7 @@ from pathjax.sensors import film, filters
 
 VERSION = "3.0.0"
 SPECTRA = (*TYPED, "blackbody", "regular", "irregular")
+_MATRICES = ((3, 3), (4, 4))
 VALUE_TYPES = ("rgb", "spectrum", "ref", "resources")
 
 
@@ -112,8 +113,10 @@ class _Reader:
             return self.object(key, value, place, top)
         if hasattr(value, "vertices") and hasattr(value, "faces"):  # of trimesh
             return self.object(key, {"type": "mesh", "mesh": value}, place, top)
-        if hasattr(value, "matrix"):
+        if np.shape(getattr(value, "matrix", ()))[:2] in _MATRICES:  # Dr.Jit's points have an attribute matrix as well
             return _transform(key, value.matrix, place)
+        if type(value).__name__.endswith("Color3f"):  # of Mitsuba
+            return _element("rgb", key, place, _text(_array(value, place)))
         if isinstance(value, bool | np.bool_):
             return _element("boolean", key, place, str(bool(value)).lower())
         if isinstance(value, Real):
@@ -230,7 +233,7 @@ def _text(array: np.ndarray) -> str:
 
 def _transform(key: str, matrix: object, place: str) -> Element:
     matrix = _array(matrix, place)
-    if matrix.shape not in ((3, 3), (4, 4)):
+    if matrix.shape not in _MATRICES:
         raise InputError(f"{place}: a transform is a pj.Transform or a (4, 4) matrix, has the shape {matrix.shape}")
     step = Element("matrix", {"value": _text(matrix)}, place, 0)
     return Element("transform", {"name": key}, place, 0, [step])
