@@ -146,8 +146,15 @@ CASES = {
     ),
     "homogeneous": filled(rgb("sigma_t", "0.5, 0.8, 1"), rgb("albedo"), numbers(scale=1.5)),
     "homogeneous, absorbing": filled(rgb("sigma_t", "0.5, 0.8, 1"), rgb("albedo", "0")),
+    "heterogeneous": filled(
+        '<volume name="sigma_t" type="constvolume"><rgb name="value" value="0.5, 0.8, 1"/><transform name="to_world">'
+        '<translate x="-0.5" y="-0.5" z="-0.5"/><scale value="4"/></transform></volume>',
+        rgb("albedo"),
+        numbers(scale=1.5),
+    ).replace('"homogeneous"', '"heterogeneous"'),
     "isotropic": filled(rgb("sigma_t", "0.5, 2, 4"), rgb("albedo"), '<phase type="isotropic"/>'),
     "hg": filled(rgb("sigma_t", "1"), rgb("albedo"), f'<phase type="hg" id="phase">{numbers(g=0.6)}</phase>'),
+    "rayleigh": filled(rgb("sigma_t", "0.5, 2, 4"), rgb("albedo"), '<phase type="rayleigh"/>'),
     "area": BALL.format(GREY)
     + '<shape type="sphere"><point name="center" value="1, 1, 1"/><float name="radius" value="0.5"/>'
     f'<bsdf type="diffuse" id="around-lamp"/><emitter type="area" id="it">{rgb("radiance", "4, 3, 2")}</emitter>'
