@@ -159,7 +159,8 @@ def test_a_sweep_is_native(monkeypatch, shipped, few, near):
     paths = tuple({parameter.path for parameter in scene.about.parameters.values()})
     options = Options(derivative=True, by_vertex=True)
     work = jnp.ones((len(pixels), 3)), pixels, *pixel.numbers(pixels, 0, 4, 1)
-    text = backward.pullback.lower(named.nameless(scene), *work, paths=paths, options=options).compile().as_text()
+    how = dict(paths=paths, options=options, ring=backward.RING)
+    text = backward.pullback.lower(named.nameless(scene), *work, **how).compile().as_text()
     entry = text[text.index("\nENTRY ") :]
     assert entry.count("xla_cpu_small_call") == 2 and " while(" not in entry
 

@@ -18,26 +18,30 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from pathjax import bsdfs, emitters
-from pathjax.compile import compute_once, native_fold, native_rows, persistent_loop, together
+from pathjax.compile import compute_once, is_traced, native_fold, native_rows, persistent_loop, together
 from pathjax.compile.lanes import flags
 from pathjax.core import sampler
 from pathjax.core.math import LUMINANCE, at
 from pathjax.derivatives import places
 from pathjax.derivatives.record import Record, Slot, extend
 from pathjax.emitters import Choice
+from pathjax.errors import InputError
 from pathjax.integrators import path, pixel
 from pathjax.integrators.options import Options
 from pathjax.integrators.random_numbers import bounce_numbers
 from pathjax.scene import parameters as named
 from pathjax.scene.scene import Scene
 
-# Trips between two sweeps, and those that the ring holds at most, a power of 2. A path of more than the difference is
-# not recorded whole, and makes the derivatives NaN: one in 1e20, if roulette ends paths.
-WINDOW, RING = 32, 1024
+# Trips between two sweeps, and those that the ring holds: powers of 2. Where the longest path is not known when a
+# kernel is made, it is RING; a path of more than the difference is not recorded whole then, and makes derivatives NaN.
+WINDOW, RING, MOST_RING = 32, 1024, 1 << 14
+# Of paths that roulette may end, so many vertices later one in 1e20 is left.
+ROULETTE = 900
 # Entries of a list that every lane sums up by itself.
 FEW = 8
 # Bytes of a list that stay in near caches.
@@ -77,25 +81,54 @@ class Sweep(NamedTuple):
     total: list[Float[Array, " W"]] | Float[Array, "M 3"]
 
 
-def start(scene: Scene, record: Record, entries: int, lanes: int) -> Memory:
-    """record: of shapes and dtypes."""
+def start(scene: Scene, record: Record, entries: int, ring: int, lanes: int) -> Memory:
+    """Before the first pixel.
+
+    Args:
+        record: of shapes and dtypes.
+        ring: trips that it holds.
+    Raises:
+        InputError: too many.
+    """
+    if ring > MOST_RING:
+        raise InputError(
+            f"max_depth and rr_depth let paths have more than {MOST_RING - WINDOW} vertices, too many to be recorded "
+            "for derivatives in many numbers; set a smaller max_depth or rr_depth"
+        )
     dtype = scene.camera.origin.dtype
     few = entries <= FEW
     total = [jnp.zeros((lanes,), dtype)] * (3 * entries) if few else jnp.zeros((entries, 3), dtype)
-    # No trip is read that was not written.
-    ring = [lax.empty((RING, lanes), x.dtype) for x in jax.eval_shape(columns_of, record)]
+    # No trip is read that was not written. On CPUs it is filled with zeros all the same, so it had better be short.
+    buffers = [lax.empty((ring, lanes), x.dtype) for x in jax.eval_shape(columns_of, record)]
     zero = jnp.int32(0)
-    return Memory(total, zero, zero, zero, ring_size(scene), ring)
+    return Memory(total, zero, zero, zero, ring_size(scene, ring), buffers)
 
 
-def ring_size(scene: Scene) -> Int[Array, ""]:
-    """Power of 2 that holds the longest path and a window, as far as that is known; RING at most."""
+def longest_ring(scene: Scene) -> int:
+    """Trips of a ring that holds the scene's longest path and a window; RING, where max_depth is not known yet."""
+    depths = scene.max_depth, scene.rr_depth
+    if any(map(is_traced, depths)):
+        return RING
+    most, unharmed = (int(np.asarray(depth).max()) for depth in depths)
+    longest = min(most, unharmed + ROULETTE)
+    if _passes(scene):
+        longest = max(longest, ROULETTE)
+    return 1 << (longest + WINDOW - 1).bit_length()
+
+
+def _passes(scene: Scene) -> bool:
+    """Whether paths meet what does not count into their depth, but has records too."""
     passes = scene.media is not None or bsdfs.occurs(scene.materials, "passes")
-    if passes or scene.free_passes or scene.hide_emitters:
-        return jnp.int32(RING)  # what is passed has records too, and does not count into depth
-    sizes = [1 << k for k in range(RING.bit_length())]
-    wanted = jnp.minimum(scene.max_depth, RING) + WINDOW
-    return jnp.min(jnp.where(jnp.array(sizes) >= wanted, jnp.array(sizes), RING)).astype(jnp.int32)
+    return bool(passes or scene.free_passes or scene.hide_emitters)
+
+
+def ring_size(scene: Scene, ring: int) -> Int[Array, ""]:
+    """Power of 2 that holds the longest path and a window, as far as that is known; the ring's at most."""
+    if _passes(scene):
+        return jnp.int32(ring)
+    sizes = [1 << k for k in range(ring.bit_length())]
+    wanted = jnp.minimum(scene.max_depth, ring) + WINDOW
+    return jnp.min(jnp.where(jnp.array(sizes) >= wanted, jnp.array(sizes), ring)).astype(jnp.int32)
 
 
 def remember(structure: Record, memory: Memory, here: Bool[Array, " W"], columns: list) -> Memory:
@@ -291,9 +324,9 @@ def _kernel(scene: Scene, paths: places.Paths, options: Options) -> _Kernel:
     return _Kernel(scene, choice, structure, entries, of_pixel)
 
 
-@partial(jax.jit, static_argnames=("paths", "options", "form", "devices"))
+@partial(jax.jit, static_argnames=("paths", "options", "ring", "form", "devices"))
 def pullback(
-    scene: Scene, adjoint, pixels, first_sample, spp, seed, *, paths, options: Options, form=None, devices=None
+    scene: Scene, adjoint, pixels, first_sample, spp, seed, *, paths, options: Options, ring, form=None, devices=None
 ):
     """J^T adjoint: of each of the arrays, its shape.
 
@@ -302,6 +335,7 @@ def pullback(
         adjoint: (N, 3) of the means of the pixels.
         pixels, first_sample, spp, seed: (N,) each.
         paths: of the arrays, which `places` knows.
+        ring: of `longest_ring`.
         form, devices: of `native_fold`.
     """
     scene, choice, structure, entries, sweep_of = _kernel(scene, paths, options)
@@ -311,7 +345,7 @@ def pullback(
         adjoint, work = work
         return sweep_of(work, scene, choice, adjoint, 0, memory)[1]
 
-    begin, end = partial(start, scene, structure, entries), partial(finish, structure)
+    begin, end = partial(start, scene, structure, entries, ring), partial(finish, structure)
     work = adjoint, (pixels, first_sample, spp, seed)
     total = native_fold(of_pixel, work, scene, choice, start=begin, finish=end, form=form, devices=devices)
 
@@ -323,9 +357,9 @@ def pullback(
     return [of_array(path) for path in paths]
 
 
-@partial(jax.jit, static_argnames=("paths", "options", "devices"))
+@partial(jax.jit, static_argnames=("paths", "options", "ring", "devices"))
 def rows(
-    scene: Scene, pixels, first_sample, spp, seed, *, paths, options: Options, devices=None
+    scene: Scene, pixels, first_sample, spp, seed, *, paths, options: Options, ring, devices=None
 ) -> tuple[Float[Array, "N 3"], Float[Array, "N M 3"]]:
     """Means of pixels, and their derivatives in each of the list of colours: of each channel in its own.
 
@@ -337,7 +371,7 @@ def rows(
         return sweep_of(work, scene, choice, jnp.ones_like(scene.camera.origin), number * entries, memory)
 
     def begin(lanes, pixels, scene, choice):
-        return start(scene, structure, pixels * entries, lanes)
+        return start(scene, structure, pixels * entries, ring, lanes)
 
     def end(memory):
         return finish(structure, memory).reshape(-1, entries, 3)

@@ -211,7 +211,8 @@ def _swept(scene, wanted, pixels, numbers, options, form=None, devices=None):
     options = replace(options, derivative=True, by_vertex=True)
     paths = tuple(dict.fromkeys(parameter.path for parameter in wanted.values()))
     first, _ = places.firsts(scene, paths)
-    image, found = backward.rows(scene, pixels, *numbers, paths=paths, options=options, devices=devices)
+    how = dict(paths=paths, options=options, ring=backward.longest_ring(scene), devices=devices)
+    image, found = backward.rows(scene, pixels, *numbers, **how)
     columns = {name: first[parameter.path] + parameter.index[0] for name, parameter in wanted.items()}
     return image, {name: tangents.by_channel(found[:, column]) for name, column in columns.items()}
 

@@ -52,13 +52,21 @@ def pull(
     spp: Counts,
     seed: Counts,
     options: Options,
+    ring: int | None = None,
     **how,
 ) -> Changes:
-    """J^T v: by name, of the parameter's shape. adjoint: v; the rest as for `push`."""
+    """J^T v: by name, of the parameter's shape.
+
+    Args:
+        adjoint: v.
+        ring: of `backward.longest_ring`; None: that of the scene.
+        others: as for `push`.
+    """
     paths = _paths(wanted)
     numbers = pixel.numbers(pixels, first_sample, spp, seed)
     options = replace(options, derivative=True, by_vertex=True)
-    arrays = backward.pullback(scene, adjoint, pixels, *numbers, paths=paths, options=options, **how)
+    ring = ring or backward.longest_ring(scene)
+    arrays = backward.pullback(scene, adjoint, pixels, *numbers, paths=paths, options=options, ring=ring, **how)
     by_path = dict(zip(paths, arrays, strict=True))
     return {name: parameter.transposed(by_path[parameter.path]) for name, parameter in wanted.items()}
 

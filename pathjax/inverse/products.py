@@ -150,7 +150,8 @@ def _rows(values, views, pixels, spp, seeds, vector):
     def one(scene, work):
         seed, pixels = work
         scene = named.nameless(named.attached(views.with_values(scene, by_name)))
-        _, found = backward.rows(scene, pixels, *pixel.numbers(pixels, 0, spp, seed), paths=paths, options=options)
+        how = dict(paths=paths, options=options, ring=backward.longest_ring(scene))
+        _, found = backward.rows(scene, pixels, *pixel.numbers(pixels, 0, spp, seed), **how)
         first, _ = entries.firsts(scene, paths)
 
         def of_pixel(row):

@@ -13,6 +13,7 @@ from pathjax import emitters
 from pathjax.compile import usual_promotion
 from pathjax.core.types import Number
 from pathjax.derivatives import matrix_free
+from pathjax.derivatives.backward import longest_ring
 from pathjax.derivatives.jacobian import MOST_TANGENTS, pixel_jacobians
 from pathjax.derivatives.rules import estimate
 from pathjax.errors import InputError
@@ -96,13 +97,14 @@ def render_pixels(scene: Scene, pixels, first_sample, spp, seed, options: Option
     how: `form` and `devices` of `native_map`.
     """
     numbers = pixel.numbers(pixels, first_sample, spp, seed)
-    return estimate(_PixelMeans(options, tuple(how.items())), scene, control, pixels, *numbers)
+    return estimate(_PixelMeans(options, tuple(how.items()), longest_ring(scene)), scene, control, pixels, *numbers)
 
 
 @dataclass(frozen=True)
 class _PixelMeans:
     options: Options
     how: tuple[tuple[str, object], ...]
+    ring: int  # of `backward.longest_ring`, which the scene tells here alone: within `estimate` nothing of it is known
 
     def value(self, scene, control, pixels, *numbers):
         return pixel_means(scene, pixels, *numbers, control, options=self.options, **dict(self.how))
@@ -126,7 +128,7 @@ class _PixelMeans:
     def pull(self, scene, wanted, adjoint, control, pixels, *numbers):
         self.options.check_differentiable()
         options, *work = self._own_samples(scene, pixels, *numbers)
-        return matrix_free.pull(scene, wanted, adjoint, *work, options, **dict(self.how))
+        return matrix_free.pull(scene, wanted, adjoint, *work, options, self.ring, **dict(self.how))
 
     def _own_samples(self, scene, pixels, *numbers):
         """What a sweep takes: it knows of pixels that draw their own samples alone, whose means are the same."""

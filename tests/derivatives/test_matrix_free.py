@@ -11,6 +11,7 @@ import pytest
 import pathjax as pj
 from pathjax.compile import mapping
 from pathjax.derivatives import backward, jacobian, matrix_free, record
+from pathjax.errors import InputError
 from pathjax.images import write_exr
 from pathjax.integrators.options import Options
 from pathjax.scene import parameters as named
@@ -273,13 +274,38 @@ def test_what_takes_a_derivative_of_each_number_refuses_textures(screen):
 @pytest.mark.slow
 @pytest.mark.parametrize(("ring", "lost"), [(1, True), (2, False)])
 def test_a_path_longer_than_the_ring_is_told(screen, monkeypatch, ring, lost):
-    """Rather nan than a derivative that lacks something. Paths have two vertices, and each trip is swept."""
-    texels, image = pj.parameters(screen)[NAME], image_of(limited(screen, 5, NO_LIMIT))
+    """Rather nan than a derivative that lacks something, where max_depth is known to the compiled kernel alone.
+
+    Paths have two vertices, and each trip is swept.
+    """
+    texels = pj.parameters(screen)[NAME]
     monkeypatch.setattr(backward, "RING", ring)
     monkeypatch.setattr(backward, "WINDOW", 1)
     backward.pullback.clear_cache()
     try:
-        found = np.isnan(jax.grad(lambda x: image(x).sum())(texels))
+        of = jax.jit(jax.grad(lambda x, scene: image_of(scene)(x).sum()))
+        found = np.isnan(of(texels, limited(screen, 5, NO_LIMIT)))
     finally:
         backward.pullback.clear_cache()
     assert found.all() if lost else not found.any()
+
+
+@pytest.mark.slow
+def test_paths_of_any_length_are_recorded_whole(make_scene, picture):
+    """Within a closed sphere that shines, I = (1 - rho^d) / (1 - rho) of each sample."""
+    depth, rho = 3000, 0.999
+    wall = diffuse("wall", texture(picture(2, 2)))
+    lamp = f'<boolean name="flip_normals" value="true"/><emitter type="area">{rgb("radiance", "1")}</emitter>'
+    scene = make_scene(f'<shape type="sphere">{lamp}{wall}</shape>', res=2, origin="0, 0, 0.1", fov=60)
+    scene = limited(scene, depth, NO_LIMIT)
+    x = jnp.full((2, 2, 3), rho, jnp.float32)
+    found = jax.grad(lambda x: pj.render(pj.with_parameters(scene, {"wall.reflectance": x}), 1, 0, "bsdf").sum())(x)
+    expected = (1 - rho**depth - depth * rho ** (depth - 1) * (1 - rho)) / (1 - rho) ** 2
+    # Sums of thousands of float32 numbers of one sign.
+    np.testing.assert_allclose(found.sum((0, 1)), 4 * expected, rtol=1e-3)
+
+
+def test_paths_too_long_to_be_recorded_are_refused(screen):
+    scene = limited(screen, 10**6, NO_LIMIT)
+    with pytest.raises(InputError, match="set a smaller max_depth"):
+        jax.eval_shape(jax.grad(lambda x: image_of(scene)(x).sum()), pj.parameters(scene)[NAME])
