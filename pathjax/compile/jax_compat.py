@@ -11,6 +11,7 @@ from typing import Any, TypeVar
 
 import jax
 from jax.custom_derivatives import SymbolicZero
+from jax.extend import source_info_util
 from jax.extend.core import ClosedJaxpr, Literal, Primitive, jaxpr_as_fun
 from jax.interpreters import ad, batching, mlir
 from jaxlib.mlir import ir
@@ -32,6 +33,7 @@ __all__ = [
     "program_of",
     "register_dataclass",
     "scan_parts",
+    "source_info_util",
     "while_parts",
 ]
 

@@ -10,7 +10,15 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from pathjax.compile.jax_compat import ClosedJaxpr, Literal, called_program, jaxpr_as_fun, scan_parts, while_parts
+from pathjax.compile.jax_compat import (
+    ClosedJaxpr,
+    Literal,
+    called_program,
+    jaxpr_as_fun,
+    scan_parts,
+    source_info_util,
+    while_parts,
+)
 from pathjax.compile.lanes import flags, runs, slots
 from pathjax.compile.lanes.columns import (
     as_components,
@@ -69,7 +77,9 @@ class Interpreter:
         """Add the results of equations to the values. used: results that are read; None: all."""
         for eqn in eqns:
             wanted = [used is None or v in used for v in eqn.outvars]
-            outputs = self.apply(eqn, [self.read(values, v) for v in eqn.invars], wanted)
+            # What an equation becomes is said to stand where it stands: profiles and errors name the code of one item.
+            with source_info_util.user_context(eqn.source_info.traceback):
+                outputs = self.apply(eqn, [self.read(values, v) for v in eqn.invars], wanted)
             values |= zip(eqn.outvars, outputs, strict=True)
 
     def apply(self, eqn, inputs, used) -> list:
