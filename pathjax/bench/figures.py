@@ -100,17 +100,17 @@ def deviation(image, exact) -> dict:
 
 
 def standard_error(values) -> float:
-    """Of the mean; nan of less than two values."""
+    """Return the standard error of the mean; nan for fewer than two values."""
     return float(np.std(values, ddof=1) / math.sqrt(len(values))) if len(values) > 1 else math.nan
 
 
 def slope(x, y) -> float | None:
-    """Of log y over log x, by least squares; None without two different x."""
+    """Return the slope of log y over log x, by least squares; None without two different x."""
     return float(np.polyfit(np.log(x), np.log(y), 1)[0]) if len(set(x)) > 1 else None
 
 
 def slopes(rows) -> dict:
-    """Of RMS error in samples (-0.5 where they are independent) and in seconds, over the rows that have noise."""
+    """Return the slopes of the RMS error in samples (-0.5 if independent) and in seconds, over rows that have noise."""
     noisy = [row for row in rows if row["efficiency"]]
     rms = [math.sqrt(row["rel_mse"]) for row in noisy]
     return {"spp": slope([row["spp"] for row in noisy], rms), "seconds": slope([r["run_seconds"] for r in noisy], rms)}

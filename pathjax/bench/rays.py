@@ -19,7 +19,7 @@ RAYS = 1 << 18
 
 
 def rates(scene, repeat: int) -> tuple[dict, dict | None]:
-    """Of rays from the camera, and of rays from where those hit in uniform directions.
+    """Measure rays from the camera, and rays from where those hit, in uniform directions.
 
     Returns:
         Mray/s on all shapes, by kind of ray; and on the triangles alone beside Embree, None if there are none.

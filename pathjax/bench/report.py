@@ -58,7 +58,7 @@ def _scene(scene: dict) -> list[str]:
 
 
 def _summary(summary: dict) -> list[str]:
-    """Of all scenes; ratios only beside a peer."""
+    """The table of all scenes; with ratios only beside a peer."""
     rows, wall, cpu = summary["rows"], summary["wall"], summary["cpu"]
     head = [f"at {summary['spp']} spp", "run s", "relMSE", "compiled s"]
     cells = [

@@ -11,7 +11,7 @@ USUAL_SPP = 64
 
 
 def summary(scenes: list[dict]) -> dict:
-    """Of scenes as `measure` returns them, all with the same spp, at 64 spp or else in their middle.
+    """Sum up scenes as `measure` returns them, all with the same spp, at 64 spp or else the middle of theirs.
 
     Ratios are the best peer's over pathjax's, and of efficiency pathjax's over the best peer's: above 1 pathjax is
     ahead. None where there is no peer or no noise.

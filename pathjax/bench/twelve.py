@@ -126,7 +126,7 @@ def sky(folder: Path) -> str:
     )
 
 
-def lights(folder: Path, count: int = 200) -> str:
+def lights(folder: Path) -> str:
     """A hall with many small lamps, some of them near to walls."""
     rng = np.random.default_rng(0)
     body = [
@@ -138,7 +138,7 @@ def lights(folder: Path, count: int = 200) -> str:
     for k in range(12):
         x, z, height = *rng.uniform(-7, 7, 2), rng.uniform(0.4, 2)
         body.append(_cube(f"block-{k}", "clay", (0.4, height, 0.4), (x, height, z - 1), rng.uniform(0, 90)))
-    for k in range(count):
+    for k in range(200):
         at, facing = rng.uniform((-7.8, 0.2, -7.8), (7.8, 5.8, 5)), rng.normal(size=3)
         shine = _area(rng.uniform(0.2, 1, 3) * 60)
         body.append(_rectangle(f"lamp-{k}", "black", (0.08, 0.08), at, facing / np.linalg.norm(facing), shine))
@@ -326,10 +326,10 @@ _BOX_BSDFS = [
 ]
 
 
-def _write_clouds(file: Path, dark, light, seed: int, size: int = 256) -> None:
+def _write_clouds(file: Path, dark, light, seed: int) -> None:
     """Smooth noise of several sizes between two colours, which repeats."""
-    rng, v = np.random.default_rng(seed), np.zeros((size, size))
-    x = np.arange(size) / size * 2 * np.pi
+    rng, v = np.random.default_rng(seed), np.zeros((256, 256))
+    x = np.arange(256) / 256 * 2 * np.pi
     for octave in range(5):
         for _ in range(6):
             a, b = rng.integers(-(2**octave), 2**octave, 2, endpoint=True)
@@ -338,8 +338,9 @@ def _write_clouds(file: Path, dark, light, seed: int, size: int = 256) -> None:
     write_png(file, np.asarray(dark) * (1 - v[..., None]) + np.asarray(light) * v[..., None])
 
 
-def _write_sky(file: Path, height: int = 256) -> None:
+def _write_sky(file: Path) -> None:
     """Blue above, brown below, brighter towards the horizon and around a sun of 3 degrees."""
+    height = 256
     polar = (np.arange(height) + 0.5)[:, None] / height * np.pi
     azimuth = (np.arange(2 * height) + 0.5) / height * np.pi
     y = np.cos(polar) + 0 * azimuth

@@ -31,11 +31,9 @@ def peer(request, tmp_path):
 @pytest.mark.parametrize("scene", SCENES, ids=lambda path: path.stem)
 def test_scene_renders_in_mitsuba(scene):
     run = {"sampler": "independent", "spp": 1, "seeds": [1]}
-    report, arrays = peers.call("mitsuba3", {"scene": str(scene), "variant": "scalar_rgb", "runs": [run]})
+    _, arrays = peers.call("mitsuba3", {"scene": str(scene), "variant": "scalar_rgb", "runs": [run]})
     image = arrays["images_0"][0]
-    assert image.shape == (report["height"], report["width"], 3)
-    assert report["runs"][0]["nonfinite"] == 0
-    assert image.max() > 0
+    assert image.ndim == 3 and np.isfinite(image).all() and image.max() > 0
 
 
 @needs_mitsuba
@@ -64,35 +62,18 @@ def test_report_and_arrays(tmp_path):
         z = (images.mean((0, 1, 2)) - (1 - rho**3) / (1 - rho)) / error
         assert np.all(np.abs(z) < 5)
     stratified = report["runs"][0]
-    assert stratified["requested_spp"] == 15 and stratified["spp"] == 16  # rounded up, and told
-    assert len(stratified["seconds"]) == 3 and stratified["warm_up_seconds"] > 0
-    assert stratified["mpaths_per_second"] == pytest.approx(64 * stratified["spp"] / stratified["median_seconds"] / 1e6)
-
-
-def test_wrong_requests_are_refused(tmp_path):
-    run = {"sampler": "independent", "spp": 1, "seeds": [1]}
-    good = {"scene": FURNACE, "variant": "scalar_rgb", "runs": [run], "output": str(tmp_path / "out.npz")}
-    for change, told in [
-        ({"runs": [{**run, "sampler": "sobol"}]}, "'sobol' is unknown"),
-        ({"runs": [{**run, "spp": 0}]}, "spp"),
-        ({"runs": [{**run, "seeds": []}]}, "seeds"),
-        ({"runs": []}, "no run"),
-        ({"scenes": "x"}, "unknown keys: scenes"),
-        ({"scene": None}, "'scene'"),
-    ]:
-        with pytest.raises(mitsuba3.RequestError, match=told):
-            mitsuba3.check({**good, **change})
-    done = peer({**good, "runs": []}, tmp_path)
-    assert done.returncode == 2
-    assert len(done.stderr.splitlines()) == 1
-    assert not (tmp_path / "out.npz").exists()
+    assert stratified["spp"] == 16  # rounded up, and told
+    assert len(stratified["seconds"]) == len(stratified["cpu_seconds"]) == 3
 
 
 @needs_mitsuba
-def test_missing_scene_and_unknown_parameter_are_errors():
+def test_wrong_requests_are_refused():
     run = {"sampler": "independent", "spp": 1, "seeds": [1]}
     with pytest.raises(peers.RequestError, match="no such file"):
         peers.call("mitsuba3", {"scene": "nowhere.xml", "variant": "scalar_rgb", "runs": [run]})
+    with pytest.raises(peers.RequestError, match="'sobol' is unknown"):
+        sobol = run | {"sampler": "sobol"}
+        peers.call("mitsuba3", {"scene": FURNACE, "variant": "scalar_rgb", "runs": [sobol]})
     with pytest.raises(peers.PeerFailed, match="colour"):
         peers.call("mitsuba3", {"scene": FURNACE, "parameters": {"colour": 1}, "variant": "scalar_rgb", "runs": [run]})
 
@@ -127,5 +108,4 @@ def test_embree_finds_the_nearest_triangle(tmp_path):
     np.savez(rays, vertices=vertices, faces=faces, origins=origins, directions=directions)
     report, found = peers.call("embree", {"rays": rays, "runs": 3})
     np.testing.assert_array_equal(found["primitive"], [0, 1, 2, -1])
-    assert report["rays"] == 4 and report["triangles"] == 4
-    assert len(report["seconds"]) == 3 and report["mrays_per_second"] > 0
+    assert report["mrays_per_second"] > 0

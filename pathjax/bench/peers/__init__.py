@@ -29,29 +29,26 @@ class PeerFailed(RuntimeError):
     """The process ended without an answer."""
 
 
-def call(peer: str, request: dict, timeout: float | None = None) -> tuple[dict, dict[str, np.ndarray]]:
+def call(peer: str, request: dict) -> tuple[dict, dict[str, np.ndarray]]:
     """Run a script of this folder.
 
     Args:
         peer: its name.
         request: as at the top of the script; without "output" the arrays go through a temporary file.
-        timeout: seconds, after which the process is ended.
     Returns:
         The report, and the arrays by name.
     Raises:
-        PeerMissing, RequestError, PeerFailed; subprocess.TimeoutExpired.
+        PeerMissing, RequestError, PeerFailed: with what the process said last.
     """
     with tempfile.TemporaryDirectory() as folder:
         request = {"output": str(Path(folder, "output.npz")), **request}
         file = Path(folder, "request.json")
         file.write_text(json.dumps(request))
-        # The process shall find this pathjax, wherever it was started, and by -P no module beside the script.
+        # The process must find this pathjax, wherever it was started, and, by -P, no module beside the script.
         places = [str(Path(__file__).resolve().parents[3]), os.environ.get("PYTHONPATH")]
         environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, places))}
         command = [sys.executable, "-P", str(Path(__file__).with_name(f"{peer}.py").resolve()), str(file)]
-        done = subprocess.run(
-            command, capture_output=True, text=True, errors="replace", timeout=timeout, env=environment
-        )
+        done = subprocess.run(command, capture_output=True, text=True, errors="replace", env=environment)
         if done.returncode:
             message = done.stderr.strip().splitlines()[-1:] or [f"it ended with status {done.returncode}"]
             raise {2: RequestError, 3: PeerMissing}.get(done.returncode, PeerFailed)(message[0])

@@ -7,7 +7,6 @@ measure each other. A request, with defaults:
       "scene": "scenes/cornell_box.xml",
       "parameters": {},                     # the file's $parameters, {"res": 128}
       "variant": "llvm_ad_rgb",             # or "scalar_rgb", which needs no LLVM
-      "threads": null,                      # null: one per core
       "runs": [{"sampler": "independent", "spp": 64, "seeds": [1, 2, 3]}],
       "output": "peer.npz"
     }
@@ -15,16 +14,13 @@ measure each other. A request, with defaults:
 OUTPUT.npz then holds, for run k, `images_k` (seeds, H, W, 3) float32. The report is
 
     {
-      "program": "Mitsuba 3.9.1", "variant": "llvm_ad_rgb", "threads": 2, "width": 256, "height": 256,
-      "load_seconds": 0.1,
-      "runs": [{"sampler": "independent", "requested_spp": 64, "spp": 64, "seeds": [1, 2, 3],
-                "warm_up_seconds": 3.1, "seconds": [2.6, 2.6, 2.7], "cpu_seconds": [5.0, 5.0, 5.1],
-                "median_seconds": 2.6, "mpaths_per_second": 1.6, "nonfinite": 0}]
+      "program": "Mitsuba 3.9.1",
+      "runs": [{"spp": 64, "seconds": [2.6, 2.6, 2.7], "cpu_seconds": [5.0, 5.0, 5.1]}]
     }
 
-`spp` is what the sampler really took: all but independent may round up (stratified to a square, say). The warm-up
-compiles (Dr.Jit keeps kernels on disk, so a second process warms up faster) and renders once; it is no part of
-`seconds`, each of which runs from the call to the image in NumPy; `cpu_seconds` are those of all threads.
+`spp` is what the sampler really took: all but independent may round up (stratified to a square, say). Mitsuba compiles
+and renders once before the timed renders; each of `seconds` runs from the call to the image in NumPy, and
+`cpu_seconds` are those of all threads.
 """
 
 from __future__ import annotations
@@ -32,7 +28,6 @@ from __future__ import annotations
 import json
 import os
 import re
-import statistics
 import subprocess
 import sys
 import time
@@ -85,7 +80,7 @@ def find_llvm() -> str:
     return newest
 
 
-def import_mitsuba(variant: str, threads: int | None):
+def import_mitsuba(variant: str):
     """Mitsuba with `variant` set."""
     if variant.startswith("llvm"):
         library = os.environ.get("DRJIT_LIBLLVM_PATH") or find_llvm()
@@ -93,7 +88,6 @@ def import_mitsuba(variant: str, threads: int | None):
             raise PeerMissing(f"DRJIT_LIBLLVM_PATH names {library}: version {OLDEST_LLVM} or newer is needed")
         os.environ["DRJIT_LIBLLVM_PATH"] = library
     try:
-        import drjit
         import mitsuba as mi
     except ImportError as error:
         raise PeerMissing(f"Mitsuba cannot be imported ({error}): pip install mitsuba") from error
@@ -101,8 +95,6 @@ def import_mitsuba(variant: str, threads: int | None):
         raise PeerMissing(f"Mitsuba {mi.__version__} is too old: pip install 'mitsuba>=3.7'")
     if variant not in mi.variants():
         raise RequestError(f"variant {variant!r} is unknown; use one of {', '.join(mi.variants())}")
-    if threads:
-        drjit.set_thread_count(threads)
     try:
         mi.set_variant(variant)
     except ImportError as error:
@@ -141,82 +133,28 @@ def render_run(mi, scene, run: dict) -> tuple[dict, np.ndarray]:
         image = np.array(mi.render(scene, seed=seed), dtype=np.float32)
         return image, time.perf_counter() - start, time.process_time() - worked
 
-    _, warm_up, _ = timed(WARM_UP_SEED)
+    timed(WARM_UP_SEED)
     images, seconds, cpu_seconds = zip(*map(timed, run["seeds"]), strict=True)
-    images = np.stack(images)
-    _, height, width, _ = images.shape
     spp = scene.sensors()[0].sampler().sample_count()
-    entry = {
-        "sampler": run["sampler"],
-        "requested_spp": run["spp"],
-        "spp": spp,
-        "seeds": run["seeds"],
-        "warm_up_seconds": warm_up,
-        "seconds": seconds,
-        "cpu_seconds": cpu_seconds,
-        "median_seconds": statistics.median(seconds),
-        "mpaths_per_second": width * height * spp / statistics.median(seconds) / 1e6,
-        "nonfinite": int((~np.isfinite(images)).sum()),
-    }
-    return entry, images
-
-
-def check(request: dict) -> None:
-    """Refuse a request that lacks something, before anything is started."""
-    if not isinstance(request, dict):
-        raise RequestError("the request is no JSON object")
-    if unknown := set(request) - {"scene", "parameters", "variant", "threads", "runs", "output"}:
-        raise RequestError(f"the request has unknown keys: {', '.join(sorted(unknown))}")
-    for key in ("scene", "output"):
-        if not isinstance(request.get(key), str):
-            raise RequestError(f"the request lacks {key!r}, a path")
-    if not request.get("runs"):
-        raise RequestError("the request names no run")
-    for run in request["runs"]:
-        if unknown := set(run) - {"sampler", "spp", "seeds"}:
-            raise RequestError(f"a run has unknown keys: {', '.join(sorted(unknown))}")
-        if run.get("sampler") not in SAMPLERS:
-            raise RequestError(f"sampler {run.get('sampler')!r} is unknown; use one of {', '.join(SAMPLERS)}")
-        if not isinstance(run.get("spp"), int) or run["spp"] < 1:
-            raise RequestError("a run needs spp, a whole number of at least 1")
-        if not run.get("seeds"):
-            raise RequestError("a run needs a list of seeds")
+    return {"spp": spp, "seconds": seconds, "cpu_seconds": cpu_seconds}, np.stack(images)
 
 
 def render(request: dict) -> tuple[dict, dict[str, np.ndarray]]:
     """All runs of a request, in this process: (report, arrays)."""
-    check(request)
-    variant = request.get("variant") or "llvm_ad_rgb"
-    mi = import_mitsuba(variant, request.get("threads"))
-    import drjit
-
-    report = {"program": f"Mitsuba {mi.__version__}", "variant": variant, "threads": drjit.thread_count(), "runs": []}
-    arrays: dict[str, np.ndarray] = {}
+    mi = import_mitsuba(request.get("variant", "llvm_ad_rgb"))
+    report, arrays = {"program": f"Mitsuba {mi.__version__}", "runs": []}, {}
     for k, run in enumerate(request["runs"]):
-        start = time.perf_counter()
-        scene = load(mi, request["scene"], request.get("parameters") or {}, run["sampler"], run["spp"])
-        report.setdefault("load_seconds", time.perf_counter() - start)
-        width, height = scene.sensors()[0].film().crop_size()
-        report.update(width=int(width), height=int(height))
+        scene = load(mi, request["scene"], request.get("parameters", {}), run["sampler"], run["spp"])
         entry, arrays[f"images_{k}"] = render_run(mi, scene, run)
         report["runs"].append(entry)
     return report, arrays
 
 
-def main(arguments: list[str]) -> int:
-    if len(arguments) != 1:
-        print("usage: python mitsuba3.py REQUEST.json", file=sys.stderr)
-        return 2
+def main(file: str) -> int:
+    request = json.loads(Path(file).read_text())
     try:
-        try:
-            request = json.loads(Path(arguments[0]).read_text())
-        except (OSError, ValueError) as error:
-            raise RequestError(f"{arguments[0]}: {error}") from error
         report, arrays = render(request)
-        beside = request["output"] + ".part"
-        with open(beside, "wb") as file:
-            np.savez(file, **arrays)
-        os.replace(beside, request["output"])
+        np.savez(request["output"], **arrays)
     except RequestError as error:
         print(error, file=sys.stderr)
         return 2
@@ -231,4 +169,4 @@ def main(arguments: list[str]) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(main(sys.argv[1]))
