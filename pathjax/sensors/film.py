@@ -147,9 +147,9 @@ def extended(film: Film, image: Real[Array, "R HW"]) -> Real[Array, "R N"]:
 
 
 def correlation(film: Film) -> Float[Array | np.ndarray, "S S"]:
-    """Of the noise of pixels (y, x) with that of the one in the middle, for they share samples.
+    """Return the correlation of the noise of pixels (y, x) with that of the one in the middle: they share samples.
 
-    What a sample tells is taken to be independent of where in its pixel it lies.
+    The light of a sample is taken to be independent of where in its pixel it lies.
     """
     return _correlation(film) if film.shared else np.ones((1, 1), film.filter.radius.dtype)
 

@@ -42,10 +42,7 @@ class Orthographic(Sensor):
 
     @classmethod
     def read(cls, loader, fields: Fields) -> Orthographic:
-        near, far = fields.float("near_clip", 1e-2, above=0), fields.float("far_clip", 1e4, above=0)
-        if near >= far:
-            raise fields.error("near_clip", f"must be smaller than far_clip, {far:g}; is {near:g}")
-        return cls(fields.transform("to_world"), near, far)
+        return cls(fields.transform("to_world"), *cls.read_clips(fields))
 
     def build(self, film: HDRFilm, dtype) -> OrthographicCamera:
         aspect = film.width / film.height

@@ -67,9 +67,7 @@ class Perspective(Sensor):
 
     @classmethod
     def read(cls, loader, fields: Fields) -> Perspective:
-        near, far = fields.float("near_clip", 1e-2, above=0), fields.float("far_clip", 1e4, above=0)
-        if near >= far:
-            raise fields.error("near_clip", f"must be smaller than far_clip, {far:g}; is {near:g}")
+        near, far = cls.read_clips(fields)
         to_world = fields.transform("to_world")
         if not np.allclose(to_world[:3, :3].T @ to_world[:3, :3], np.eye(3), atol=2e-3):
             raise fields.error("to_world", "scales or shears; a camera can be turned and moved only")
@@ -86,7 +84,7 @@ class Perspective(Sensor):
         return PerspectiveCamera(*self.arrays(film, dtype))
 
     def arrays(self, film: HDRFilm, dtype):
-        """Of `PerspectiveCamera`."""
+        """The arrays of a `PerspectiveCamera`, in order."""
         half = half_extent(self.fov, self.fov_axis, film.width / film.height)
         # The local x axis points to the left of the image.
         axes = self.to_world[:3, :3] / np.linalg.norm(self.to_world[:3, :3], axis=0)

@@ -43,6 +43,14 @@ class Sensor(ABC):
     def read(cls, loader, fields: Fields) -> Sensor:
         """Ask for what an element may hold; its film and its sampler are the loader's."""
 
+    @staticmethod
+    def read_clips(fields: Fields) -> tuple[float, float]:
+        """Distances before which and beyond which nothing is seen."""
+        near, far = fields.float("near_clip", 1e-2, above=0), fields.float("far_clip", 1e4, above=0)
+        if near >= far:
+            raise fields.error("near_clip", f"must be smaller than far_clip, {far:g}; is {near:g}")
+        return near, far
+
     @abstractmethod
     def build(self, film: HDRFilm, dtype) -> Camera:
         """film: whose size gives the aspect ratio."""

@@ -158,7 +158,7 @@ def lamp_table(lamps: list[Lamp], dtype) -> Lamps:
 
 
 def _lamps(parts: list[_Part], table, primitive):
-    """Of one table, whose first primitive has this number."""
+    """Yield the lamps of one table, whose first primitive has the number `primitive`."""
     first = 0
     for shape, primitives, _, lamp in parts:
         if lamp:

@@ -93,6 +93,18 @@ def unit_normal(vertices):
     return n / np.linalg.norm(n, axis=-1, keepdims=True)
 
 
+def margins_of_alike(keys: np.ndarray, reach: np.ndarray, dtype) -> np.ndarray:
+    """Margins (P,) of round primitives: 0 for those that coincide with no other one of their kind.
+
+    Args:
+        keys: (P, K), the same numbers for primitives in the same place; reach: (P,) largest size of their coordinates.
+    """
+    margins = np.zeros(len(keys))
+    pairs = close_pairs(keys, precision(dtype) * reach.max(initial=0))
+    margins[pairs] = 2 * MARGIN * np.finfo(dtype).eps * reach[pairs]
+    return margins
+
+
 def close_pairs(points: np.ndarray, distance: float) -> np.ndarray:
     """(M, 2) pairs of the points (N, K) that lie so close to each other."""
     from scipy.spatial import cKDTree  # takes a sixth of a second, which `import pathjax` has not

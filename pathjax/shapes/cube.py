@@ -48,7 +48,7 @@ class Cubes(Searched):
 
     @classmethod
     def build(cls, frames, first, dtype, rule):
-        """Of the faces (6 B, 4, 3), which begin at the row `first` of their table; and the built tree."""
+        """Boxes of the faces (6 B, 4, 3), which begin at the row `first` of their table; and the tree over them."""
         *found, built = pack(leaf_numbers(frames), *bounds(frames), dtype, rule, first=first, step=FACES)
         return cls(*found), built
 

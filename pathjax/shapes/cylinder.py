@@ -64,10 +64,7 @@ class Cylinders(Table):
         axis = axis * np.copysign(1, axis[np.arange(len(axis)), np.abs(axis).argmax(1)])[:, None]
         nearest = start - (start * axis).sum(1, keepdims=True) * axis
         keys = np.concatenate([axis * reach.max(), nearest, radius[:, None]], 1)
-        margins = np.zeros(len(tubes))
-        pairs = coincident.close_pairs(keys, coincident.precision(dtype) * reach.max())
-        margins[pairs] = 2 * coincident.MARGIN * np.finfo(dtype).eps * reach[pairs]
-        return margins
+        return coincident.margins_of_alike(keys, reach, dtype)
 
     def intersect(self, leaf, prepared, start):
         """Across the axis, where it is a circle, as spheres are; then along it. The cylinder that the ray starts on has
@@ -139,7 +136,7 @@ class Cylinders(Table):
         return self.from_square(row, u)
 
     def sample_lamp(self, lamps, lamp, ref, u, u_part):
-        """Of the inner wall seen from outside, only what is seen through the ends: a shadow ray passes its own lamp."""
+        """As of any lamp, but of an inner wall only what is seen through the ends: a shadow ray passes its own lamp."""
         drawn = super().sample_lamp(lamps, lamp, ref, u, u_part)
         tube = at(self.tubes, drawn.primitive)
         start, axis, radius, length = tube[:3], tube[3:6], tube[6], tube[7]

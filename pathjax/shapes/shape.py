@@ -267,5 +267,5 @@ class Table(Searched):
         """The inverse."""
 
     def edges_and_normals(self) -> tuple[np.ndarray, np.ndarray]:
-        """Of polygons a corner and the two edges from there (P, 3, 3), and normals (P, 3) of any length; float64."""
+        """For polygons: a corner and the two edges from there (P, 3, 3), and normals (P, 3) of any length; float64."""
         raise NotImplementedError

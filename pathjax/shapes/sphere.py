@@ -70,11 +70,7 @@ class Spheres(Table):
     def own_margins(cls, parts, dtype):
         """0 for spheres that no other one coincides with."""
         balls = np.concatenate([part.balls for part in parts])
-        reach = np.linalg.norm(balls[:, :3], axis=1) + balls[:, 3]
-        margins = np.zeros(len(balls))
-        pairs = coincident.close_pairs(balls, coincident.precision(dtype) * reach.max(initial=0))
-        margins[pairs] = 2 * coincident.MARGIN * np.finfo(dtype).eps * reach[pairs]
-        return margins
+        return coincident.margins_of_alike(balls, np.linalg.norm(balls[:, :3], axis=1) + balls[:, 3], dtype)
 
     def intersect(self, leaf, prepared, start):
         """Discriminant from the vector of closest approach, roots without cancellation (Haines, Gunther, Akenine-Moller

@@ -347,7 +347,7 @@ def bounds(vertices):
 
 
 def _barycentrics(vertex, edge1, edge2, o, d):
-    """Of the point where a ray meets the plane of a triangle, or of one near it in the triangle."""
+    """Barycentric coordinates of where a ray meets the plane of a triangle, or of a point near it in the triangle."""
     s = o - vertex
     q = cross(s, edge1)
     h = cross(d, edge2)
