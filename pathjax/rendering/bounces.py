@@ -109,12 +109,12 @@ def render_bounces(
     return _bounces(scene, int(depth), film.pixels(scene.film), samples, seed, options, errors)
 
 
-def pilot(scene: Scene, seed: int = 0) -> tail.Tail:
-    """The Tail after 12 terms, from 64 samples of at most 4096 pixels, spread evenly over the image."""
+def pilot(scene: Scene) -> tail.Tail:
+    """Return the Tail after 12 terms, from 64 samples of at most 4096 pixels, spread evenly over the image."""
     count = film.pixel_count(scene.film)
     pixels = np.unique(np.linspace(0, count - 1, min(PILOT_PIXELS, count)).astype(np.int32))
     samples = jnp.full((1, len(pixels)), PILOT_SPP, jnp.int32)
-    return _bounces(scene, PILOT_TERMS, jnp.asarray(pixels), samples, seed, DEFAULTS, True).tail()
+    return _bounces(scene, PILOT_TERMS, jnp.asarray(pixels), samples, 0, DEFAULTS, True).tail()
 
 
 def _check_depth(depth) -> None:

@@ -11,7 +11,7 @@ the horizon of x. Shares of all that x sees add up to 1 exactly, so a closed sce
 from __future__ import annotations
 
 import math
-from functools import partial, reduce
+from functools import reduce
 
 import jax
 import jax.numpy as jnp
@@ -38,8 +38,8 @@ _BLOCK = 1 << 15
 MOST_BLOCKERS = 64
 
 
-def can(scene: Scene) -> bool:
-    """Whether the scene is made of polygons, or of one sphere."""
+def are_exact(scene: Scene) -> bool:
+    """Whether the scene is made of polygons, or of one sphere, so that its form factors have a closed form."""
     return _one_sphere(scene) or all(table.polygons for table in scene.geometry.tables)
 
 
@@ -59,7 +59,7 @@ def form_factors(scene: Scene, patches: Patches, rays: int, seed: int) -> tuple[
     Raises:
         InputError: curved shapes, but for the inside of one sphere.
     """
-    if not can(scene):
+    if not are_exact(scene):
         raise InputError('spheres and disks, but for the inside of one sphere alone, need method="rays"')
     if _one_sphere(scene):
         return _in_sphere(scene.geometry.tables[0], patches)
@@ -95,7 +95,7 @@ def _in_sphere(table, patches):
 
 
 def _planes(scene):
-    """Of all primitives: corner and two edges (Q, 3, 3), whether it is a triangle (Q,), unit normal (Q, 3), float64."""
+    """A corner and two edges of each primitive (Q, 3, 3), whether it is a triangle (Q,), its unit normal (Q, 3)."""
     bases, triangular, normals = [], [], []
     for table in scene.geometry.tables:
         edges, n = table.edges_and_normals()
@@ -270,9 +270,9 @@ def _visible(scene, patches, pairs, rays, seed):
     return share, np.sqrt(likely * (1 - likely) / effective)
 
 
-@partial(jax.jit, static_argnames=("form", "devices"))
-def _visibility(shapes, patches, i, j, rays, seed, form=None, devices=None):
-    return native_map(_pair_visibility, (i, j), shapes, patches, rays, seed, form=form, devices=devices)
+@jax.jit
+def _visibility(shapes, patches, i, j, rays, seed):
+    return native_map(_pair_visibility, (i, j), shapes, patches, rays, seed)
 
 
 def _pair_visibility(work, shapes, patches, rays, seed):

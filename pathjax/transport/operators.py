@@ -253,7 +253,7 @@ def operator(
     cells = cut(scene, patches, faceted)
     if method is None:
         few = cells.count <= _DENSE_PATCHES and cells.first.shape[0] <= dense_factors.MOST_BLOCKERS
-        method = "dense" if few and dense_factors.can(scene) else "rays"
+        method = "dense" if few and dense_factors.are_exact(scene) else "rays"
     if method not in METHODS:
         raise InputError(f"method {method!r} is unknown; use one of {', '.join(METHODS)}")
     rays = METHODS[method] if rays is None else rays

@@ -91,7 +91,7 @@ def cut(scene: Scene, count: int, faceted: bool = False) -> Patches:
 
 
 def refuse_media(scene: Scene) -> None:
-    """Raises InputError: light does not go from patch to patch undimmed."""
+    """Refuse a scene with media, in which light does not go from patch to patch undimmed."""
     if scene.media is not None:
         raise InputError(
             "the scene has participating media, and light between patches goes through nothing. Use pathjax.render, or "

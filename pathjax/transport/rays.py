@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -51,9 +49,9 @@ def cast(scene: Scene, patches: Patches, rays: int, seed: int) -> tuple[sparse.c
     return counts, sent, lost
 
 
-@partial(jax.jit, static_argnames=("form", "devices"))
-def _cast(shapes, patches, sender, number, seed, form=None, devices=None):
-    return native_map(_one, (sender, number), shapes, patches, seed, form=form, devices=devices)
+@jax.jit
+def _cast(shapes, patches, sender, number, seed):
+    return native_map(_one, (sender, number), shapes, patches, seed)
 
 
 def _one(work, shapes, patches, seed):

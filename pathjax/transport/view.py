@@ -91,9 +91,9 @@ def _with_sample(total, scene, light, pixels, number, seed):
     return total + weight[:, None] * light.L[patch]
 
 
-@partial(jax.jit, static_argnames=("form", "devices"))
-def _seen(scene, patches, pixels, number, seed, form=None, devices=None):
-    return native_map(_one, pixels, scene, patches, number, seed, form=form, devices=devices)
+@jax.jit
+def _seen(scene, patches, pixels, number, seed):
+    return native_map(_one, pixels, scene, patches, number, seed)
 
 
 def _one(pixel, scene, patches, number, seed):
