@@ -77,11 +77,12 @@ def start(coordinator: str | None = None, processes: int | None = None, process:
 
 
 def count() -> int:
+    """Return the number of processes."""
     return jax.process_count() if jax.distributed.is_initialized() else 1
 
 
 def index() -> int:
-    """Of this process; 0 is the one that writes and tells."""
+    """Return the number of this process; 0 is the one that writes and prints."""
     return jax.process_index() if jax.distributed.is_initialized() else 0
 
 
@@ -138,8 +139,10 @@ def _digest(content: bytes) -> str:
 
 @contextmanager
 def losses() -> Iterator[None]:
-    """Raises:
-    ProcessLost: for what JAX raises within it, if there are several processes and one has ended.
+    """A context in which errors of JAX are told apart from those of a process that has ended.
+
+    Raises:
+        ProcessLost: for what JAX raises within it, if there are several processes and one has ended.
     """
     try:
         yield
@@ -162,15 +165,17 @@ def interruptible(interrupts: Interrupts) -> Iterator[None]:
 
 
 def heard(interrupts: Interrupts) -> None:
-    """Raises:
-    KeyboardInterrupt: a signal came, to any process.
+    """Find out whether a signal came to any process.
+
+    Raises:
+        KeyboardInterrupt: one did.
     """
     if highest(bool(interrupts.heard)):
         raise KeyboardInterrupt
 
 
 def highest(number: int) -> int:
-    """Of the numbers that processes give."""
+    """Return the highest of the numbers that the processes give."""
     return int(max(exchanged(np.int32(number)))) if count() > 1 else number
 
 

@@ -29,7 +29,7 @@ _AHEAD = 2
 
 @dataclass(frozen=True)
 class Outcome:
-    """Of one job."""
+    """What became of one job."""
 
     job: Job
     output: Path

@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 
 def parser() -> argparse.ArgumentParser:
-    """Of the whole command line; `command` of what it parses is the command's name."""
+    """Return the parser of the whole command line; `command` of what it parses is the command's name."""
     program = argparse.ArgumentParser(prog="pathjax", description="A differentiable Monte Carlo path tracer.")
     subparsers = program.add_subparsers(required=True, dest="command", metavar="COMMAND")
 

@@ -62,5 +62,5 @@ def run(options, output: Output) -> int:
 
 
 def _layers(fit: inverse.Fit, name: str):
-    """Of an image file: the texels, and their standard errors."""
+    """The layers of an image file: the texels, and their standard errors."""
     return [("", fit.values[name]), ("error.", fit.standard_errors[name])]

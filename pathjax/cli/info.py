@@ -75,7 +75,7 @@ def scene_facts(scene: Scene) -> dict:
 
 
 def _parameter_facts(parameter: Parameter, value: np.ndarray) -> dict:
-    """Of a texture the mean stands for all numbers."""
+    """What is told of a parameter; of a texture, the mean stands for all numbers."""
     known = {"value": value}
     if parameter.is_texture:
         known = {"mean": value.mean((0, 1) if parameter.corners is None else 0)}

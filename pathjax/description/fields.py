@@ -150,7 +150,7 @@ class Fields:
         return values * scale
 
     def _typed_spectrum(self, element: Element, at_most: float) -> np.ndarray:
-        """Of a spectrum that is a plugin of its own: none of these is converted by Mitsuba, but taken as linear RGB."""
+        """The colour of a spectrum with a type. Mitsuba takes all of these as linear RGB and converts none."""
         fields = Fields(self.document, element)
         match fields.type:
             case "uniform":
@@ -170,7 +170,7 @@ class Fields:
         return color
 
     def _listed_spectrum(self, element: Element, at_most: float, radiance: bool) -> np.ndarray:
-        """Of values by wavelength, which stand in the file, or in one that it names."""
+        """The colour of values by wavelength, which stand in the scene file or in a file that it names."""
         if "filename" in element.attributes:
             require_attributes(element, required=("name", "filename"))
             pairs = _pairs_of_file(self.document.find(element.attributes["filename"], element), element)

@@ -187,7 +187,7 @@ def chosen_by_place(emitters: tuple[Lights, ...]) -> bool:
 
 
 def usual_name(kind: str) -> str:
-    """Of a light outside of shapes that has no id; kind: as scene files call it."""
+    """Return the name of a light outside of shapes that has no id; kind: as scene files call it."""
     return "background" if issubclass(KINDS.get(kind, Emitter), Background) else kind
 
 

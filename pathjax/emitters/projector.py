@@ -43,7 +43,7 @@ class Projector(DiracEmitter):
 
     @staticmethod
     def power(p) -> Float[Array, " R"]:
-        """Of a point light, times the root of the share of directions in which it shines: as of a spot."""
+        """That of a point light, times the root of the share of directions in which it shines, as for a spot."""
         wide, high = p.tan_x, p.tan_y
         solid_angle = 4 * jnp.arcsin(wide * high / jnp.sqrt((1 + wide * wide) * (1 + high * high)))
         return (4 * math.pi) * luminance(p.irradiance) * p.scale * jnp.sqrt(solid_angle / (4 * math.pi))
@@ -76,6 +76,6 @@ def _screen(p: Row, d: Float[Array, "3"]) -> tuple[Float[Array, ""], Float[Array
 
 
 def _extent(fov: float, fov_axis: str, irradiance) -> dict[str, float]:
-    """Of a picture, whose shape is that of its texels; of what has none a square."""
+    """Half sizes of the picture at distance 1. Its shape is that of its texels; without a picture it is a square."""
     height, width = irradiance.kind.resolution(irradiance) if isinstance(irradiance, Instance) else (1, 1)
     return dict(zip(("tan_x", "tan_y"), half_extent(fov, fov_axis, width / height).tolist(), strict=True))

@@ -23,9 +23,7 @@ class Cover(Color):
 
 
 class Spot(Point):
-    """Of `intensity` up to `beam_width` off the axis; from there it falls linearly in the angle, to 0 at
-    `cutoff_angle`.
-    """
+    """A cone of light: `intensity` up to `beam_width` off its axis, falling linearly from there to `cutoff_angle`."""
 
     texture = Cover(None, bounds=(0, math.inf), radiance=True)  # over the square around the cone, seen from the light
     cutoff_angle = Angle(20.0, bounds=(0, 180))
@@ -62,8 +60,9 @@ class Spot(Point):
 
     @staticmethod
     def power(p) -> Float[Array, " R"]:
-        """Of a point light, times the root of the share of its light that is left: the mean square error of an image is
-        least where lights are chosen by the root of the mean square of what they add to it.
+        """That of a point light, times the root of the share of its light that is left.
+
+        The mean square error of an image is least if lights are chosen by the root mean square of what they add to it.
         """
         cutoff, beam = jnp.radians(p.cutoff_angle), jnp.radians(p.beam_width)
         middle, half = (cutoff + beam) / 2, (cutoff - beam) / 2

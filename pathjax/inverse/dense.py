@@ -36,7 +36,7 @@ def is_dense(problem: Problem) -> bool:
 
 
 class Equations(NamedTuple):
-    """Of each channel, of Q colours."""
+    """The normal equations of each channel, for Q colours."""
 
     matrix: np.ndarray  # (3, Q, Q) J' W J
     gradient: np.ndarray  # (Q, 3) J' W (image - target)

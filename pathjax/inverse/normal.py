@@ -126,7 +126,7 @@ def _weights(weights, target: Target) -> np.ndarray:
 
 
 def check_memory(vector: ParameterVector, dtype) -> None:
-    """Raises InputError: the matrices of so many numbers do not fit into memory."""
+    """Refuse so many numbers that their matrices do not fit into memory."""
     count = vector.count
     # Of groups by channel and by component, each with a copy; and what solving takes, in float64.
     needed = 4 * GROUPS * count**2 * np.dtype(dtype).itemsize + 8 * count**2 * 8 + 6 * CHUNK_BYTES

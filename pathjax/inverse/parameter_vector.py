@@ -30,7 +30,7 @@ class ParameterVector:
 
     @property
     def labels(self) -> list[str]:
-        """Of the components: `glass.int_ior`, `white.reflectance.r`, `wall.reflectance[0, 2].r`."""
+        """Names of the components: `glass.int_ior`, `white.reflectance.r`, `wall.reflectance[0, 2].r`."""
         return [f"{name}{suffix}" for name, p in self.parameters for suffix in _suffixes(p.shape)]
 
     @property
@@ -55,13 +55,13 @@ class ParameterVector:
 
     @property
     def runs(self) -> list[tuple[bool, int]]:
-        """Of columns one after another, whether they are colours, and how many. A column is a number or a colour."""
+        """Runs of columns that are alike: whether they are colours, and how many. A column is a number or a colour."""
         kinds = itertools.groupby(self.parameters, lambda item: _is_color(item[1]))
         return [(color, sum(map(_count, (p for _, p in group)))) for color, group in kinds]
 
     @property
     def entries(self) -> tuple[np.ndarray, np.ndarray]:
-        """Of n components: the column (n,) that holds them, and the channels (3, n) in which they show, 1 or 0."""
+        """For n components: the column (n,) that holds each, and the channels (3, n) in which it shows, 1 or 0."""
         columns, seen, first = [], [], 0
         for color, count in self.runs:
             here = np.arange(first, first + count)
@@ -144,12 +144,12 @@ def _is_color(parameter: Parameter) -> bool:
 
 
 def _count(parameter: Parameter) -> int:
-    """Of the colours or numbers of a parameter."""
+    """The number of colours, or of numbers, in a parameter."""
     return math.prod(parameter.shape[:-1] if _is_color(parameter) else parameter.shape)
 
 
 def _suffixes(shape: tuple[int, ...]) -> list[str]:
-    """Of the components of a parameter; where the last of several axes has the length 3, it is r, g, b."""
+    """What is added to a parameter's name for each of its components; a last axis of length 3 is r, g, b."""
     channels = [".r", ".g", ".b"] if shape[-1:] == (3,) else [""]
     places = np.ndindex(shape[:-1] if shape[-1:] == (3,) else shape)
     return [f"{list(place) if place else ''}{channel}" for place in places for channel in channels]

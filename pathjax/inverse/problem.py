@@ -82,7 +82,7 @@ class Problem:
 
     @property
     def side(self) -> int:
-        """Of squares of pixels whose noise is taken to be independent of each other's."""
+        """Side of the squares of pixels whose noise is taken to be independent of each other's."""
         return 2 * self.reach + 1 if self.reach else 1
 
     @property

@@ -85,9 +85,9 @@ class Products:
         return total
 
     def rows(self, values: np.ndarray, spp: int, draws: tuple) -> Iterator[tuple[np.ndarray, ...]]:
-        """Of parts of the pixels their places (n,) in (N,), and of each draw J (3, n, Q), of each channel in its own.
+        """Yield parts of the pixels: their places (n,) in (N,), and for each draw their rows of J, (3, n, Q).
 
-        All parameters are colours, Q in all.
+        All parameters are colours, Q in all, and light keeps its channel: J[c] is that of channel c in channel c.
         """
         for views, pixels, places in self.parts:
             most = max(ROWS_BYTES // (len(pixels) * len(values) * 4), LEAST_ROWS)

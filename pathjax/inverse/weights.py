@@ -34,7 +34,7 @@ class Noise(NamedTuple):
 
 
 def noise(halves: Halves, problem: Problem, spp: int) -> Noise:
-    """Of renders of `spp` samples, from `halves` of NOISE_SPP. The target's own noise is taken to be like theirs."""
+    """The noise of renders of `spp` samples, from `halves` of NOISE_SPP. That of the target is taken to be like it."""
     renders = []
     for a, b in halves:
         variance = _smoothed(((a - b) ** 2).mean(-1, keepdims=True) / 2, 3) * (NOISE_SPP / spp)
@@ -72,9 +72,9 @@ def _target_ratio(halves: Halves, problem: Problem, noise: Noise, errors: float)
 
 
 def target_rounding(halves: Halves, problem: Problem, noise: Noise) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Of each view (H, W, 3) the steps of its rounding, and in units of them images and standard deviations of noise.
+    """For each view steps of rounding, and in units of these the image and the deviation of the noise: (H, W, 3) each.
 
-    They are the arguments of `uncertainty.rounding_covariance`: pixels of nearly equal values are rounded alike.
+    They are the arguments of `uncertainty.rounding_images`: pixels of nearly equal values are rounded alike.
     """
     ratio, parts = _target_ratio(halves, problem, noise, -2), []
     for (a, b), target in zip(halves, problem.targets, strict=True):

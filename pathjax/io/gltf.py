@@ -278,7 +278,7 @@ class _Picture:
         return self.bitmap(decoded(stored, raw) * np.asarray(factor, np.float32), raw=True)
 
     def normals(self, scale: float) -> dict:
-        """Of a normal map whose x and y are scaled."""
+        """A normal map whose x and y are scaled."""
         if scale == 1:
             return self.bitmap(self.pixels[..., :3], raw=True)
         normal = (2 * decoded(self.pixels[..., :3], raw=True) - 1) * np.array([scale, scale, 1], np.float32)

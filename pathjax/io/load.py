@@ -99,7 +99,7 @@ def save_scene(scene: Scene, file: str | os.PathLike) -> list[Path]:
 
 
 def _equal(one: object, other: object) -> bool:
-    """Of pytrees."""
+    """Whether two pytrees have the same structure and arrays."""
     alike = jax.tree.structure(one) == jax.tree.structure(other)
     return alike and all(map(np.array_equal, jax.tree.leaves(one), jax.tree.leaves(other)))
 

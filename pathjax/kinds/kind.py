@@ -36,7 +36,7 @@ class Kind:
 
     @classmethod
     def place(cls, name: str) -> int:
-        """Of a declared parameter among the columns of the table."""
+        """Return the place of a declared parameter among the columns of the table."""
         return cls._places[name]
 
     @classmethod
@@ -99,7 +99,7 @@ class Kind:
 
 
 def _column(declared: Declared, values: list, dtype, code: Callable | None) -> Column | None:
-    """Of one parameter, by row: None where no row has it, and of what the kind's own builder fills."""
+    """The column of one parameter; None where no row has it, or where the kind's own builder fills it."""
     if isinstance(declared, Setting) or declared.shared or all(value is None for value in values):
         return None
     textured = [isinstance(value, Instance) for value in values]

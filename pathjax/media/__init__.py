@@ -244,7 +244,7 @@ def _in_grid(values, medium, of_grid, otherwise):
 
 
 def _chances(throughput):
-    """Of each colour to be the one that a distance is drawn for."""
+    """The chance (3,) of each colour to be the one that a distance is drawn for."""
     carried = lax.stop_gradient(throughput)
     total = carried[0] + carried[1] + carried[2]
     share = jnp.where(total > 0, carried / jnp.where(total > 0, total, 1), 1 / 3)

@@ -203,7 +203,7 @@ def _direction(theta, bounds, reach):
 
 
 def _weights(nodes):
-    """Of values at the nodes, those that give the derivative at 0, exact for polynomials."""
+    """Weights of values at the nodes whose sum is the derivative at 0, exact for polynomials."""
     powers = np.arange(len(nodes))
     return np.linalg.solve(nodes[None] ** powers[:, None], (powers == 1).astype(float))
 

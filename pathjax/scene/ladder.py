@@ -66,7 +66,7 @@ def _geometry(geometry: Geometry) -> Geometry:
     parted = np.cumsum(counts)[:-1]
 
     def numbered(values):
-        """Of all primitives, which are numbered through the tables."""
+        """Pad values of all primitives, which are numbered through the tables."""
         parts = zip(np.split(np.asarray(values), parted), tables, strict=True)
         return np.concatenate([_rows(part, table.count) for part, table in parts]) if tables else values
 

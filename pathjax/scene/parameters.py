@@ -111,7 +111,7 @@ def checked(name, value, parameter: Parameter, dtype):
 
 
 def refuse_constant(scene: Scene, wanted: Mapping[str, Parameter]) -> None:
-    """Raises InputError: one of the parameters, of which derivatives are asked for, is known to be below its least."""
+    """Refuse a derivative in a parameter that is known to be below its least value."""
     for name, parameter in wanted.items():
         values = get(scene, parameter.path)
         if not math.isfinite(parameter.least) or parameter.is_texture or is_traced(values):

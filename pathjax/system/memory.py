@@ -21,7 +21,7 @@ def limit() -> int | None:
 
 
 def check(needed: int, what: str, remedy: str) -> None:
-    """Raises InputError: `what` needs more bytes than there are."""
+    """Refuse `what` if it needs more bytes than there are."""
     there = limit()
     if there is not None and needed > there:
         raise InputError(f"{what} take {_text(needed)} of memory, and there are {_text(there)}; {remedy}")

@@ -24,7 +24,7 @@ def _encodable_on(stream: TextIO | None, text: str) -> str:
 
 
 class Output:
-    """Of one command; `written` is true once a file is, `failed` once something could not go where it was asked for."""
+    """The output of one command; `written` once a file is, `failed` once something could not go where it should."""
 
     def __init__(self) -> None:
         self.failed = self.written = False

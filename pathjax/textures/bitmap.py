@@ -115,7 +115,7 @@ def texels_of(fields, data: np.ndarray, raw: bool) -> np.ndarray:
 
 
 def _corners(p, uv):
-    """Of the texels around a point: (0 or 1 down, 0 or 1 right) -> which of all; and (2,) where it is between them."""
+    """The texels around a point: (0 or 1 down, 0 or 1 right) -> number of one; and (2,) where it is between them."""
     size = p.size
     vu = jnp.stack([uv[1], uv[0]])
     # Texel centres lie at (i + 1/2) / size.

@@ -61,7 +61,7 @@ class MeshAttribute(Texture):
 
     @classmethod
     def span(cls, texture: Instance) -> tuple[float, float]:
-        """Of no mesh yet: `fault` checks those that it is used on."""
+        """Any: `fault` checks the meshes that it is used on."""
         return 0.0, 0.0
 
 

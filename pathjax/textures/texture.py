@@ -28,10 +28,10 @@ class Texture(Kind):
 
     @staticmethod
     def entries(p: Row, uv: Float[Array, "2"], surface: Surface) -> list[tuple[str, Int[Array, ""] | None, Array]]:
-        """Of which numbers `look_up` is the sum, for derivatives in them: a parameter, the entry, and its share ().
+        """Return the numbers that `look_up` is a weighted sum of, for derivatives in them: parameter, entry, weight ().
 
-        The entry is that in a `Shared` array; None: the row of the texture. A kind that says none is differentiated
-        forwards alone.
+        The entry is that in a `Shared` array; None: the row of the texture. A kind that returns none is differentiated
+        forwards only.
         """
         return []
 

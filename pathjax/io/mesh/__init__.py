@@ -103,7 +103,7 @@ def of_arrays(
 def _in_world(
     path: str | Path, raw: Raw, to_world: np.ndarray, face_normals: bool, smooth: bool, flip: bool
 ) -> tuple[Mesh, list[str]]:
-    """Of `load`. smooth: what has no normals is shaded smoothly; flip: v to 1 - v."""
+    """What `load` returns. smooth: a mesh without normals is shaded smoothly; flip: v becomes 1 - v."""
     vertices = _transformed(path, raw.vertices, to_world)
     notes = list(raw.notes)
     attributes = dict(raw.attributes)
@@ -264,7 +264,7 @@ def _smooth_normals(vertices: np.ndarray, faces: np.ndarray, area_vectors: np.nd
 
 
 def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Of columns, (3, N) each."""
+    """Scalar products of columns, (3, N) each."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 

@@ -78,7 +78,7 @@ def enumerated(sizes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Of columns, (3, N) each: NumPy's own is slower."""
+    """Cross products of columns, (3, N) each; NumPy's own are slower."""
     return np.stack([a[k - 2] * b[k - 1] - a[k - 1] * b[k - 2] for k in range(3)])
 
 

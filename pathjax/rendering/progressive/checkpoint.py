@@ -87,9 +87,10 @@ class Checkpoint:
         return state
 
     def save(self, state: State) -> None:
-        """Raises:
-        InputError: it cannot be written; the last one that was is intact.
-        Of several processes the first one writes.
+        """Write the state to the file; of several processes the first one does.
+
+        Raises:
+            InputError: it cannot be written; the last one that was is intact.
         """
         if distributed.index():
             return

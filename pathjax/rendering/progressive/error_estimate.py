@@ -74,7 +74,7 @@ def _floor(image: np.ndarray) -> float:
 
 
 def image_error(image: np.ndarray, variance: np.ndarray, alike: float = 1.0) -> ImageError:
-    """Of (..., 3). Pixels that are not finite are left out; nan where the image has no `images.level`.
+    """Estimate the error of an image (..., 3); pixels that are not finite are left out, nan without an `images.level`.
 
     The bound takes pixels as draws from a population: where few of them make up most of the error, their number is
     small and the bound high. Where single samples do (skewness beyond 6), the error exceeds it more often.

@@ -33,7 +33,7 @@ def shares(count: np.ndarray | jax.Array) -> np.ndarray | jax.Array:
 
 
 def blocks(count: int, pixels: int = 1) -> Iterator[slice]:
-    """Of `count` things of so many pixels each, those to work on at a time."""
+    """Yield slices of `count` things, of `pixels` pixels each, to work on at a time."""
     size = max(_BLOCK // pixels, 1)
     return (slice(first, min(first + size, count)) for first in range(0, count, size))
 
