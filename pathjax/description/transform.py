@@ -69,7 +69,8 @@ class Transform:
             x, y, z = forward
             sign = math.copysign(1, z)
             up = np.array([1 - sign * x * x / (sign + z), -sign * x * y / (sign + z), -sign * x])
-        left = _unit("look_at", np.cross(up, forward), "up is parallel to the line of sight")
+        least = 1e-12 * np.linalg.norm(up)  # rounding leaves a sine of some 1e-16 between parallel vectors
+        left = _unit("look_at", np.cross(up, forward), "up is parallel to the line of sight", least)
         matrix = np.eye(4)
         matrix[:3] = np.stack([left, np.cross(forward, left), forward, origin], axis=1)
         return self @ Transform(matrix)
@@ -116,8 +117,8 @@ def _numbers(what: str, value: ArrayLike, shape: tuple[int, ...]) -> np.ndarray:
     return made
 
 
-def _unit(what: str, vector: np.ndarray, complaint: str) -> np.ndarray:
+def _unit(what: str, vector: np.ndarray, complaint: str, least: float = 0.0) -> np.ndarray:
     length = np.linalg.norm(vector)
-    if not 1e-12 < length < math.inf:
+    if not least < length < math.inf:
         raise InputError(f"{what}: {complaint}")
     return vector / length

@@ -36,6 +36,14 @@ def test_an_axis_may_have_any_length():
     np.testing.assert_allclose(turned, [0, 0, -1], atol=1e-15)
 
 
+@pytest.mark.parametrize("size", [1e-30, 1e30])
+def test_vectors_may_be_tiny_or_huge(size):
+    turned = Transform().rotate([0, size, 0], 90) @ [1, 0, 0]
+    np.testing.assert_allclose(turned, [0, 0, -1], atol=1e-15)
+    seen = Transform().look_at([0, 0, size], [0, 0, 0], [0, size, 0])
+    np.testing.assert_allclose(seen.matrix[:3, :3], np.diag([-1, 1, -1]), atol=1e-15)
+
+
 def test_it_does_not_change():
     matrix = np.eye(4)
     made = Transform(matrix)
@@ -57,6 +65,7 @@ def test_it_does_not_change():
         (lambda: Transform().rotate([0, 0, 1], [1, 2, 3]), "one finite number"),
         (lambda: Transform().look_at([0, 0, 0], [0, 0, 0], [0, 1, 0]), "coincide"),
         (lambda: Transform().look_at([0, 0, 0], [0, 1, 0], [0, 2, 0]), "parallel"),
+        (lambda: Transform().look_at([0, 0, 0], [0.1, 0.3, 0.7], [1e20, 3e20, 7e20]), "parallel"),
         (lambda: Transform().scale([1, 0, 1]).inverse(), "flattens"),
     ],
 )
