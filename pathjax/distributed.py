@@ -211,7 +211,7 @@ def dealt(f: Callable[[T], np.ndarray], items: Iterable[T], stopped: Callable[[]
 
 @contextmanager
 def _stdout_as_stderr() -> Iterator[None]:
-    """The transport tells on stdout whom it has found, past Python's own."""
+    """Send to stderr what the transport prints on stdout, past Python's own, of the processes that it has found."""
     sys.stdout.flush()
     kept = os.dup(1)
     os.dup2(2, 1)

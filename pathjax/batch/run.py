@@ -112,7 +112,7 @@ def _load(job: Job, beside: Path) -> tuple[Scene, float]:
 
 
 def _outcome(job: Job, output: Path, loading: Future | None, interrupts: Interrupts) -> Outcome | None:
-    """None: a signal came before the image was whole."""
+    """Render a job and write its image; None: a signal came before the image was whole."""
     if interrupts.heard:
         return None
     if loading is None:
@@ -143,7 +143,7 @@ def _outcome(job: Job, output: Path, loading: Future | None, interrupts: Interru
 
 @contextmanager
 def _told(progress: bool | Callable[[Outcome], None], count: int) -> Iterator[Callable[[Outcome], None]]:
-    """What to tell outcomes to."""
+    """A context with a function that shows outcomes as they come."""
     if progress is not True:
         yield progress or (lambda outcome: None)
         return

@@ -161,7 +161,7 @@ def _rays(closest_hits: dict, beside: dict | None) -> list[str]:
 
 
 def _table(head: list[str], rows: list[list]) -> list[str]:
-    """With an empty line after it."""
+    """The lines of a Markdown table, and an empty line after it."""
     return [*(f"| {' | '.join(map(str, cells))} |" for cells in (head, ["---"] * len(head), *rows)), ""]
 
 
@@ -186,7 +186,7 @@ def _versus(row: dict) -> str:
 
 
 def _relative(value: float, standard_error: float) -> str:
-    """With its standard error in percent."""
+    """The value, with its standard error in percent."""
     known = value > 0 and math.isfinite(standard_error)
     return _number(value) + (f" ± {standard_error / value:.0%}" if known else "")
 

@@ -92,12 +92,12 @@ def blob(folder: Path, level: int = 6) -> str:
 
 
 def million(folder: Path, level: int = 8) -> str:
-    """The same of 1.3 million."""
+    """The same with 1.3 million triangles."""
     return _in_box(folder / "million.ply", *bumpy(level, waves=40))
 
 
 def scan(folder: Path, file: Path) -> str:
-    """A mesh of a file."""
+    """A mesh of the user's in the Cornell box."""
     kind = file.suffix[1:].lower()
     if kind not in ("obj", "ply", "stl"):
         raise InputError(f"{file}: a mesh for the box is an .obj, .ply or .stl file")
@@ -106,7 +106,7 @@ def scan(folder: Path, file: Path) -> str:
 
 
 def sky(folder: Path) -> str:
-    """Pictures on what stands under a picture of the sky."""
+    """Textured shapes under a picture of the sky."""
     _write_sky(folder / "sky.exr")
     _write_clouds(folder / "ground.png", [0.2, 0.3, 0.1], [0.6, 0.5, 0.35], seed=1)
     _write_clouds(folder / "stone.png", [0.15, 0.1, 0.1], [0.8, 0.7, 0.6], seed=2)

@@ -75,7 +75,7 @@ def walk(tree, vertices, origins, directions) -> Walk:
 
 
 def distances(vertices, o, d):
-    """To the triangles (..., 3, 3) along the rays o, d (..., 3): inf where missed (Möller and Trumbore 1997)."""
+    """Distances to the triangles (..., 3, 3) along the rays o, d (..., 3): inf: missed (Möller and Trumbore 1997)."""
     edge1, edge2 = vertices[..., 1, :] - vertices[..., 0, :], vertices[..., 2, :] - vertices[..., 0, :]
     s = o - vertices[..., 0, :]
     h, q = np.cross(d, edge2), np.cross(s, edge1)

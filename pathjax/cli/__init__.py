@@ -44,7 +44,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _join(options) -> None:
-    """The other processes, if there are any."""
+    """Join the other processes, if there are any."""
     given = {name: getattr(options, name, None) for name in ("coordinator", "processes", "process")}
     if all(value is None for value in given.values()):
         return

@@ -123,7 +123,7 @@ def _primitives(part) -> int:
 
 
 def text(facts: dict) -> str:
-    """The same for people."""
+    """Lay out the facts of a scene for people to read."""
     image, integrator, compiled = facts["image"], facts["integrator"], facts["compiled"]
     depth = "unbounded" if integrator["max_depth"] is None else integrator["max_depth"]
     lines = [

@@ -12,7 +12,7 @@ from pathjax.system.interrupts import wait_for
 
 
 def load(options) -> Scene:
-    """The scene of a command, with its `-D` and `--set`. Whether it is dark is not told here."""
+    """Load the scene of a command, with its `-D` and `--set`. There is no warning if it is dark."""
     return wait_for(lambda: _load(options))
 
 

@@ -42,7 +42,7 @@ def run(options, output: Output) -> int:
     render = Render(
         scene, options.error, options.time, options.spp, options.seed, options.strategy, options.checkpoint
     )
-    first = distributed.index() == 0  # of several processes, the one that tells and writes
+    first = distributed.index() == 0  # of several processes, the one that prints and writes
     watched = first and sys.stderr.isatty()
     with _compiling() if watched else nullcontext():
         wait_for(render.compile)
@@ -100,7 +100,7 @@ def _check_depth(scene: Scene, options) -> None:
 
 
 def _first_hits(scene: Scene, options) -> dict[str, np.ndarray]:
-    """Channels of the output variables that tell of what is hit first."""
+    """Channels of those output variables that show what is hit first."""
     names = [name for name in options.aov if name in aovs.NAMES]
     if not names:
         return {}
@@ -137,7 +137,7 @@ def _bounces(scene, result: RenderResult, options, interrupts: Interrupts, outpu
 
 
 def _reached(result: RenderResult, lost: int, place: Path | None, saved: bool, options) -> str:
-    """What there is, where it is not what was asked for."""
+    """A message that says what there is, if it is not what was asked for."""
     if result.reason == "no estimate":
         why = f"{lost} of its pixels are not finite" if lost else "it is black, or nearly so"
         return (

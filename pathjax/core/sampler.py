@@ -84,7 +84,7 @@ def lattice_point(stream: Word, sample: Word, vertex: Number) -> Float[Array, "4
 
 
 def independent_point(stream: Word, sample: Word, vertex: Number) -> Float[Array, "4"]:
-    """Numbers as of `lattice_point`, none of which knows of another."""
+    """Numbers like those of `lattice_point`, but independent of each other."""
     return to_unit(_point_hashes(stream, sample, vertex))
 
 

@@ -47,7 +47,7 @@ def file_format(path: str | Path) -> str:
 
 
 class Unreadable(Exception):
-    """Why, and what to do about it."""
+    """A file cannot be read; the message says why, and what to do about it."""
 
 
 @contextmanager

@@ -59,10 +59,10 @@ class Dense(Search):
         self.values = np.clip(self.values + self.solve(-gradient, damping), self.low, self.high)
 
     def step_again(self) -> None:
-        """The step was exact."""
+        """Do nothing: the step was exact."""
 
     def sums(self, scatter: bool = False) -> Equations:
-        """Over the kept pixels, with as many samples of J as the image had."""
+        """Sum up the normal equations over the kept pixels, with as many samples of J as the image had."""
         products, count = self.products, len(self.values) // 3
         shapes = (3, count, count), (count, 3), (count, 3), (3, count, count)
         found = Equations(*map(np.zeros, shapes))

@@ -13,7 +13,7 @@ from pathjax.rendering.render import render
 
 
 def residuals(x, arguments, vector):
-    """As few residuals as tell a solver all, (n + 1,), and half their sum of squares; x: unbounded coordinates (n,).
+    """Return n + 1 residuals that tell a solver everything, and half their sum of squares; x: unbounded numbers (n,).
 
     The weighted residuals of all views are as good as these: with J = Q R and the rest e = r - Q Q' r, which no x
     changes to first order, Q' r and |e| have the same sum of squares, gradient and R' R = J' J. All follow from the

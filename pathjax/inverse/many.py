@@ -55,9 +55,10 @@ ARRAYS = 24
 
 
 class Search:
-    """Values, and what the last renders said."""
+    """The state of a fit: its values, and what the last renders said of them."""
 
-    # Pixels are left out that tell less than this part of what those tell that half of all is known from.
+    # Of what pixels tell, half comes from the best of them. Those that tell less than this part of what the worst of
+    # these does are left out.
     least_told = 0.02
 
     def __init__(
@@ -95,7 +96,7 @@ class Search:
         return self.verdict()
 
     def descend(self, samples: int, last: bool) -> None:
-        """Steps with so many samples, until what the image misses was no more than noise."""
+        """Take steps with so many samples, until the image misses no more than noise."""
         for _ in range(MAX_STEPS):
             excess = self.look(samples)
             self.step()
@@ -121,7 +122,7 @@ class Search:
     # ---- pixels -----------------------------------------------------------------------------------------------------
 
     def survey(self) -> None:
-        """Render all pixels with few samples: how noisy each is, what it misses, and which of them tell something."""
+        """Render all pixels with few samples: how noisy each is, what it misses, and which depend on the numbers."""
         problem, products = self.problem, self.products
         products.keep([np.ones(t.image.shape[:2], bool) for t in problem.targets])
         self.accepted = None  # what was missed is of other pixels from now on
@@ -225,7 +226,7 @@ class Search:
         self.values = np.clip(values + self.solve(-gradient), self.low, self.high)
 
     def inside(self, gradient: np.ndarray) -> np.ndarray:
-        """(n,) bool: not of what is at a bound and would leave it, which stays there."""
+        """(n,) bool: False for values at a bound that a step would push beyond it; they stay there."""
         return ~((self.values <= self.low) & (gradient > 0) | (self.values >= self.high) & (gradient < 0))
 
     def step_again(self) -> None:
@@ -267,14 +268,14 @@ class Search:
         self.standard_errors = np.where(unseen, np.inf, found)
 
     def known(self) -> np.ndarray:
-        """(n,) whose expectation is the diagonal of J' W J, of two independent J, so that their noise adds nothing."""
+        """(n,) numbers whose mean is the diagonal of J' W J, from two independent J, whose noise adds nothing."""
         products = self.products
         noisy = np.sqrt(self.weights) * self.random.normal(size=self.weights.shape)
         a, b = (products.pull(self.values, noisy, PRODUCT_SPP, products.next_draw()) for _ in range(2))
         return a * b
 
     def local_mean(self, x: np.ndarray) -> np.ndarray:
-        """(n,) of texels, means over windows of them; of other numbers themselves."""
+        """(n,) means over windows of texels; other numbers as they are."""
         parts = self.vector.unpack(x)
         for name, p in self.vector.parameters:
             if is_grid(p):

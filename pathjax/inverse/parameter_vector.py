@@ -25,7 +25,7 @@ class ParameterVector:
 
     @property
     def count(self) -> int:
-        """n."""
+        """The number n of components."""
         return sum(math.prod(p.shape) for _, p in self.parameters)
 
     @property

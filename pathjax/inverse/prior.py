@@ -1,4 +1,4 @@
-"""What is supposed of parameters before an image is seen: near where they begin, and alike in neighbouring texels."""
+"""What is assumed of parameters before an image is seen: near their start, and alike in neighbouring texels."""
 
 from __future__ import annotations
 

@@ -48,7 +48,7 @@ def refine(state: State) -> tuple[bool, str]:
 
 
 def _newton(state: State, spp: int, small: float) -> bool:
-    """Steps until one is below `small` standard errors; whether one was."""
+    """Take steps until one is below `small` standard errors; return whether one was."""
     state.scale, draw = state.vector.scale(state.values), state.next_draw()
     for _ in range(MAX_STEPS):
         state.evaluate(spp, draw)

@@ -66,7 +66,7 @@ def solve(normal: NormalEquations, free: np.ndarray) -> Solution:
 
 
 def _not_negative(covariance: np.ndarray) -> np.ndarray:
-    """Without what rounding leaves of variances that are 0."""
+    """The covariance without the negative variances that rounding leaves of 0."""
     variances, vectors = np.linalg.eigh(covariance)
     return vectors * np.maximum(variances, 0) @ vectors.T
 

@@ -93,7 +93,7 @@ class _Scene:
     # ---- where it is seen from, and lit
 
     def camera(self, camera: dict, matrix: np.ndarray) -> dict:
-        """With `aspect` in place of a film."""
+        """A camera, with `aspect` in place of a film."""
         seen = camera[camera["type"]]
         to_world = _looking(matrix)
         clip = {"near_clip": float(seen["znear"] or 1e-2), "far_clip": float(seen.get("zfar", NO_LIMIT))}

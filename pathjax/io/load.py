@@ -52,7 +52,7 @@ def load_scene(
     """Load a scene file of Mitsuba 3, or glTF or a bare mesh as a scene.
 
     Args:
-        file: path of the file; what it is, is told by its suffix.
+        file: path of the file, whose suffix says what it is.
         sensor: which of several to use: its number, from 0, or its id.
         dtype: of all real numbers; float64 needs `jax_enable_x64`.
         split_rule: how hierarchies are split, for experiments: "sah" (least expected cost), "equal" (equal counts) or
@@ -105,7 +105,7 @@ def _equal(one: object, other: object) -> bool:
 
 
 def _lit(scene: Scene, file: str | os.PathLike) -> Scene:
-    """The scene; a warning where it is dark."""
+    """Return the scene, after a warning if it is dark."""
     if dark := emitters.darkness(scene.emitters, scene.samples_lights):
         warnings.warn(f"{file}: {dark}, so images of it are black", InputWarning, stacklevel=3)
     return scene

@@ -76,7 +76,7 @@ class Row:
         return Row(self._table, self._row, SimpleNamespace(uv=uv), self._textures)
 
     def nudged(self, nudges: Mapping[int, Array]) -> Row:
-        """The same of `Table.nudged`."""
+        """The row of `Table.nudged`."""
         return Row(self._table.nudged(nudges), self._row, self._surface, self._textures, self._colors)
 
     def __getattr__(self, name: str):

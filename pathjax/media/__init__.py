@@ -134,7 +134,7 @@ def _grids(rows: list[Instance], key: str, dtype, parameters: Parameters) -> Gri
 
 
 def _absorbing(medium: Instance, parameters: Parameters) -> Instance:
-    """The same without albedo, as all of them are 0."""
+    """The media without albedo, as all albedos are 0."""
     parameters.refused[f"{medium.name}.albedo"] = (
         f"{medium.name}.albedo is 0, as that of all media of the scene is, so no scattering is compiled; "
         "load the scene with one above 0 to set it"
@@ -143,7 +143,7 @@ def _absorbing(medium: Instance, parameters: Parameters) -> Instance:
 
 
 def names(media: Media) -> list[str]:
-    """What scene files call the kinds that are present, as `info` tells them."""
+    """Names that scene files give the kinds that are present, for `info`."""
     known = {kind: name for name, kind in (KINDS | PHASES).items()}
     present = [media.table.kind, *(table.kind for table in media.phases)]
     more = [] if media.extinctions is None and media.albedos is None else ["grids"]

@@ -1,4 +1,4 @@
-"""More forwards or backwards the longer the wave is against the particles (Henyey and Greenstein 1941, ApJ 93)."""
+"""Scattering mostly forwards, or mostly backwards (Henyey and Greenstein 1941, ApJ 93)."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class _Between(Number):
 
 
 class HG(Phase):
-    """Mean cosine g: above 0 light goes rather on than back."""
+    """A lobe around the way that light goes, forwards where its mean cosine g is above 0, else backwards."""
 
     g = _Between(0.8, bounds=(-_MOST, _MOST))
 

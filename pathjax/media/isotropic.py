@@ -1,4 +1,4 @@
-"""The same in all directions."""
+"""The phase function that is the same in all directions."""
 
 from __future__ import annotations
 

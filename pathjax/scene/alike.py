@@ -1,4 +1,4 @@
-"""Calls that all processes make with the same: what they differ in is told, before they compute past each other."""
+"""Calls that all processes make alike: a difference is found before they compute past each other."""
 
 from __future__ import annotations
 

@@ -28,7 +28,7 @@ class About:
 
 @dataclass(frozen=True)
 class Names:
-    """What of `About` sets parameters: equal for all scenes that have these in the same places."""
+    """The part of `About` that sets parameters: equal for all scenes that have these in the same places."""
 
     places: tuple[tuple[str, Parameter], ...]
 

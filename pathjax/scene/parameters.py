@@ -71,7 +71,7 @@ def with_values(scene: Scene, values: Mapping[str, jax.Array], parameters: Mappi
 
 
 def nameless(scene: Scene) -> Scene:
-    """What kernels get, so that scenes of one structure share them: without names, and what is told by them."""
+    """Return the scene as kernels get it: without names, so that scenes of one structure share kernels."""
     return replace(scene, about=None, varied={})
 
 

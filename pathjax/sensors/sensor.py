@@ -53,4 +53,4 @@ class Sensor(ABC):
 
     @abstractmethod
     def build(self, film: HDRFilm, dtype) -> Camera:
-        """film: whose size gives the aspect ratio."""
+        """Return the camera; the size of `film` gives its aspect ratio."""

@@ -130,7 +130,7 @@ def build(
 
 
 def _enter_attributes(parameters: Parameters, path: tuple, shape, primitives: Primitives, first: int) -> None:
-    """Those that the bsdf of a shape asks for. first: row of the shape's first primitive."""
+    """Enter the attributes that the bsdf of a shape asks for. first: row of the shape's first primitive."""
     for key, declared, texture in mesh_attribute.asked(shape.bsdf):
         attribute, scale = texture.values["names"], texture.values["scale"]
         name, values = f"{shape.name}.{attribute}", shape.geometry.attributes[attribute]
@@ -150,7 +150,7 @@ def _enter_attributes(parameters: Parameters, path: tuple, shape, primitives: Pr
 
 
 def lamp_table(lamps: list[Lamp], dtype) -> Lamps:
-    """For kernels."""
+    """The lamps as kernels take them."""
     _, table, first, count, area, *_ = zip(*lamps, strict=True)
     tables = tuple(sorted(set(table)))
     integers = (np.asarray(x, np.int32) for x in ([tables.index(each) for each in table], first, count))

@@ -53,7 +53,7 @@ class Cubes(Searched):
         return cls(*found), built
 
     def intersect(self, leaf, prepared, start):
-        """By the slabs between opposite faces. Of each cube the face that the ray meets first is told."""
+        """Test the slabs between opposite faces; each cube answers with the face that the ray meets first."""
         o, d = prepared
         block = at(self.leaves, leaf)
         leaf, first = numbers_of(block, d.dtype), rows_of(block)

@@ -11,7 +11,7 @@ SMALL = 1 << 15  # as many primitives or faces are done before threads have begu
 
 
 def cores() -> int:
-    """Their number, where the system tells."""
+    """Return the number of cores that this process may use; of all, if the system does not say."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 

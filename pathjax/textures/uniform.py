@@ -1,4 +1,4 @@
-"""The same everywhere."""
+"""The texture that is the same everywhere."""
 
 from __future__ import annotations
 

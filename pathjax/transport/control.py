@@ -35,7 +35,7 @@ _FIRST = 2
 @register_dataclass
 @dataclass(frozen=True)
 class Control:
-    """For `pathjax.render`, of `Operator.control`."""
+    """The control variate of `pathjax.render`, as `Operator.control` makes it."""
 
     reflected: Radiosity  # S0
     effort: jax.Array  # () survival where all of a path's light is still to be found

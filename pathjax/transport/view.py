@@ -35,7 +35,7 @@ class Radiosity:
 
 @usual_promotion
 def radiosity(patches: Patches, L) -> Radiosity:
-    """L: (U, 3)."""
+    """Return light L (U, 3) on the patches, to be looked up."""
     return Radiosity(patches, jnp.concatenate([L, jnp.zeros_like(L[:1])]))
 
 

@@ -1,4 +1,4 @@
-"""All of a pixel alike."""
+"""The box filter: all of a pixel counts alike."""
 
 from __future__ import annotations
 

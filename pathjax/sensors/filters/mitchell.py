@@ -32,7 +32,7 @@ class Mitchell(Tabulated):
 @register_dataclass
 @dataclass(frozen=True)
 class CatmullRom(Mitchell):
-    """The one that interpolates."""
+    """The cubic that interpolates."""
 
     B: jax.Array | float = 0.0
     C: jax.Array | float = 0.5
