@@ -92,7 +92,7 @@ def test_hidden_lamps_let_the_camera_through(make_scene):
 def test_chunks_make_no_difference(shipped, monkeypatch):
     from pathjax.rendering import aovs
 
-    scene = shipped("glass_and_mirror", res=16)
+    scene = shipped("furnace", res=16)
     whole = pj.render_aovs(scene, NAMES)
     monkeypatch.setattr(aovs, "CHUNK_PIXELS", 100)
     for name, image in pj.render_aovs(scene, NAMES).items():

@@ -199,6 +199,9 @@ def test_two_finite_plates_with_their_form_factor(plates, derivatives, agree, st
         agree(slopes[name], partial, pixelwise=False)
 
 
+METAL = ["metal.eta", "metal.k", "metal.specular_reflectance"]  # in all tests, which share one kernel
+
+
 def metal_sheet(make_scene, angle):
     """A sheet of metal that fills the view, seen at an angle under radiance 1."""
     metal = (
@@ -221,8 +224,7 @@ def conductor_reflectance(cos_i, eta, k):
 def test_metals(make_scene, angle):
     """I = 2 s F(eta, k), and all three derivatives."""
     eta, k, s = np.array([0.2, 0.924, 1.102]), np.array([3.912, 2.452, 2.142]), np.array([0.9, 0.8, 0.7])
-    names = ["metal.eta", "metal.k", "metal.specular_reflectance"]
-    image, J = pj.jacobian(metal_sheet(make_scene, angle), names, 1)
+    image, J = pj.jacobian(metal_sheet(make_scene, angle), METAL, 1)
 
     def F(eta, k):
         return conductor_reflectance(np.cos(np.radians(angle)), eta, k)
@@ -234,7 +236,7 @@ def test_metals(make_scene, angle):
         2 * F(eta, k),
     )
     np.testing.assert_allclose(image, np.broadcast_to(2 * s * F(eta, k), (8, 8, 3)), rtol=1e-5)
-    for name, slope in zip(names, exact, strict=True):
+    for name, slope in zip(METAL, exact, strict=True):
         # In float32 some digits cancel in 1 - F; and the view is 1e-5 wide.
         wanted = np.broadcast_to(np.diag(slope), (8, 8, 3, 3))
         np.testing.assert_allclose(J[name], wanted, rtol=1e-4, atol=2e-6)
@@ -250,7 +252,7 @@ def test_metals_of_next_to_no_eta(make_scene, angle):
     slope = -2 * k * cos / (b * (cos**2 + b**2)) * (1 + (b**2 + sin**2) / (sin**4 + (b * cos) ** 2))
     for eta in (0, 1e-9, 1e-4):
         changed = pj.with_parameters(scene, {"metal.eta": [eta] * 3, "metal.k": k})
-        image, J = pj.jacobian(changed, ["metal.eta"], 1)
+        image, J = pj.jacobian(changed, METAL, 1)
         np.testing.assert_allclose(image, np.broadcast_to(2 * s * (1 + eta * slope), (8, 8, 3)), rtol=1e-5)
         # Pixels see the sheet under slightly other angles; and the slope itself changes by a few eta.
         expected = np.broadcast_to(np.diag(2 * s * slope), (8, 8, 3, 3))

@@ -69,7 +69,9 @@ def test_convex_diffuse_object_under_uniform_light_reflects_its_albedo(make_scen
 SPLIT = {"fresnel": "schlick", "split_depth": 4}
 
 
-@pytest.mark.parametrize("kind, how", [("sphere", {}), ("cube", {}), ("sphere", SPLIT)])
+@pytest.mark.parametrize(
+    "kind, how", [("sphere", {}), ("cube", {}), pytest.param("sphere", SPLIT, marks=pytest.mark.slow)]
+)
 def test_glass_in_uniform_light_is_invisible(make_scene, kind, how):
     scene = with_depth(make_scene(shape(kind, GLASS) + UNIFORM, origin="1.2, 1.5, 4"), NO_LIMIT, NO_LIMIT)
     # Some 10 refractions by reciprocal factors, an ulp or two each.

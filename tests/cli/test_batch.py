@@ -71,15 +71,14 @@ def key(scene):
     return jax.tree.structure(scene), [(x.shape, x.dtype) for x in jax.tree.leaves(scene)]
 
 
-def test_scenes_of_one_structure_are_padded_to_the_same_arrays_and_keep_their_bits(folder):
+def test_scenes_of_one_structure_are_padded_to_the_same_arrays(folder):
     scenes = [load_scene(folder / f"{number}.xml") for number in range(4)]
     assert not any(key(scene) == key(scenes[0]) for scene in scenes[1:])
     assert all(key(padded(scene)) == key(padded(scenes[0])) for scene in scenes[1:])
-    one, other = (np.asarray(pj.render(scene, 4, seed=3)) for scene in (scenes[1], padded(scenes[1])))
-    np.testing.assert_array_equal(one, other)
 
 
 def test_images_are_those_of_single_renders_and_one_kernel_makes_them(folder, tmp_path, monkeypatch):
+    """To the bit: what scenes are padded with adds nothing."""
     jobs = some_jobs()
     jobs[1] |= {"set": {"floor.reflectance": [0.1, 0.2, 0.3]}, "parameters": {"fov": 30}, "seed": 5}
     jobs[2] |= {"output": "deep/er/2.exr"}

@@ -16,7 +16,7 @@ from pathjax.compile import xla
 OPTION = "xla_cpu_small_while_loop_byte_threshold"
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def python(root):
     """(code, **environment) -> what it prints as JSON on its last line, and its stderr; in a process of its own."""
 
@@ -38,19 +38,20 @@ print(json.dumps([os.environ.get("XLA_FLAGS", ""), jax.local_device_count(), pat
 """
 
 
-def test_import_turns_native_loops_on_with_a_device_per_core(python):
-    (flags, devices, native), err = python(FLAGS_AND_DEVICES)
+@pytest.fixture(scope="module")
+def untouched(python):
+    """Flags, number of devices, whether loops are native, and stderr, where the user has set nothing."""
+    values, err = python(FLAGS_AND_DEVICES)
+    return *values, err
+
+
+def test_import_turns_native_loops_on_with_a_device_per_core(untouched):
+    flags, devices, native, err = untouched
     assert OPTION in flags
     assert native
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     assert devices == cores
     assert "Warning" not in err
-
-
-def test_users_flags_are_kept(python):
-    (flags, _, native), _ = python(FLAGS_AND_DEVICES, XLA_FLAGS="--xla_cpu_enable_fast_math=false")
-    assert flags.startswith("--xla_cpu_enable_fast_math=false ")
-    assert native
 
 
 @pytest.mark.parametrize(
@@ -61,10 +62,13 @@ def test_users_flags_are_kept(python):
         "--xla_backend_extra_options=xla_cpu_disable_loop_unrolling=false",
     ],
 )
-def test_users_vectors_and_optimisation_are_kept(python, mine):
-    (flags, _, native), _ = python(FLAGS_AND_DEVICES, XLA_FLAGS=mine)
-    assert flags.count(mine.split("=")[-2]) == 1
-    assert native
+def test_users_flags_are_kept(python, untouched, mine):
+    """Those that pathjax does not know, and each of those that it sets too; the others it adds."""
+    users = f"--xla_cpu_enable_fast_math=false {mine} --xla_cpu_collective_call_terminate_timeout_seconds=50"
+    (flags, _, native), _ = python(FLAGS_AND_DEVICES, XLA_FLAGS=users)
+    assert native and flags.startswith(f"{users} ")
+    ours = [each for each in untouched[0].split() if each.split("=")[-2] not in users and "collective" not in each]
+    assert flags.removeprefix(f"{users} ").split() == ours
 
 
 def test_users_own_threshold_is_kept(python):
@@ -89,12 +93,9 @@ def test_users_number_of_devices_is_kept(python, code, environment):
 
 
 def test_setting_up_again_changes_nothing(python):
-    (flags, devices, native), err = python("import pathjax.compile; pathjax.compile.setup()" + FLAGS_AND_DEVICES)
+    (flags, _, native), _ = python("import pathjax.compile; pathjax.compile.setup()" + FLAGS_AND_DEVICES)
     assert flags.count(OPTION) == 1
     assert native
-    (_, _, native), err = python(STARTED + "import pathjax; pathjax.compile.setup()" + FLAGS_AND_DEVICES)
-    assert err.count("UserWarning") == 1
-    assert not native
 
 
 STARTED = "import jax; jax.devices()\n"
@@ -102,7 +103,9 @@ STARTED = "import jax; jax.devices()\n"
 
 @pytest.mark.parametrize("number", [{}, {"JAX_NUM_CPU_DEVICES": "2"}])
 def test_import_after_the_backend_warns_once_with_the_remedy(python, number):
-    (flags, _, native), err = python(STARTED + "import pathjax" + FLAGS_AND_DEVICES, **number)
+    """Once, even if it is set up again."""
+    again = "import pathjax; pathjax.compile.setup()"
+    (flags, _, native), err = python(STARTED + again + FLAGS_AND_DEVICES, **number)
     assert err.count("UserWarning") == 1
     assert "before" in err and f"XLA_FLAGS='{xla._FLAG} {xla._WIDTH_FLAG}'" in err
     assert OPTION not in flags
@@ -142,17 +145,14 @@ def test_renders_are_right_without_native_loops(python, root, opted_out):
     np.testing.assert_allclose(image, np.broadcast_to((1 - rho**4) / (1 - rho), (4, 4, 3)), rtol=1e-5)
 
 
-def test_parts_of_a_kernel_may_end_long_after_each_other(python):
+def test_parts_of_a_kernel_may_end_long_after_each_other(untouched):
     """XLA takes such a time for a hanging program's, and aborts; of jaxlib 0.7 nobody can ask for more."""
-    (flags, _, _), _ = python(FLAGS_AND_DEVICES)
+    flags = untouched[0]
     if "terminate_timeout" not in xla._PATIENCE_FLAGS:
         pytest.skip("this jaxlib has no such flag")
     year = 365 * 86400
     assert all(int(seconds) > year for seconds in re.findall(r"collective_call_\w+_timeout_seconds=(\d+)", flags))
     assert len(re.findall("collective_call", flags)) == 2
-    mine = "--xla_cpu_collective_call_terminate_timeout_seconds=50"
-    (flags, _, _), _ = python(FLAGS_AND_DEVICES, XLA_FLAGS=mine)
-    assert flags.startswith(mine) and flags.count("collective_call") == 1
 
 
 UNEVEN = """
@@ -230,26 +230,23 @@ print(json.dumps([seconds, sorted(heavy & (set(sys.modules) - before))]))
 
 
 def test_import_is_light(python, tmp_path):
-    """Within 0.3 s of CPU time of `import jax`: the best of three, as other work on the machine only ever adds.
+    """Within 0.3 s of CPU time of `import jax`: once of three times, as other work on the machine only ever adds.
 
     Neither it nor the command `render` imports what it needs for some uses alone.
     With the bytecode that Python keeps of what is installed, which some environments turn off.
     """
     bytecode = {"PYTHONDONTWRITEBYTECODE": "", "PYTHONPYCACHEPREFIX": str(tmp_path)}
-    runs = [python(IMPORTS, **bytecode)[0] for _ in range(3)]
-    assert all(heavy == [] for _, heavy in runs)
-    assert min(seconds for seconds, _ in runs) < 0.3
+    for _ in range(4):  # the first one writes the bytecode
+        (seconds, heavy), _ = python(IMPORTS, **bytecode)
+        assert heavy == []
+        if seconds < 0.3:
+            return
+    pytest.fail(f"import pathjax took {seconds:.2f} s")
 
 
-@pytest.mark.parametrize("before", [True, False])
-def test_import_leaves_the_collector_as_it_was(python, before):
-    """It is off meanwhile."""
-    code = f"import gc\n{'gc.enable' if before else 'gc.disable'}()\nimport pathjax\nprint(json.dumps(gc.isenabled()))"
-    assert python(code)[0] is before
-
-
-def test_import_starts_no_backend(python):
-    started, _ = python(
-        "import pathjax\nfrom jax._src import xla_bridge\nprint(json.dumps(xla_bridge.backends_are_initialized()))"
-    )
-    assert started is False
+@pytest.mark.parametrize("before", ["enable", "disable"])
+def test_import_starts_no_backend_and_leaves_the_collector_as_it_was(python, before):
+    """The collector is off meanwhile."""
+    code = f"import gc\ngc.{before}()\nimport pathjax\nfrom jax._src import xla_bridge\n"
+    (collects, started), _ = python(code + "print(json.dumps([gc.isenabled(), xla_bridge.backends_are_initialized()]))")
+    assert collects is (before == "enable") and started is False

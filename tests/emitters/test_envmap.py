@@ -262,8 +262,8 @@ def test_images_are_linear_in_the_scale(make_scene, sky):
     assert "sky.scale" in pj.parameters(scene)
     image, J = pj.jacobian(scene, ["sky.scale"], 16)
     np.testing.assert_allclose(np.asarray(J["sky.scale"]) * 0.5, image, rtol=1e-5)
-    doubled = pj.with_parameters(scene, {"sky.scale": 1.0})
-    np.testing.assert_allclose(pj.render(doubled, 16), 2 * np.asarray(pj.render(scene, 16)), rtol=1e-5)
+    doubled, _ = pj.jacobian(pj.with_parameters(scene, {"sky.scale": 1.0}), ["sky.scale"], 16)
+    np.testing.assert_allclose(doubled, 2 * np.asarray(image), rtol=1e-5)
 
 
 def test_texels_are_a_parameter(make_scene, sky):
@@ -295,11 +295,12 @@ def test_terms_first_hits_and_hidden_emitters(make_scene, sky):
     above = np.s_[:2]
     assert np.asarray(pj.render(shown, 4))[above].min() > 0
     assert not np.asarray(pj.render(hidden, 4))[above].any() and np.asarray(pj.render(hidden, 4))[8:].any()
-    terms = np.asarray(pj.render_bounces(shown, 3, 4).terms)
+    bare = make_scene(FLOOR + light, res=16, **VIEW)
+    terms = np.asarray(pj.render_bounces(bare, 3, 4).terms)
     assert terms[0][above].min() > 0 and not terms[1:][:, above].any() and terms[1].any()
-    assert pj.render_aovs(shown, ["normal"])["normal"].shape == (16, 16, 3)
+    assert pj.render_aovs(bare, ["normal"])["normal"].shape == (16, 16, 3)
     with pytest.raises(pj.InputError, match="envmap emitter; patches hold the light of surfaces alone"):
-        transport.operator(make_scene(FLOOR + light))
+        transport.operator(bare)
 
 
 @pytest.mark.slow

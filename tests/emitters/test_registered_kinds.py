@@ -117,7 +117,7 @@ ANSWERS = {
 
 
 @pytest.mark.parametrize("light", [BULB, SUN])
-@pytest.mark.parametrize("strategy", ["mis", "light"])
+@pytest.mark.parametrize("strategy", ["mis", pytest.param("light", marks=pytest.mark.slow)])
 def test_a_dirac_light_alone_leaves_no_noise(make_scene, light, strategy):
     image = pj.render(make_scene(FLOOR.format("") + light, **VIEW), 1, strategy=strategy)
     np.testing.assert_allclose(image, np.broadcast_to(ANSWERS[light], image.shape), rtol=1e-4)
@@ -152,7 +152,7 @@ def test_the_parameters_of_a_registered_kind_are_differentiated(make_scene):
 LAMP = '<shape type="rectangle"><transform name="to_world"><rotate x="1" angle="90"/>{}</transform>{}</shape>'
 
 
-@pytest.mark.parametrize("strategy", ["mis", "light"])
+@pytest.mark.parametrize("strategy", ["mis", pytest.param("light", marks=pytest.mark.slow)])
 def test_two_kinds_of_lamp_are_sampled_and_hit_as_one_another(make_scene, estimate, agree, strategy):
     """What bsdf sampling alone finds of them; under a sphere of one kind, beside a rectangle of the other."""
     body = FLOOR.format('<scale value="9"/>') + LAMP.format('<translate y="2" x="1"/>', emitter("area"))

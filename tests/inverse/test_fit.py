@@ -46,6 +46,11 @@ def kind(request):
     return request.param
 
 
+# A target of each kind has a program of its own; what does not depend on it is quickly tested with one.
+EXR_FIRST = pytest.mark.parametrize("kind", ["exr", pytest.param("png", marks=pytest.mark.slow)], indirect=True)
+PNG_FIRST = pytest.mark.parametrize("kind", [pytest.param("exr", marks=pytest.mark.slow), "png"], indirect=True)
+
+
 def stored(image, path):
     """The target that is read back from a file of the kind that its name says."""
     image = np.asarray(image)
@@ -152,6 +157,7 @@ def test_values_at_their_bounds_are_reached_and_told(room, store):
     assert set(fit.at_bound) <= {f"{n}.{c}" for n in NAMES for c in "rgb"} - {"floor.reflectance.g"}
 
 
+@EXR_FIRST
 def test_what_images_do_not_determine_is_named(make_scene, store):
     """One bounce under a sky that is not seen: only the product of its radiance and the albedo shows."""
     scene = make_scene(ROOM, res=16, depth=2, origin="0, 0.5, 3", fov=50, hide="true")
@@ -167,6 +173,7 @@ def test_what_images_do_not_determine_is_named(make_scene, store):
     json_text(report.facts(fit))
 
 
+@EXR_FIRST
 def test_a_parameter_that_does_not_show_is_named(make_scene, store):
     body = (
         ROOM
@@ -180,6 +187,7 @@ def test_a_parameter_that_does_not_show_is_named(make_scene, store):
     assert np.isfinite(fit.standard_errors["floor.reflectance"]).all()
 
 
+@PNG_FIRST
 def test_views_share_parameters_and_know_more_together(write_scene, room, target, fitted):
     """The second target is an array, whatever the first is."""
     other = pj.load_scene(write_scene(ROOM, res=16, depth=5, origin="1, 1, 2.5", fov=50))
@@ -303,6 +311,7 @@ def cornell_image(cornell):
     return np.asarray(pj.render(cornell, 1024, seed=7))
 
 
+@PNG_FIRST
 def test_a_lamp_that_is_clipped_does_not_move_the_answer(cornell, cornell_image, store):
     target = store(cornell_image)
     fit = pj.fit(cornell, target, list(WHITE), start=WHITE)
@@ -371,6 +380,7 @@ def ball_target(ball_image, store):
     return store(ball_image)
 
 
+@EXR_FIRST
 @pytest.mark.parametrize("start", [1.2, *(pytest.param(far, marks=pytest.mark.slow) for far in (1.05, 2.5))])
 def test_ior_is_recovered_from_far(ball, ball_target, start):
     fit = pj.fit(ball, ball_target, ["glass.int_ior"], start={"glass.int_ior": start}, spp=32)
@@ -378,6 +388,7 @@ def test_ior_is_recovered_from_far(ball, ball_target, start):
     assert abs(fit.values["glass.int_ior"] - 1.5) < 4 * fit.standard_errors["glass.int_ior"] < 4 * 2e-3
 
 
+@EXR_FIRST
 def test_a_local_minimum_is_not_taken_for_the_answer(ball, ball_target):
     fit = pj.fit(ball, ball_target, ["glass.int_ior"], start={"glass.int_ior": 1.2}, spp=32, scan=False)
     assert abs(fit.values["glass.int_ior"] - 1.5) > 0.1
