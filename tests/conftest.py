@@ -59,7 +59,7 @@ def interrupts_are_heard():
         signal.pthread_sigmask(signal.SIG_UNBLOCK, (signal.SIGINT, signal.SIGTERM))
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def compiled_anew():
     """Nothing is taken from what other tests have compiled: for those that time compilation."""
     compilation_cache.reset_cache()  # JAX asks once whether to keep anything

@@ -88,7 +88,7 @@ def default(shipped, estimate):
 
     def of(name):
         if name not in made:
-            scene = shipped(name, res=12)
+            scene = shipped(name, res=16)  # of which other tests have the kernel
             made[name] = scene, estimate(scene, spp=256, first_seed=101)
         return made[name]
 
@@ -182,9 +182,9 @@ def test_choices_are_one_native_kernel(shipped):
 def test_vectorised_form_splits_into_the_same_image(default):
     scene, _ = default("glass_ball")
     images = [pj.render(scene, 4, split_depth=2)]
-    pixels = jnp.arange(144, dtype=jnp.int32)
+    pixels = jnp.arange(256, dtype=jnp.int32)
     for form in ("loop", "vmap"):
-        images.append(render_pixels(scene, pixels, 0, 4, 0, Options(split_depth=2), form=form).reshape(12, 12, 3))
+        images.append(render_pixels(scene, pixels, 0, 4, 0, Options(split_depth=2), form=form).reshape(16, 16, 3))
     for image in images[1:]:
         assert np.isclose(images[0], image, rtol=1e-4, atol=1e-5).all(-1).mean() > 0.97
 
@@ -194,7 +194,7 @@ def test_float64_splits_into_the_same_image(shipped, default, x64):
     scene, _ = default("glass_ball")
     single = np.asarray(pj.render(scene, 4, split_depth=2))
     with x64():
-        double = np.asarray(pj.render(shipped("glass_ball", jnp.float64, res=12), 4, split_depth=2))
+        double = np.asarray(pj.render(shipped("glass_ball", jnp.float64, res=16), 4, split_depth=2))
     assert double.dtype == np.float64
     assert np.isclose(single, double, rtol=1e-3, atol=1e-5).all(-1).mean() > 0.97
 

@@ -64,9 +64,12 @@ def assert_one_native_kernel(compiled):
 # ---- native kernels -------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", but(*LARGE))
-def test_every_scene_renders_in_one_native_kernel(kernel_of, name):
+@pytest.mark.parametrize("name", but(*LARGE, *REPEATED))
+def test_every_scene_renders_in_one_native_kernel_what_is_finite_and_not_negative(kernel_of, name):
     assert_one_native_kernel(kernel_of(name).compiled)
+    image = kernel_of(name).image(spp=64)
+    assert np.isfinite(image).all()
+    assert image.min() >= 0 and image.max() > 0
 
 
 def test_the_cornell_box_is_a_small_program(shipped):

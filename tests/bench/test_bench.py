@@ -18,8 +18,6 @@ from pathjax.images import rel_mse
 
 ROOT = Path(__file__).resolve().parents[2]
 CORNELL, FURNACE = (str(ROOT / "scenes" / f"{name}.xml") for name in ("cornell_box", "furnace"))
-# `bench` times compilation.
-pytestmark = pytest.mark.usefixtures("compiled_anew")
 SMALL = ["-D", "res=8", "--spp", "2,32", "--reference-spp", "512", "--repeat", "2"]
 
 needs_mitsuba = pytest.mark.skipif(not importlib.util.find_spec("mitsuba"), reason="Mitsuba is not installed")
@@ -35,7 +33,7 @@ def run(*arguments, status=0):
 
 
 @pytest.fixture(scope="module")
-def folder(compiled_anew, tmp_path_factory):
+def folder(tmp_path_factory):
     """A report of everything but Mitsuba."""
     folder = tmp_path_factory.mktemp("bench") / "report"
     run(CORNELL, *SMALL, "-o", str(folder))
@@ -123,6 +121,7 @@ def test_float64_has_a_process_of_its_own():
         peers.call("pathjax_alone", {**request, "scene": "nowhere.xml", "dtype": "float32"})
 
 
+@pytest.mark.usefixtures("compiled_anew")
 def test_several_scenes_without_matplotlib(tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     run(FURNACE, FURNACE, *SMALL, "--quick", "-o", str(tmp_path / "report"), "--json")

@@ -33,7 +33,7 @@ def target(tmp_path):
     return write_target(tmp_path / "target.exr")
 
 
-@pytest.mark.parametrize("kind", ["exr", "png"])
+@pytest.mark.parametrize("kind", ["exr", pytest.param("png", marks=pytest.mark.slow)])
 def test_fit_prints_a_table_and_writes_its_files(run, tmp_path, kind):
     target = write_target(tmp_path / f"target.{kind}", **{"glow.radiance": [0.2, 0.2, 0.2]})
     start = "--set", "glow.radiance=0.2", "--param", "wall.reflectance=0.6"

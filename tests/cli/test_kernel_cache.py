@@ -89,7 +89,7 @@ def test_a_cache_of_the_users_choice_is_used_instead(counted, tmp_path):
 
 
 @linux
-@pytest.mark.parametrize("name", ["file", BYTE])
+@pytest.mark.parametrize("name", ["file", pytest.param(BYTE, marks=pytest.mark.slow)])
 def test_a_cache_that_cannot_be_written_stops_no_render(counted, tmp_path, name):
     (tmp_path / "file").write_text("")
     assert end(counted(XDG_CACHE_HOME=tmp_path / name))[1] == 0

@@ -291,11 +291,11 @@ def test_texels_are_a_parameter(make_scene, sky):
 
 def test_terms_first_hits_and_hidden_emitters(make_scene, sky):
     light = sky(picture(16, 32))
-    shown, hidden = (make_scene(FLOOR + BALLS + light, res=16, hide=hide, **VIEW) for hide in ("false", "true"))
+    shown = make_scene(FLOOR + BALLS + light, res=16, **VIEW)
+    bare, hidden = (make_scene(FLOOR + light, res=16, hide=hide, **VIEW) for hide in ("false", "true"))
     above = np.s_[:2]
     assert np.asarray(pj.render(shown, 4))[above].min() > 0
     assert not np.asarray(pj.render(hidden, 4))[above].any() and np.asarray(pj.render(hidden, 4))[8:].any()
-    bare = make_scene(FLOOR + light, res=16, **VIEW)
     terms = np.asarray(pj.render_bounces(bare, 3, 4).terms)
     assert terms[0][above].min() > 0 and not terms[1:][:, above].any() and terms[1].any()
     assert pj.render_aovs(bare, ["normal"])["normal"].shape == (16, 16, 3)

@@ -24,12 +24,10 @@ ROUNDING, ASTRAY = {jnp.float32: 1e-3, jnp.float64: 1e-9}, {jnp.float32: 5e-3, j
 
 
 def rendered(scene):
-    """(SPP, H, W, 3) samples of `path`, each an image of one."""
-    count = film.pixel_count(scene.film)
-    pixels = jnp.tile(jnp.arange(count, dtype=jnp.int32), SPP)
-    numbers = pixel.numbers(pixels, jnp.repeat(jnp.arange(SPP), count), 1, SEED)
-    means = pixel_means(scene, pixels, *numbers, options=DEFAULTS)
-    return np.asarray(means).reshape(SPP, *film.image_shape(scene.film), 3)
+    """(SPP, H, W, 3) samples of `path`, each an image of one, by the kernel that other tests have of this size."""
+    pixels, shape = film.pixels(scene.film), film.image_shape(scene.film)
+    numbers = (pixel.numbers(pixels, sample, 1, SEED) for sample in range(SPP))
+    return np.stack([pixel_means(scene, pixels, *each, options=DEFAULTS).reshape(*shape, 3) for each in numbers])
 
 
 def assert_same_samples(scene, dtype):
@@ -55,7 +53,7 @@ def test_in_float64_no_sample_goes_astray(shipped, x64, name):
 @pytest.mark.parametrize("name", ["cornell_box", pytest.param("glass_and_mirror", marks=pytest.mark.slow)])
 def test_images_of_other_random_numbers_agree(shipped, estimate, estimate_type, agree, name):
     """With the false-alarm rate of `agree`, 1e-4."""
-    scene = shipped(name, res=8)
-    images = np.stack([np.asarray(reference.samples(nameless(scene), 64, seed)).mean(0) for seed in range(101, 117)])
+    scene = shipped(name, res=16)
+    images = np.stack([np.asarray(reference.samples(nameless(scene), SPP, seed)).mean(0) for seed in range(101, 229)])
     plain = estimate_type(images.mean(0), images.var(0, ddof=1) / len(images), len(images))
     agree(estimate(scene, spp=64), plain)
