@@ -1,5 +1,7 @@
 """JAX's debug flags, by which users look for bugs of their own, find nothing in healthy scenes."""
 
+from contextlib import contextmanager
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,11 +10,14 @@ import pytest
 import pathjax as pj
 from pathjax import transport
 
-FLAGS = {
-    "debug_nans": lambda: jax.debug_nans(True),
-    "dtype_promotion": lambda: jax.numpy_dtype_promotion("strict"),
-    "rank_promotion": lambda: jax.numpy_rank_promotion("raise"),
-}
+
+@contextmanager
+def strict_promotion():
+    with jax.numpy_dtype_promotion("strict"), jax.numpy_rank_promotion("raise"):
+        yield
+
+
+FLAGS = {"debug_nans": lambda: jax.debug_nans(True), "strict_promotion": strict_promotion}
 SLOW = pytest.mark.slow
 # Boxes and rectangles; triangles in a tree, whose leaves have empty lanes; a sphere and glass, of which the derivatives
 # are quick; the rest.

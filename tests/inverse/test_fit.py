@@ -362,7 +362,7 @@ def test_pixels_that_are_left_out_may_hold_anything(room, target_image):
 
 @pytest.fixture(scope="module")
 def ball(shipped):
-    return shipped("glass_ball", res=32)
+    return shipped("glass_ball", res=64)  # as in the README, whose programs these fits share
 
 
 @pytest.fixture(scope="module")
