@@ -32,7 +32,7 @@ def shape(kind, inside):
     return f'<shape type="{kind}" id="it">{inside}</shape>'
 
 
-@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+@pytest.mark.parametrize("dtype", [jnp.float32, pytest.param(jnp.float64, marks=pytest.mark.slow)])
 def test_points_of_a_patch_lie_in_it(make_scene, x64, dtype):
     """All kinds of shape, both sides; 64 points each."""
     both = f'<bsdf type="twosided">{GREY}</bsdf>'
