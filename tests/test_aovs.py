@@ -103,6 +103,7 @@ def test_chunks_make_no_difference(shipped, monkeypatch):
 @pytest.mark.parametrize(
     "names, how, says",
     [
+        ("depth", {}, r"write \['depth'\]"),
         (["depht"], {}, "depht"),
         (["depth", "normal", "depth"], {}, "depth is named twice"),
         (["depth"], {"spp": 0}, "spp"),

@@ -296,15 +296,23 @@ def test_depth_out_of_range(furnace, depth):
         pj.render_bounces(furnace, depth)
 
 
-@pytest.mark.parametrize("how, says", [({"spp": 0}, "spp"), ({"seed": -1}, "seed"), ({"strategy": "mix"}, "mix")])
+@pytest.mark.parametrize(
+    "how, says",
+    [
+        ({"spp": 0}, "spp"),
+        ({"spp": np.ones((3, 3), int)}, r"spp has the shape \(3, 3\); .* the \(16, 16\) pixels"),
+        ({"seed": -1}, "seed"),
+        ({"strategy": "mix"}, "mix"),
+    ],
+)
 def test_arguments_out_of_range(furnace, how, says):
     with pytest.raises(pj.InputError, match=says):
         pj.render_bounces(furnace, 3, **how)
 
 
-def test_tail_of_too_few_terms(furnace):
+def test_tail_of_too_few_terms():
     with pytest.raises(pj.InputError, match="depth = 2; a tail needs"):
-        pj.render_bounces(furnace, 2, 4).tail()
+        tail.fit(np.ones((2, 3)), np.ones((2, 3)))
 
 
 @pytest.mark.parametrize("error", [0, 1, -0.5])

@@ -139,6 +139,8 @@ def test_weights_differentiate_polynomials():
 def test_bad_input_is_refused(room):
     with pytest.raises(pj.InputError, match=r"did you mean floor\.reflectance"):
         pj.check_gradient(room, "flor.reflectance")
+    with pytest.raises(pj.InputError, match="at = 0.5; of a scene it is the name"):
+        pj.check_gradient(room, 0.5)
     with pytest.raises(pj.InputError, match="at least 3"):
         pj.check_gradient(room, "floor.reflectance", seeds=2)
     with pytest.raises(pj.InputError, match="between 0 and 1"):

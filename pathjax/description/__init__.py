@@ -84,5 +84,5 @@ def chosen(sensors: list[str], which: int | str, file: str) -> str:
     if str(which).isdigit() and int(which) < len(sensors):
         return sensors[int(which)]
     ids = [name for number, name in enumerate(sensors) if name != str(number)]
-    known = f"0 to {len(sensors) - 1}" + (f" or {', '.join(ids)}" if ids else "")
-    raise InputError(f"{file}: there is no sensor {which!r}; use {known}{nearest(str(which), ids)}")
+    known = [f"0 to {len(sensors) - 1}" if len(sensors) > 1 else "0", *([", ".join(ids)] if ids else [])]
+    raise InputError(f"{file}: there is no sensor {which!r}; use {' or '.join(known)}{nearest(str(which), ids)}")

@@ -67,7 +67,9 @@ def render_aovs(scene: Scene, names: Sequence[str], spp: int = MAX_SPP, seed: in
 
 
 def check_names(names: Sequence[str], known: Sequence[str]) -> None:
-    """Refuse what is not known, and what is named twice."""
+    """Refuse what is no list, not known, or named twice."""
+    if isinstance(names, str):
+        raise InputError(f"names is a list of output variables; write [{names!r}]")
     for i, name in enumerate(names):
         if name not in known:
             raise InputError(f"no output variable is named {name!r}; known are {', '.join(known)}")

@@ -105,6 +105,8 @@ def render_bounces(
     options.check_counts(spp, seed)
     options.check_strategy(scene)
     shape = film.image_shape(scene.film)
+    if np.shape(spp) not in ((), shape):
+        raise InputError(f"spp has the shape {np.shape(spp)}; it is one number, or one for each of the {shape} pixels")
     samples = jnp.broadcast_to(jnp.asarray(spp, jnp.int32), shape)
     return _bounces(scene, int(depth), film.pixels(scene.film), samples, seed, options, errors)
 

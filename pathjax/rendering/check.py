@@ -152,6 +152,8 @@ def check_gradient(
 
 def _of_scene(scene, name, spp):
     """Render, derivative, value and bounds of a parameter; and nodes, or None for those that fit the value."""
+    if not isinstance(name, str):
+        raise InputError(f"at = {name!r}; of a scene it is the name of a parameter, as `parameters` lists them")
     parameter = named.find(scene, name)
     value = named.parameters(scene)[name]
 

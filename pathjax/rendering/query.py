@@ -8,11 +8,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Bool, Real
+from jaxtyping import Array, Bool, Float, Real
 
 from pathjax.compile import native_map, usual_promotion
 from pathjax.core.math import normalize, rescale
 from pathjax.core.types import Hit, Ray
+from pathjax.errors import InputError
 from pathjax.scene.alike import by_all
 from pathjax.scene.scene import Scene
 from pathjax.shapes import geometry
@@ -29,9 +30,10 @@ def closest_hit(scene: Scene, origins: Vectors, directions: Vectors) -> Hit:
         Hit of arrays (N,). `t` is the distance, inf where the ray meets nothing; `primitive` and `shape` are then -1.
         `shape` counts the shapes of the file; `primitive` counts spheres, rectangles (six of each cube), disks and
         triangles, in this order.
+    Raises:
+        InputError: origins and directions do not have one shape (N, 3).
     """
-    dtype = scene.camera.origin.dtype
-    return _closest_hit(scene.geometry, jnp.asarray(origins, dtype), jnp.asarray(directions, dtype))
+    return _closest_hit(scene.geometry, *_rays(scene, origins, directions))
 
 
 @by_all
@@ -44,11 +46,23 @@ def any_hit(
     Args:
         directions: of any positive length.
         distances: (N,) or one for all, in units of the scene, whatever the length of the directions; inf: no limit.
+    Raises:
+        InputError: origins and directions do not have one shape (N, 3), or there is another number of distances.
     """
-    dtype = scene.camera.origin.dtype
-    origins, directions = jnp.asarray(origins, dtype), jnp.asarray(directions, dtype)
-    distances = jnp.broadcast_to(jnp.asarray(distances, dtype), origins.shape[:1])
+    origins, directions = _rays(scene, origins, directions)
+    if np.shape(distances) not in ((), origins.shape[:1]):
+        raise InputError(f"distances have the shape {np.shape(distances)}; give one, or one for each of the rays")
+    distances = jnp.broadcast_to(jnp.asarray(distances, origins.dtype), origins.shape[:1])
     return _any_hit(scene.geometry, origins, directions, distances)
+
+
+def _rays(scene: Scene, origins: Vectors, directions: Vectors) -> tuple[Float[Array, "N 3"], Float[Array, "N 3"]]:
+    """Both as arrays of the scene's dtype. Kernels clamp indices, and would make vectors of whatever is there."""
+    shapes = np.shape(origins), np.shape(directions)
+    if shapes[0] != shapes[1] or shapes[0][1:] != (3,):
+        raise InputError(f"origins and directions have the shapes {shapes[0]} and {shapes[1]}; both must be (N, 3)")
+    dtype = scene.camera.origin.dtype
+    return jnp.asarray(origins, dtype), jnp.asarray(directions, dtype)
 
 
 @partial(jax.jit, static_argnames=("form", "devices"))

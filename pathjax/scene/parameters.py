@@ -93,15 +93,15 @@ def _offer(near, parameters):
 
 def checked(name, value, parameter: Parameter, dtype):
     """The value as an array of the parameter's shape; values that are known must lie within its bounds."""
+    given = value
     try:
-        value = jnp.asarray(value, dtype)
-        value = jnp.broadcast_to(value, parameter.shape)
+        value = jnp.broadcast_to(jnp.asarray(given, dtype), parameter.shape)
     except (TypeError, ValueError):
         if parameter.is_texture:
-            given = " x ".join(map(str, np.shape(value)))
+            given = " x ".join(map(str, np.shape(given)))
             raise InputError(f"{name} has the shape {parameter.shape}, and cannot be set to {given} numbers") from None
         wanted = f"{parameter.shape[0]} numbers" if parameter.shape else "one number"
-        raise InputError(f"{name} takes {wanted}, not {value!r}") from None
+        raise InputError(f"{name} takes {wanted}, not {given!r}") from None
     if not is_traced(value):
         low, high = parameter.bounds
         if not bool(jnp.all((value >= low) & (value <= high) & jnp.isfinite(value))):

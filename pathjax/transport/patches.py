@@ -50,7 +50,7 @@ def cut(scene: Scene, count: int, faceted: bool = False) -> Patches:
         InputError: nothing to cut, a primitive of zero area, or something that is not diffuse: named.
     """
     if not isinstance(count, int) or count < 1:
-        raise InputError(f"patches = {count}; a scene is cut into at least 1")
+        raise InputError(f"patches = {count!r}; it is the number of patches, an integer of at least 1")
     shapes = scene.geometry
     if not shapes.tables:
         raise InputError("a scene without shapes has no patches")

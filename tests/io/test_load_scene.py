@@ -62,6 +62,8 @@ def test_a_scene_is_seen_by_each_sensor_of_its_file(write_scene, tmp_path):
     assert scene.with_sensor("near").film.width == 6
     with pytest.raises(pj.InputError, match="there is no sensor 'far'; use 0 to 1 or near"):
         scene.with_sensor("far")
+    with pytest.raises(pj.InputError, match="there is no sensor 1; use 0$"):
+        pj.load_scene(write_scene(MESH)).with_sensor(1)
     pj.save_scene(scene.with_sensor("near"), tmp_path / "saved.xml")
     assert pj.load_scene(tmp_path / "saved.xml").sensors == ("near", "1")
 

@@ -32,6 +32,25 @@ def test_what_blocks_is_met_before_the_distance(spheres, rays):
     assert pj.any_hit(spheres, *(x[:0] for x in rays)).shape == (0,)
 
 
+@pytest.mark.parametrize(
+    "origins, directions, says",
+    [
+        ((3,), (3,), r"shapes \(3,\) and \(3,\); both must be \(N, 3\)"),
+        ((2, 2), (2, 2), r"both must be \(N, 3\)"),
+        ((2, 3), (5, 3), r"shapes \(2, 3\) and \(5, 3\)"),
+    ],
+)
+def test_rays_of_other_shapes_are_refused(spheres, origins, directions, says):
+    for query in (pj.closest_hit, pj.any_hit):
+        with pytest.raises(pj.InputError, match=says):
+            query(spheres, np.zeros(origins), np.ones(directions))
+
+
+def test_another_number_of_distances_is_refused(spheres):
+    with pytest.raises(pj.InputError, match=r"distances have the shape \(3,\); give one, or one for each"):
+        pj.any_hit(spheres, np.zeros((2, 3)), np.ones((2, 3)), np.ones(3))
+
+
 def test_queries_within_jit_vmap_and_loops(spheres, rays):
     alone = np.asarray(pj.closest_hit(spheres, *rays).t), np.asarray(pj.any_hit(spheres, *rays, 1.0))
 
