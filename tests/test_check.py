@@ -139,7 +139,7 @@ def test_weights_differentiate_polynomials():
 def test_bad_input_is_refused(room):
     with pytest.raises(pj.InputError, match=r"did you mean floor\.reflectance"):
         pj.check_gradient(room, "flor.reflectance")
-    with pytest.raises(pj.InputError, match="at = 0.5; of a scene it is the name"):
+    with pytest.raises(pj.InputError, match="no parameter is named 0.5; the scene has"):
         pj.check_gradient(room, 0.5)
     with pytest.raises(pj.InputError, match="at least 3"):
         pj.check_gradient(room, "floor.reflectance", seeds=2)
@@ -152,6 +152,13 @@ def test_bad_input_is_refused(room):
         pj.check_gradient(right.image, 0.5)
     with pytest.raises(pj.InputError, match=r"lies outside the bounds \[0, 1\]"):
         right.check(1.5)
+    for reach in (0, -1, np.nan):
+        with pytest.raises(pj.InputError, match="reach = .*; it must be positive"):
+            right.check(reach=reach)
+    with pytest.raises(pj.InputError, match="block = 0; .* at least 1"):
+        right.check(block=0)
+    with pytest.raises(pj.InputError, match="theta holds no number"):
+        right.check(np.zeros(0))
     with pytest.raises(pj.InputError, match="no room"):
         pj.check_gradient(right.image, 0.5, derivative=right.derivative, bounds=(0.5, 0.5))
     with pytest.raises(pj.InputError, match="three axes"):

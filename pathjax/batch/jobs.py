@@ -48,10 +48,10 @@ def read(file: str | os.PathLike) -> list[Job]:
         raise InputError(f"{file}: the jobs cannot be read: {why}") from None
     # Not `splitlines`, which also ends lines within strings, at U+2028.
     numbered = ((f"{file}:{number}", line) for number, line in enumerate(text.split("\n"), 1) if line.strip())
-    return checked((place, _object(place, line)) for place, line in numbered)
+    return checked((place, _decoded(place, line)) for place, line in numbered)
 
 
-def checked(numbered: Iterable[tuple[str, Mapping]]) -> list[Job]:
+def checked(numbered: Iterable[tuple[str, object]]) -> list[Job]:
     """Jobs of mappings with the fields of `Job`, and of each the place where it stands."""
     jobs = [_job(place, values) for place, values in numbered]
     if not jobs:
@@ -67,17 +67,16 @@ def checked(numbered: Iterable[tuple[str, Mapping]]) -> list[Job]:
 _EXAMPLE = '{"scene": "box.xml", "output": "box.exr", "spp": 16}'
 
 
-def _object(place: str, line: str) -> Mapping:
+def _decoded(place: str, line: str) -> object:
     try:
-        values = json.loads(line)
+        return json.loads(line)
     except json.JSONDecodeError as error:
-        raise InputError(f"{place}: column {error.colno}: {error.msg}; a line is one JSON object: {_EXAMPLE}") from None
-    if not isinstance(values, dict):
-        raise InputError(f"{place}: a line is one JSON object, such as {_EXAMPLE}, not {line.strip()[:40]}")
-    return values
+        raise InputError(f"{place}: column {error.colno}: {error.msg}; a job is one JSON object: {_EXAMPLE}") from None
 
 
-def _job(place: str, values: Mapping) -> Job:
+def _job(place: str, values: object) -> Job:
+    if not isinstance(values, Mapping):
+        raise InputError(f"{place}: a job is one JSON object or mapping, such as {_EXAMPLE}, not {str(values)[:40]}")
     for key in values:
         if key not in KEYS:
             raise InputError(f'{place}: a job has no "{key}"{nearest(key, KEYS)}; its keys are {", ".join(KEYS)}')

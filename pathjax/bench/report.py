@@ -105,7 +105,7 @@ def _speed(scene: dict) -> list[str]:
     for sampler, found in scene["slopes"]["mitsuba"].items():
         groups[f"Mitsuba {sampler}"] = found, [row for row in scene["mitsuba"] if row["sampler"] == sampler]
     cells = [
-        [name, _slope(found["spp"]), _slope(found["seconds"]), _bias(rows[-1]["bias"])]
+        [name, _hundredths(found["spp"]), _hundredths(found["seconds"]), _bias(rows[-1]["bias"])]
         for name, (found, rows) in groups.items()
     ]
     return lines + _table(["RMS error", "slope in spp", "slope in seconds", "bias, relMSE"], cells)
@@ -118,7 +118,7 @@ def _strategies(rows: list[dict]) -> list[str]:
 
 def _sampler(sampler: dict) -> list[str]:
     cells = [
-        [row["spp"], _number(row["rel_mse"]), _number(row["independent_rel_mse"]), _ratio(row["ratio"])]
+        [row["spp"], _number(row["rel_mse"]), _number(row["independent_rel_mse"]), _hundredths(row["ratio"])]
         for row in sampler["rows"]
     ]
     single = _relative(sampler["single_rel_mse"], sampler["single_rel_mse_standard_error"])
@@ -199,9 +199,5 @@ def _number(value: float) -> str:
     return f"{value:.2e}" if math.isfinite(value) else "not finite"
 
 
-def _slope(value: float | None) -> str:
-    return "" if value is None else f"{value:.2f}"
-
-
-def _ratio(value: float | None) -> str:
+def _hundredths(value: float | None) -> str:
     return "" if value is None else f"{value:.2f}"

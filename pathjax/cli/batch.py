@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 
-from pathjax.batch import Outcome, render_batch
+from pathjax.batch import render_batch
 from pathjax.cli import DONE, FAILED
 from pathjax.compile import keep_kernels
 from pathjax.system.json_text import json_text
@@ -18,9 +18,6 @@ def run(options, output: Output) -> int:
     output.written = counts["done"] > 0
     say(", ".join(f"{count} {status}" for status, count in counts.items()))
     if options.json:
-        output.text(json_text({"jobs": [_facts(outcome) for outcome in outcomes]}))
+        facts = [vars(each) | {"job": each.job.place, "output": str(each.output)} for each in outcomes]
+        output.text(json_text({"jobs": facts}))
     return DONE if not counts.keys() - {"done", "skipped"} else FAILED
-
-
-def _facts(outcome: Outcome) -> dict:
-    return vars(outcome) | {"job": outcome.job.place, "output": str(outcome.output)}

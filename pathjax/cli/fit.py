@@ -52,15 +52,11 @@ def run(options, output: Output) -> int:
         if fit.images:
             output.file(picture, lambda path: images.write_png(path, report.picture(fit, [target.image])))
         for name in report.textures(fit):
-            layers = {f"{layer}{c}": x[..., i] for layer, x in _layers(fit, name) for i, c in enumerate("RGB")}
+            of_layers = {"": fit.values[name], "error.": fit.standard_errors[name]}
+            layers = {f"{layer}{c}": x[..., i] for layer, x in of_layers.items() for i, c in enumerate("RGB")}
             path = Path(f"{options.output}.{name}.exr")
             output.file(path, lambda path, layers=layers: images.write_exr(path, layers, {}))
         if report.textures(fit):
             output.file(Path(f"{options.output}.xml"), lambda path: save_scene(fit.scene, path))
         output.text(json_text(facts) if options.json else report.text(fit))
     return DONE if fit.converged else FAILED
-
-
-def _layers(fit: inverse.Fit, name: str):
-    """The layers of an image file: the texels, and their standard errors."""
-    return [("", fit.values[name]), ("error.", fit.standard_errors[name])]

@@ -131,7 +131,7 @@ def build(scene, target, names, start) -> Problem:
         if name not in found:
             raise InputError(f"start names {name}, which is not fitted; fitted are {', '.join(names)}")
         dtype = scenes[0].camera.origin.dtype
-        values[name] = named.checked(f"start of {name}:", value, found[name], dtype)
+        values[name] = named.checked(f"start of {name}", value, found[name], dtype)
     for each in scenes:
         held = {name: parameter for name, parameter in found.items() if name in each.described.parameters}
         named.refuse_constant(Problem.with_values(each, values), held)

@@ -128,6 +128,8 @@ def check_gradient(
     """
     if seeds < 3:
         raise InputError(f"seeds = {seeds}; at least 3 are needed to estimate their scatter")
+    if block < 1:
+        raise InputError(f"block = {block}; it is the side of blocks of pixels, at least 1")
     if not 0 < false_alarm < 1:
         raise InputError(f"false_alarm = {false_alarm}; it is a probability, between 0 and 1")
     nodes = None
@@ -152,8 +154,6 @@ def check_gradient(
 
 def _of_scene(scene, name, spp):
     """Render, derivative, value and bounds of a parameter; and nodes, or None for those that fit the value."""
-    if not isinstance(name, str):
-        raise InputError(f"at = {name!r}; of a scene it is the name of a parameter, as `parameters` lists them")
     parameter = named.find(scene, name)
     value = named.parameters(scene)[name]
 
@@ -183,6 +183,10 @@ def _image(x):
 def _direction(theta, bounds, reach):
     """v, of the shape of theta, and (5,) nodes x, so that all theta + x v lie within the bounds."""
     low, high = bounds
+    if not theta.size:
+        raise InputError("theta holds no number, so no image can change with it")
+    if reach is not None and not 0 < reach < math.inf:
+        raise InputError(f"reach = {reach}; it must be positive and finite")
     if not (np.isfinite(theta).all() and (theta >= low).all() and (theta <= high).all()):
         raise InputError(f"theta is not finite, or lies outside the bounds [{low:g}, {high:g}]")
     if reach is None:

@@ -81,7 +81,7 @@ def find(scene: Scene, name: str) -> Parameter:
         return known.parameters[name]
     if name in known.refused:
         raise InputError(known.refused[name])
-    near = difflib.get_close_matches(name, known.parameters, n=3, cutoff=0.3)
+    near = difflib.get_close_matches(str(name), known.parameters, n=3, cutoff=0.3)
     raise InputError(f"no parameter is named {name!r}; " + _offer(near, known.parameters))
 
 

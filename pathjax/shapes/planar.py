@@ -151,10 +151,7 @@ class Planar(Table):
         q = from_c + distance * d
         p = c + (q - dot(n, q) * n)
         margin = jnp.zeros_like(distance) if self.margins is None else at(self.margins, row)
-        aa, ab, bb = dot(a, a), dot(a, b), dot(b, b)
-        qa, qb = dot(q, a), dot(q, b)
-        scale = 1 / (aa * bb - ab * ab)
-        return Surface(p, n, margin, n, self.uv((bb * qa - ab * qb) * scale, (aa * qb - ab * qa) * scale))
+        return Surface(p, n, margin, n, self.uv(*_coordinates(q, a, b)))
 
     @staticmethod
     @abstractmethod
@@ -177,15 +174,20 @@ class Planar(Table):
 
     def to_square(self, row, p):
         c, a, b, _ = at(self.frames, row)
-        q = p - c
-        aa, ab, bb, qa, qb = dot(a, a), dot(a, b), dot(b, b), dot(q, a), dot(q, b)
-        x, y = jnp.stack([bb * qa - ab * qb, aa * qb - ab * qa]) / (aa * bb - ab * ab)
-        return self.square(x, y)
+        return self.square(*_coordinates(p - c, a, b))
 
     @staticmethod
     @abstractmethod
     def square(x, y):
         """(2,) in [0, 1], in which equal areas are equal."""
+
+
+def _coordinates(q, a, b):
+    """x and y of q = x a + y b."""
+    aa, ab, bb = dot(a, a), dot(a, b), dot(b, b)
+    qa, qb = dot(q, a), dot(q, b)
+    scale = 1 / (aa * bb - ab * ab)
+    return (bb * qa - ab * qb) * scale, (aa * qb - ab * qa) * scale
 
 
 def leaf_numbers(frames):

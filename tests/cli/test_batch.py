@@ -165,6 +165,11 @@ def test_wrong_lists_are_refused_before_anything_is_rendered(tmp_path, refused, 
     refused("batch", jobs, "-o", tmp_path, says=says)
 
 
+def test_what_is_no_job_is_refused():
+    with pytest.raises(pj.InputError, match="job 1: a job is one JSON object or mapping, such as .*, not 7"):
+        pj.render_batch([{"scene": "a.xml", "output": "a.exr"}, 7])
+
+
 @pytest.mark.parametrize("part", ["2/2", "1", "a/b", "-1/2"])
 def test_wrong_parts_are_refused(tmp_path, refused, part):
     refused("batch", tmp_path / "jobs.jsonl", "-o", tmp_path, f"--part={part}", says=["I/N"])

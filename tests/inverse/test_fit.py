@@ -442,7 +442,7 @@ def test_roughness_and_colour_are_recovered_from_a_target_of_mitsuba(rough_ball)
         ({"names": "floor.reflectance"}, "list of names"),
         ({"names": ["floor.reflectence"]}, "did you mean floor.reflectance"),
         ({"names": ["floor.reflectance"] * 2}, "named twice"),
-        ({"start": {"floor.reflectance": 1.5}}, "outside its bounds"),
+        ({"start": {"floor.reflectance": 1.5}}, "start of floor.reflectance = .* lies outside its bounds"),
         ({"start": {"sky.radiance": 1}}, "not fitted"),
         ({"target": np.ones((8, 16, 3))}, "shape"),
         ({"target": np.full((16, 16, 3), np.nan)}, "not finite"),
