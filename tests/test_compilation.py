@@ -371,7 +371,7 @@ def test_other_values_never_compile_again(shipped, compilations):
 
 def test_a_sweep_over_32_iors_compiles_once(shipped, compilations):
     """The kernel, and what chooses its step."""
-    scene = shipped("glass_ball", res=16)
+    scene = shipped("glass_ball", res=64)  # as in the README, whose kernel this is
     sweep = [pj.with_parameters(scene, {"glass.int_ior": 1.1 + 0.03 * i}) for i in range(32)]
     pj.jacobian(sweep[0], ["glass.int_ior"], 1)
     before = compilations.count
