@@ -248,6 +248,8 @@ def _is_object(child: Element) -> bool:
 def _value(key: str, value: object, element: Element) -> Element:
     """The element that sets a parameter to exactly this value."""
     value = np.asarray(value)
+    if value.shape == (3,) and value.min() == value.max() > 1:
+        value = value[0]  # Mitsuba takes an <rgb> above 1 for light alone, and a number for any
     tag = {(): "float", (3,): "rgb"}.get(value.shape)
     if tag is None:
         raise element.error(f'{element}: "{key}" has the shape {value.shape}, which no scene file can say')
