@@ -92,7 +92,7 @@ def build(
     of_shapes = dict.fromkeys(emitters[lamp.shape] for lamp in lamps)
     inside = ordered(of_shapes, KINDS)
     outside = ordered([each for each in emitters if each is not None and each not in of_shapes], KINDS)
-    made, boxes, light, number = [], [], np.full(len(shapes.shape), -1, np.int32), 0
+    made, places, light, number = [], [], np.full(len(shapes.shape), -1, np.int32), 0
     for kind, instances in (*inside.items(), *sorted(outside.items(), key=lambda item: item[0].distant)):
         place = (*path, len(made))
         covers, codes = _textures(instances, dtype, (*place, "textures"), parameters)
@@ -110,30 +110,31 @@ def build(
         row_of = np.asarray([rows[emitters[lamp.shape]] for lamp in shining], np.int32)
         lamps_of = (lamp_table(shining, dtype), row_of) if shining else (None, None)
         made.append(Lights(table, *lamps_of, covers))
-        boxes.append(_boxes(made[-1], shining))
-    return _arranged(made, boxes, dtype), replace(shapes, light=light)
+        places.append(_places(made[-1], shining))
+    return _arranged(made, places, dtype), replace(shapes, light=light)
 
 
-def _boxes(lights: Lights, lamps: list[Lamp]) -> np.ndarray | None:
-    """(R, 2, 3) around each light that is near; None where nobody knows where they are."""
+def _places(lights: Lights, lamps: list[Lamp]) -> np.ndarray | None:
+    """(R, 3, 3) of each light that is near, as `Lights.places`; None where nobody knows where they are."""
     if lights.lamps is not None:
-        return np.stack([lamp.box for lamp in lamps])
-    places = [key for key, declared in lights.kind.declared.items() if isinstance(declared, Position)]
-    if not places:
+        return np.stack([lamp.place for lamp in lamps])
+    names = [key for key, declared in lights.kind.declared.items() if isinstance(declared, Position)]
+    if not names:
         return None
-    return np.repeat(np.asarray(lights.table.column(places[0]).values)[:, None], 2, 1)
+    at = np.asarray(lights.table.column(names[0]).values)
+    return np.stack([at, at, np.zeros_like(at)], 1)
 
 
-def _arranged(made: list[Lights], boxes: list[np.ndarray | None], dtype) -> tuple[Lights, ...]:
+def _arranged(made: list[Lights], places: list[np.ndarray | None], dtype) -> tuple[Lights, ...]:
     """The lights, those that are near in the tree by which they are chosen where there are many."""
-    near = [(lights, box) for lights, box in zip(made, boxes, strict=True) if not lights.kind.distant]
-    if sum(lights.count for lights, _ in near) < light_tree.FEWEST or any(box is None for _, box in near):
+    near = [(lights, place) for lights, place in zip(made, places, strict=True) if not lights.kind.distant]
+    if sum(lights.count for lights, _ in near) < light_tree.FEWEST or any(place is None for _, place in near):
         return tuple(made)
     ends = np.cumsum([lights.count for lights, _ in near])[:-1]
-    leaves = np.split(light_tree.arranged(np.concatenate([box for _, box in near])), ends)
+    leaves = np.split(light_tree.arranged(np.concatenate([place for _, place in near])), ends)
     placed = [
-        replace(lights, boxes=np.asarray(box, dtype), leaf=leaf)
-        for (lights, box), leaf in zip(near, leaves, strict=True)
+        replace(lights, places=np.asarray(place, dtype), leaf=leaf)
+        for (lights, place), leaf in zip(near, leaves, strict=True)
     ]
     return (*placed, *made[len(near) :])
 
@@ -183,7 +184,7 @@ def name(lights: Lights) -> str:
 
 def chosen_by_place(emitters: tuple[Lights, ...]) -> bool:
     """Whether the choice of a light depends on the point that it is to shine on."""
-    return any(lights.boxes is not None for lights in emitters)
+    return any(lights.places is not None for lights in emitters)
 
 
 def usual_name(kind: str) -> str:

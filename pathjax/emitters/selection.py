@@ -29,7 +29,8 @@ class Lights:
     lamps: Lamps | None  # what shines, of kinds that stand inside shapes; None: each row is one light
     row: Int[Array, " R"] | None  # row of the table, of each lamp
     textures: Textures | None = None  # in the place of parameters; None: there are none
-    boxes: Float[Array, "R 2 3"] | None = None  # lower and upper corner around each; None: nothing chooses by them
+    # Of each, lower and upper corner around it and the mean normal of its area; None: nothing chooses by them.
+    places: Float[Array, "R 3 3"] | None = None
     leaf: Int[Array, " R"] | None = None  # of each in the tree by which they are chosen
 
     @property
@@ -114,12 +115,12 @@ def choice(emitters: tuple[Lights, ...], strategy: str) -> Choice | None:
     # Lights of power 0 throughout: any choice will do, and 0 / 0 will not.
     pdf = _over(power, jnp.sum(power), 1 / len(power))
     chosen = Choice(pdf, jnp.cumsum(pdf), tuple(first))
-    placed = [lights for lights in emitters if lights.boxes is not None]
+    placed = [lights for lights in emitters if lights.places is not None]
     if not placed:
         return chosen
-    boxes, leaf = (jnp.concatenate(each) for each in zip(*((x.boxes, x.leaf) for x in placed), strict=True))
+    places, leaf = (jnp.concatenate(each) for each in zip(*((x.places, x.leaf) for x in placed), strict=True))
     near = pdf[: len(leaf)]
-    return replace(chosen, tree=light_tree.built(boxes, leaf, near), near=jnp.sum(near))
+    return replace(chosen, tree=light_tree.built(places, leaf, near), near=jnp.sum(near))
 
 
 def _over(power, total, otherwise):

@@ -85,15 +85,15 @@ def _emitters(emitters: tuple[Lights, ...], light: Int[np.ndarray, " N"]) -> tup
         moved += more
         lit[(light >= first) & (light < first + lights.count)] += moved
         first += lights.count
-    if any(lights.boxes is not None for lights in emitters):
+    if any(lights.places is not None for lights in emitters):
         _plant(emitters, made, extra)
     return lit, tuple(made)
 
 
 def _plant(emitters: tuple[Lights, ...], made: list[Lights], extra: list[int]) -> None:
-    """Put added lights into empty leaves, with the boxes that these have when empty: so no node of the tree changes."""
-    placed = [place for place, lights in enumerate(emitters) if lights.boxes is not None]
-    boxes = np.concatenate([emitters[place].boxes for place in placed])
+    """Put added lights into empty leaves, with the place that these have when empty: so no node of the tree changes."""
+    placed = [place for place, lights in enumerate(emitters) if lights.places is not None]
+    places = np.concatenate([emitters[place].places for place in placed])
     leaf = np.concatenate([emitters[place].leaf for place in placed])
     room = light_tree.leaves(sum(made[place].count for place in placed))
     light = np.full(room, -1)
@@ -104,7 +104,7 @@ def _plant(emitters: tuple[Lights, ...], made: list[Lights], extra: list[int]) -
         own = np.asarray([next(empty) for _ in range(extra[place])], np.int32)
         made[place] = replace(
             made[place],
-            boxes=np.concatenate([boxes[followed[own]], emitters[place].boxes]),
+            places=np.concatenate([places[followed[own]], emitters[place].places]),
             leaf=np.concatenate([own, emitters[place].leaf]),
         )
 

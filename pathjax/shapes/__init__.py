@@ -65,7 +65,7 @@ class Lamp(NamedTuple):
     count: int
     area: float
     primitive: int  # number of the first one among all of the geometry
-    box: np.ndarray  # (2, 3) around it
+    place: np.ndarray  # (3, 3) lower and upper corner of a box around it, and mean of the normals
 
 
 class _Part(NamedTuple):
@@ -163,13 +163,13 @@ def _lamps(parts: list[_Part], table, primitive):
     for shape, primitives, _, lamp in parts:
         if lamp:
             areas = primitives.areas
-            boxes = np.stack(primitives.boxes(), 1)
+            (lo, hi), facing = primitives.boxes(), primitives.facing()
             if primitives.one_lamp:
-                around = np.stack([boxes[:, 0].min(0), boxes[:, 1].max(0)])
-                yield Lamp(shape, table, first, len(areas), areas.sum(), primitive + first, around)
+                place = np.stack([lo.min(0), hi.max(0), facing.sum(0) / areas.sum()])
+                yield Lamp(shape, table, first, len(areas), areas.sum(), primitive + first, place)
             else:
-                each = enumerate(zip(areas, boxes, strict=True), first)
-                yield from (Lamp(shape, table, row, 1, area, primitive + row, box) for row, (area, box) in each)
+                each = enumerate(zip(areas, np.stack([lo, hi, facing / areas[:, None]], 1), strict=True), first)
+                yield from (Lamp(shape, table, row, 1, area, primitive + row, place) for row, (area, place) in each)
         first += primitives.count
 
 

@@ -41,6 +41,9 @@ class Frames(Primitives):
         reach = np.abs(a) + np.abs(b)
         return c - reach, c + reach
 
+    def facing(self):
+        return self.frames[:, 3] * self.areas[:, None]
+
     def faces(self, glass, lamp, dtype):
         return Faces(corners(self.frames), self.frames[:, 3], self.depths(), glass, lamp)
 

@@ -89,6 +89,10 @@ class Primitives(ABC):
     def boxes(self) -> tuple[np.ndarray, np.ndarray]:
         """Lower and upper corners (P, 3) of boxes around them."""
 
+    def facing(self) -> np.ndarray:
+        """(P, 3) integrals of the normal over their areas; 0 of what faces all sides."""
+        return np.zeros((self.count, 3))
+
     def faces(self, glass: bool, lamp: bool, dtype) -> Faces | None:
         """The flat faces, which may touch those of other shapes; None: they are curved."""
         return None

@@ -47,6 +47,10 @@ class Facets(Primitives):
     def boxes(self):
         return bounds(self.vertices)
 
+    def facing(self):
+        a, b, c = np.moveaxis(self.vertices, 1, 0)
+        return np.cross(b - a, c - a) / 2
+
     def faces(self, glass, lamp, dtype):
         """One face if all triangles lie in one plane."""
         some = self.vertices[:_SOME]

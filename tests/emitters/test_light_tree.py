@@ -47,7 +47,7 @@ def room(depth=3, kinds=("rectangle", "sphere", "point"), sky=False, lights=LIGH
 @pytest.mark.parametrize("count", [2, 3, 9, 16, 100])
 def test_each_light_has_a_leaf_of_its_own_near_its_neighbours(count):
     middles = np.random.default_rng(count).uniform(size=(count, 1, 3))
-    leaf = light_tree.arranged(np.repeat(middles, 2, 1))
+    leaf = light_tree.arranged(np.repeat(middles, 3, 1))
     assert len(set(leaf.tolist())) == count
     assert 0 <= leaf.min() <= leaf.max() < 2 * count
     along = np.argsort(middles[:, 0, np.ptp(middles[:, 0], axis=0).argmax()])
@@ -75,10 +75,27 @@ def test_lights_are_found_as_often_as_their_probabilities_say(sky):
         assert stats.kstest(np.asarray(again[:, 0]), "uniform").pvalue > FALSE_ALARM
 
 
+def tree_of(points, normals, power):
+    """Of small lights."""
+    places = np.stack([points, points, normals], 1).astype(np.float32)
+    leaf = light_tree.arranged(places)
+    return light_tree.built(jnp.asarray(places), jnp.asarray(leaf), jnp.asarray(power, jnp.float32))
+
+
+def test_lights_that_face_a_point_are_chosen_more_often():
+    """Two flat lights by the cosine; beside one that faces away, a round one by a quarter of its area."""
+    tilted = [(0, 0, 1), (0, np.sin(0.9), np.cos(0.9))]
+    tree = tree_of([(0, 0, 0), (0, 0, 0)], tilted, [1, 1])
+    least = light_tree._LEAST_AROUND / 4
+    first, second = (float(light_tree.probability(tree, jnp.array([0, 0, 7.0]), n)) for n in (0, 1))
+    np.testing.assert_allclose(second / first, (np.cos(0.9) + least) / (1 + least), rtol=1e-5)
+    tree = tree_of([(0, 0, 0), (0, 0, 0)], [(0, 0, -1), (0, 0, 0)], [1, 1])
+    away, round = (float(light_tree.probability(tree, jnp.array([0, 0, 7.0]), n)) for n in (0, 1))
+    np.testing.assert_allclose(away / round, least / 0.25, rtol=1e-5)
+
+
 def test_near_and_bright_lights_are_chosen_more_often():
-    boxes = np.repeat(np.array([[[0.0, 0, 0]], [[10, 0, 0]], [[10, 5, 0]], [[10, 9, 0]]]), 2, 1).astype(np.float32)
-    power = jnp.array([1.0, 1, 8, 0])
-    tree = light_tree.built(jnp.asarray(boxes), jnp.asarray(light_tree.arranged(boxes)), power)
+    tree = tree_of([(0, 0, 0), (10, 0, 0), (10, 5, 0), (10, 9, 0)], np.zeros((4, 3)), [1, 1, 8, 0])
     beside = [float(light_tree.probability(tree, jnp.array([0.5, 0, 0]), n)) for n in range(4)]
     assert beside[0] > 5 * 0.1  # its share of the power
     assert beside[2] > beside[1] and beside[3] == 0
