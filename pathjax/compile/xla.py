@@ -23,13 +23,11 @@ from pathjax.system.cores import cores
 _OPTION = "xla_cpu_small_while_loop_byte_threshold"
 _FLAG = f"--xla_backend_extra_options={_OPTION}=1000000000000"
 # What takes time of compilation, and gives kernels of lanes nothing, as measured: LLVM's last level, a sixth; its
-# unrolling of loops, another; and MLIR, a tenth, for what little stands outside of a kernel. (An extra option that a
-# version of XLA does not know means nothing to it; another one ends the process.)
-_QUICK_FLAGS = {
-    "xla_backend_optimization_level": "--xla_backend_optimization_level=2",
-    "xla_cpu_disable_loop_unrolling": "--xla_backend_extra_options=xla_cpu_disable_loop_unrolling=true",
-    "xla_cpu_disable_new_fusion_emitters": "--xla_backend_extra_options=xla_cpu_disable_new_fusion_emitters=true",
-}
+# unrolling of loops, another; and MLIR, a tenth, for what little stands outside of a kernel. (To name an extra option
+# is to set it, whatever its value, and one that a version of XLA does not know means nothing to it.)
+_LEVEL_OPTION = "xla_backend_optimization_level"
+_LEVEL_FLAG = f"--{_LEVEL_OPTION}=2"
+_QUICK_FLAG = "--xla_backend_extra_options=xla_cpu_disable_loop_unrolling=true,xla_cpu_disable_new_fusion_emitters=true"
 # XLA halves the vectors of processors that have them this wide; kernels of lanes gain a tenth or more from whole ones.
 _WIDTH_OPTION = "xla_cpu_prefer_vector_width"
 _WIDTH_FLAG = f"--{_WIDTH_OPTION}=512"
@@ -70,9 +68,9 @@ def setup() -> None:
     wanted = native and _OPTION not in flags
     if wanted:
         width = "" if _WIDTH_OPTION in flags else _WIDTH_FLAG
-        quick = [flag for option, flag in _QUICK_FLAGS.items() if option not in flags]
+        level = "" if _LEVEL_OPTION in flags else _LEVEL_FLAG
         patience = "" if _PATIENCE_OPTION in flags else _PATIENCE_FLAGS
-        os.environ["XLA_FLAGS"] = " ".join(filter(None, (flags, _FLAG, width, *quick, patience)))
+        os.environ["XLA_FLAGS"] = " ".join(filter(None, (flags, _FLAG, _QUICK_FLAG, width, level, patience)))
     devices_chosen = _DEVICE_FLAG in flags or jax.config.jax_num_cpu_devices >= 0
     devices = max(cores(), jax.config.jax_num_cpu_devices, *map(int, re.findall(rf"{_DEVICE_FLAG}=(\d+)", flags)))
     os.environ.setdefault(_POOL_VARIABLE, str(_POOL_OF_A_DEVICE * devices))

@@ -54,14 +54,7 @@ def test_import_turns_native_loops_on_with_a_device_per_core(untouched):
     assert "Warning" not in err
 
 
-@pytest.mark.parametrize(
-    "mine",
-    [
-        "--xla_cpu_prefer_vector_width=128",
-        "--xla_backend_optimization_level=3",
-        "--xla_backend_extra_options=xla_cpu_disable_loop_unrolling=false",
-    ],
-)
+@pytest.mark.parametrize("mine", ["--xla_cpu_prefer_vector_width=128", "--xla_backend_optimization_level=3"])
 def test_users_flags_are_kept(python, untouched, mine):
     """Those that pathjax does not know, and each of those that it sets too; the others it adds."""
     users = f"--xla_cpu_enable_fast_math=false {mine}"
