@@ -37,7 +37,7 @@ def pack(built, dtype) -> Tree:
 
 
 def prepare(o, d):
-    """Constants of a ray from o (3,) in the unit direction d (3,): (9,) reciprocal of d and slabs, () int32 octant."""
+    """Constants of a ray from o (3,) in the unit direction d (3,): (9,) reciprocal of d and slabs, () uint32 octant."""
     eps = np.finfo(d.dtype).eps
     # A component of zero becomes one that moves the ray less than rounding does over any distance in range.
     tiny = np.asarray(1e-18, d.dtype)
@@ -45,14 +45,15 @@ def prepare(o, d):
     negative = (d < 0).astype(jnp.int32)
     # Slabs are widened by what o, o / d and the product round (Ize 2013): a few ulps of the coordinates.
     start, slack = o * inv, jnp.abs(o * inv) * (4 * eps)
-    octant = negative[0] + 2 * negative[1] + 4 * negative[2]
+    # Unsigned as the axes of triangles are: in lanes, all numbers of one type that a ray has are one array.
+    octant = (negative[0] + 2 * negative[1] + 4 * negative[2]).astype(jnp.uint32)
     return jnp.concatenate([inv, start + slack, start - slack]), octant
 
 
 def enter(tree: Tree, prepared, t):
-    """() int32: the first entry of `traverse`; 0 if the ray meets no child of the root at 0 <= s <= t."""
+    """() uint32: the first entry of `traverse`; 0 if the ray meets no child of the root at 0 <= s <= t."""
     ray, octant = prepared
-    return _hit_children(tree, jnp.int32(0), ray, _weights(octant), t)
+    return _hit_children(tree, jnp.int32(0), ray, _weights(octant), t).astype(jnp.uint32)
 
 
 class _State(NamedTuple):
@@ -82,7 +83,7 @@ def traverse(tree: Tree, leaf, prepared, entry, t, found, result=lambda t, found
     ray, octant = prepared
 
     def first_child(entry):
-        slot = (lax.population_count(~entry & (entry - 1)) ^ octant) & (WIDTH - 1)
+        slot = (lax.population_count(~entry & (entry - 1)).astype(jnp.uint32) ^ octant) & (WIDTH - 1)
         return at(tree.nodes, entry >> WIDTH, 6, slot).astype(jnp.int32)
 
     def rest_of(entry):
@@ -92,10 +93,11 @@ def traverse(tree: Tree, leaf, prepared, entry, t, found, result=lambda t, found
 
     def begin():
         stack = jnp.zeros((tree.depth + 1,), jnp.int32)
-        child = first_child(entry)
+        root = entry.astype(jnp.int32)
+        child = first_child(root)
         # A search begins by opening a node: if a leaf comes first, by opening the root again.
-        at_node = (child > 0) | (entry == 0)
-        start = jnp.where(at_node, entry, -1 << WIDTH), jnp.where(at_node, child, 0)
+        at_node = (child > 0) | (root == 0)
+        start = jnp.where(at_node, root, -1 << WIDTH), jnp.where(at_node, child, 0)
         return _State(jnp.int32(1), *start, stack, t, found)
 
     def open_node(state):
@@ -132,7 +134,7 @@ def traverse(tree: Tree, leaf, prepared, entry, t, found, result=lambda t, found
 
 def _weights(octant, is_any=True):
     """(8,) int32: the bit of each slot in an entry; of none, 0."""
-    return jnp.left_shift(jnp.int32(is_any), jnp.arange(WIDTH, dtype=jnp.int32) ^ octant)
+    return jnp.left_shift(jnp.int32(is_any), (jnp.arange(WIDTH, dtype=jnp.uint32) ^ octant).astype(jnp.int32))
 
 
 def _hit_children(tree: Tree, node, ray, weights, t):
