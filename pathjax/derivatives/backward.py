@@ -215,8 +215,11 @@ def add(total, slot: Slot, change: list[Float[Array, " W"]]):
         of_lane = partial(jax.tree.map, lambda column: at(column, lane))
         x = of_lane(change)
         for place, share in of_lane(list(zip(places, slot.shares or [None], strict=True))):
-            new = at(total, place) + jnp.stack(_part(x, share))
-            total = lax.dynamic_update_slice(total, new[None], (place, jnp.int32(0)), allow_negative_indices=False)
+            # Number by number: a loop over three would not be unrolled.
+            for channel, number in enumerate(_part(x, share)):
+                where = place, jnp.int32(channel)
+                new = lax.dynamic_slice(total, where, (1, 1), allow_negative_indices=False) + number
+                total = lax.dynamic_update_slice(total, new, where, allow_negative_indices=False)
         return total
 
     return lax.fori_loop(first, len(change[0]), one, total)
