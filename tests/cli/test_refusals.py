@@ -19,7 +19,7 @@ def test_errors_in_a_scene_name_file_and_line(refused, write_scene, tmp_path):
     refused("render", path, "-o", tmp_path / "a.exr", says=[f"{path}:{line}: ", "hair", "diffuse"])
 
 
-@pytest.mark.parametrize("text", ["", "not xml", "<scene", "<scene version='3.0.0'></scene>", "\0\1\2"])
+@pytest.mark.parametrize("text", ["", "not xml", "<scene", "<scene></scene>", "\0\1\2"])
 def test_what_is_no_scene(refused, tmp_path, text):
     (tmp_path / "bad.xml").write_text(text)
     refused("info", tmp_path / "bad.xml", says=["bad.xml"])
