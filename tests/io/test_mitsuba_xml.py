@@ -726,6 +726,14 @@ def test_what_is_no_xml_to_the_letter_is_read_as_mitsuba_does(tmp_path):
     assert "a & b & c" in load(tmp_path / "scene.xml").document.ids
 
 
+@pytest.mark.parametrize(("before", "encoding"), [("", "utf-16"), ("", "latin-1"), ("\n\n", "latin-1"), ("", "utf-8")])
+def test_the_declared_encoding_is_that_of_the_file(tmp_path, before, encoding):
+    text = f'{before}<?xml version="1.0" encoding="{encoding}"?><scene version="3.0.0">{SENSOR}'
+    text += '<!-- c --><bsdf type="diffuse" id="\xe9 &amp; b"/></scene>'
+    (tmp_path / "scene.xml").write_bytes(text.encode(encoding))
+    assert "\xe9 & b" in load(tmp_path / "scene.xml").document.ids
+
+
 def test_text_between_elements_is_noted_at_its_line(read):
     notes = read(f"{shape()}>\n{shape()} word").notes
     assert [note[note.index("scene.xml") :] for note in notes if "text between" in note] == [

@@ -5,6 +5,7 @@ What the elements mean is the business of `loader.py` and of each kind.
 
 from __future__ import annotations
 
+import codecs
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -24,7 +25,7 @@ MAX_FILES = 1_000
 MAX_VALUE = 10_000
 
 REFERENCE = re.compile(r"\$(\w+)")
-_DECLARATION = re.compile(rb"\s*<\?xml\b[^>]*\?>")
+_DECLARATION = re.compile(rb"\s*(<\?xml\b[^>]*\?>)")
 _AMPERSAND = re.compile(rb"&(?!#?\w{1,8};)")
 
 
@@ -184,15 +185,18 @@ def _parse(path: Path, shown: str, notes: list[str]) -> Element:
 
 def _well_formed(data: bytes) -> bytes:
     """What is XML to the letter, where Mitsuba's parser is lenient: with `--` and any bytes in comments, white space
-    before the declaration, and & for itself. Lines stay where they are.
+    before the declaration, and & for itself. Lines stay where they are. What is UTF-16 is left alone.
     """
+    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        return data
     parts, end = [], 0
     while (start := data.find(b"<!--", end)) >= 0 and (close := data.find(b"-->", start + 4)) >= 0:
         parts += [data[end:start], b"\n" * data.count(b"\n", start, close)]
         end = close + 3
     data = b"".join([*parts, data[end:]])
     if data[:1].isspace() and (declared := _DECLARATION.match(data)):
-        data = b"\n" * data.count(b"\n", 0, declared.end()) + data[declared.end() :]
+        lines = b"\n" * data.count(b"\n", 0, declared.start(1))
+        data = declared[1] + lines + data[declared.end() :]
     return _AMPERSAND.sub(b"&amp;", data)
 
 
