@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -198,26 +197,8 @@ def test_no_number_is_nan_whatever_the_extinction(sigma):
     np.testing.assert_array_equal(np.asarray(image)[..., 2] > 0, True)
 
 
-def test_weights_of_a_flight_average_to_1():
+def test_weights_of_a_flight_average_to_1(average_to_1):
     """Of all colours, also of one that the path carries nothing of, at the end of any distance."""
-    made = media.build(
-        [],
-        media.Homogeneous.scattering(
-            media.Homogeneous.instance("it", sigma_t=np.array([0.1, 1.0, 10.0]), albedo=np.ones(3)),
-            media.Isotropic.instance(),
-        ),
-        np.float32,
-        (),
-        pj.kinds.Parameters(),
-    )
-    throughput, surface = jnp.array([0.0, 0.2, 3.0]), 0.7
-    u = jnp.asarray(np.random.default_rng(1).random((200_000, 2)), jnp.float32)
-
-    def weight(u):
-        t = media.distance(made, jnp.int32(0), RAY, throughput, u)
-        return media.flight_weight(made, jnp.int32(0), RAY, throughput, jnp.minimum(t, surface), t < surface)
-
-    weights = np.asarray(jax.jit(jax.vmap(weight))(u), float)
-    error = weights.std(0) / np.sqrt(len(u))
-    assert (np.abs(weights.mean(0) - 1) < 4 * error + 1e-6).all()
+    fog = media.Homogeneous.instance("it", sigma_t=np.array([0.1, 1.0, 10.0]), albedo=np.ones(3))
+    weights = average_to_1(fog, RAY, jnp.array([0.0, 0.2, 3.0]), 200_000, 1e-6)
     assert weights.max() <= 1 / media.LEAST
