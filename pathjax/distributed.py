@@ -8,11 +8,12 @@ so that they never part.
 
 from __future__ import annotations
 
+import atexit
 import hashlib
 import os
 import re
-import socket
 import sys
+import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from itertools import islice
@@ -23,21 +24,23 @@ import jax
 import numpy as np
 
 from pathjax.compile import calls_at_once, concurrently
-from pathjax.compile.jax_compat import gathered
+from pathjax.compile.jax_compat import found_cluster, gathered
 from pathjax.errors import InputError
 from pathjax.system.interrupts import Interrupts, leave
 from pathjax.system.meeting import meet
+from pathjax.system.output import say
+from pathjax.system.watch import BEAT, PATIENCE, Relay, Watch
 
 T = TypeVar("T")
-# Seconds without a sign of life after which JAX ends all processes, and those for which they wait for each other.
-PATIENCE, MEETING = 5, 60
+# Seconds for which processes wait for each other at first.
+MEETING = 60
 # Calls of each device between two exchanges: all wait for the slowest, so the fewer exchanges the better; but signals
 # are heard then.
 _CALLS = 2
 # Words of what the transport raises when it has lost a process.
 TRANSPORT = re.compile("gloo|nccl|peer|connection|socket|heartbeat|coordination|deadline", re.IGNORECASE)
 
-_peers: list[tuple[str, int]] = []  # host and process number in the system, by process
+_threads: list[Watch | Relay] = []  # while there are several processes
 
 
 class ProcessLost(RuntimeError):
@@ -57,23 +60,26 @@ def start(coordinator: str | None = None, processes: int | None = None, process:
     """
     facts = {"code of pathjax": _package(), "version of JAX": jax.__version__}
     try:
-        if coordinator is not None:
-            meet(coordinator, processes, process, facts, MEETING)
+        devices = None
+        if coordinator is None:
+            coordinator, processes, process, devices = found_cluster(MEETING)
+        peers = meet(coordinator, processes, process, facts, MEETING)
+        _threads.append(Watch(peers, _end))
+        if process:
+            _threads.append(Relay(coordinator, MEETING))
+            coordinator = _threads[-1].address
         jax.config.update("jax_cpu_collectives_implementation", "gloo")
-        jax.distributed.initialize(
-            coordinator, processes, process, initialization_timeout=MEETING, heartbeat_timeout_seconds=PATIENCE
-        )
+        patience = {"initialization_timeout": MEETING, "heartbeat_timeout_seconds": MEETING}
+        jax.distributed.initialize(coordinator, processes, process, devices, **patience)
     except InputError:
         raise
     except (RuntimeError, ValueError) as error:
         said = str(error).partition("\n")[0]
         raise InputError(f"this process could not join the others ({said}); start each of them anew") from None
+    atexit.register(_leave)
     _end_at_once_after_errors()
-    here = np.frombuffer(socket.gethostname().encode()[:64].ljust(64, b"\0"), np.uint8)
     with _stdout_as_stderr():
-        found = exchanged((here, np.int32(os.getpid())))
-    _peers.extend((bytes(host).rstrip(b"\0").decode(errors="replace"), int(number)) for host, number in found)
-    same({what: _digest(fact.encode()) for what, fact in facts.items()})
+        exchanged(np.int32(0))
 
 
 def count() -> int:
@@ -116,24 +122,50 @@ def same(digests: Mapping[str, str]) -> None:
                     raise InputError(f"process {index()} has another {what} than process {other}; give all the same")
 
 
+def ended(reason: str = "") -> None:
+    """Tell the others, if there are any, that this process ends: as it should, or why not."""
+    for thread in _threads:
+        if isinstance(thread, Watch):
+            thread.end(reason and f"process {index()} has ended: {reason}")
+
+
+def _leave() -> None:
+    """End as it should."""
+    ended()
+    jax.distributed.shutdown()  # waits for the others
+    for thread in _threads:
+        thread.close()
+
+
+def _end(reason: str) -> None:
+    time.sleep(2 * BEAT)  # what differs between processes each of them finds out by itself, and says it better
+    say(f"process {index()} ends, as {reason}")
+    leave(1, at_once=True)
+
+
 def _end_at_once_after_errors() -> None:
     """Let an error that ends this process end it: else Python waits for the others, which wait for this one."""
     tell = sys.excepthook
 
-    def end(*error) -> None:
-        tell(*error)
+    def end(kind, error, trace) -> None:
+        if TRANSPORT.search(str(error)):
+            _wait_for_watch()
+        tell(kind, error, trace)
+        ended(f"{kind.__name__}: {error}")
         leave(1, at_once=True)
 
     sys.excepthook = end
 
 
+def _wait_for_watch() -> None:
+    """Wait while it finds out which process is lost, and ends this one."""
+    time.sleep(BEAT * (PATIENCE + 2))
+
+
 def _package() -> str:
     """Digest of the code of pathjax, which may be of one version and yet not the same."""
     files = sorted(Path(__file__).parent.rglob("*.py"))
-    return _digest(b"".join(file.read_bytes().replace(b"\r\n", b"\n") for file in files))
-
-
-def _digest(content: bytes) -> str:
+    content = b"".join(file.read_bytes().replace(b"\r\n", b"\n") for file in files)
     return hashlib.sha256(content).hexdigest()[:16]
 
 
@@ -147,10 +179,11 @@ def losses() -> Iterator[None]:
     try:
         yield
     except (ValueError, RuntimeError) as error:  # of either type the transport has it
-        if count() == 1 or isinstance(error, InputError | ProcessLost) or not (why := _lost(str(error))):
+        if count() == 1 or isinstance(error, InputError | ProcessLost) or not TRANSPORT.search(str(error)):
             raise
+        _wait_for_watch()
         said = str(error).partition("\n")[0]
-        raise ProcessLost(f"{why}: {said}") from None
+        raise ProcessLost(f"another process cannot be reached: {said}") from None
 
 
 @contextmanager
@@ -220,23 +253,3 @@ def _stdout_as_stderr() -> Iterator[None]:
     finally:
         os.dup2(kept, 1)
         os.close(kept)
-
-
-def _lost(said: str) -> str | None:
-    """Which of the others has ended, where that can be known: on this machine. None: none, by what the error says."""
-    here = socket.gethostname()
-    gone = [process for process, (host, number) in enumerate(_peers) if host == here and _ended(number)]
-    if gone:
-        return f"process {', '.join(map(str, gone))} has ended"
-    return "another process has ended, or cannot be reached" if TRANSPORT.search(said) else None
-
-
-def _ended(number: int) -> bool:
-    try:
-        os.kill(number, 0)
-        state = Path(f"/proc/{number}/stat").read_text().rpartition(")")[2].split()[0]
-    except FileNotFoundError:  # no Linux
-        return False
-    except OSError:
-        return True
-    return state in ("Z", "X")  # ended, but nobody has asked for its status

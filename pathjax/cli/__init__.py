@@ -31,6 +31,7 @@ def main(arguments: list[str] | None = None) -> int:
                 status = command.run(options, output)
         except InputError as error:
             say(str(error))
+            distributed.ended(str(error))
             status = WRONG
         except distributed.ProcessLost as error:
             say(f"process {distributed.index()} ends, as {error}")

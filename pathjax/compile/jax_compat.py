@@ -5,6 +5,7 @@ Tested with jax 0.7.2 to 0.12: a new version is met here.
 
 from __future__ import annotations
 
+import os
 from dataclasses import fields
 from functools import partial
 from typing import Any, TypeVar
@@ -25,6 +26,7 @@ __all__ = [
     "batching",
     "call_of_identity",
     "called_program",
+    "found_cluster",
     "gathered",
     "is_symbolic_zero",
     "is_traced",
@@ -144,3 +146,18 @@ def gathered(tree):
     from jax.experimental import multihost_utils  # takes a moment, and one process never needs it
 
     return multihost_utils.process_allgather(tree)
+
+
+def found_cluster(seconds: int) -> tuple[str, int, int, list[int] | None]:
+    """What `jax.distributed.initialize` finds out by itself: address, processes, number of this one, its devices.
+
+    Raises:
+        ValueError: it finds no cluster.
+    """
+    from jax._src.clusters import ClusterEnv
+
+    address = os.environ.get("JAX_COORDINATOR_ADDRESS")
+    found: Any = ClusterEnv.auto_detect_unset_distributed_params(address, None, None, None, None, seconds)
+    if None in found[:3]:
+        raise ValueError("no cluster is found here")
+    return found

@@ -15,13 +15,18 @@ _LONGEST, _SLOWEST = 1 << 16, 5.0
 _PAUSE = 0.1
 
 
-def meet(address: str, processes: int, process: int, facts: Mapping[str, str], seconds: float) -> None:
-    """Return when all processes have come; the address is free again then.
+def meet(
+    address: str, processes: int, process: int, facts: Mapping[str, str], seconds: float
+) -> dict[int, socket.socket]:
+    """Return when all processes have come; others may listen at the address then.
 
     Args:
         address: HOST:PORT of process 0.
         facts: what must be the same in all, by what it is.
         seconds: for which they wait for each other.
+    Returns:
+        connections, by the number of the process at the other end: of the first one with all others, of each of them
+        with the first.
     Raises:
         InputError: the address is none, or in use; nobody is there; processes are missing, two have one number, or they
             differ in a fact.
@@ -32,20 +37,22 @@ def meet(address: str, processes: int, process: int, facts: Mapping[str, str], s
     facts = {"number of processes": str(processes), **facts}
     own = {"process": process, "host": socket.gethostname(), "facts": facts}
     until = time.monotonic() + seconds
-    problem = _welcome(int(port), address, own, until) if process == 0 else _call(host, int(port), address, own, until)
-    if problem:
-        raise InputError(problem)
+    if process:
+        return {0: _call(host, int(port), address, own, until)}
+    return _welcome(int(port), address, own, until)
 
 
-def _welcome(port: int, address: str, own: dict, until: float) -> str:
-    """What keeps the processes from working together, as the first one finds out; empty: nothing."""
+def _welcome(port: int, address: str, own: dict, until: float) -> dict[int, socket.socket]:
+    """Connections with all others, who are told what keeps the processes from working together, if anything does."""
     try:
         dual = socket.has_dualstack_ipv6()
         family = socket.AF_INET6 if dual else socket.AF_INET
         server = socket.create_server(("", port), family=family, dualstack_ipv6=dual, backlog=512)
     except OSError as error:
-        return f"process 0 cannot be found at {address}: {error.strerror}; stop what uses the port, or name another"
-    with server, ExitStack() as open_calls:
+        raise InputError(
+            f"process 0 cannot be found at {address}: {error.strerror}; stop what uses the port, or name another"
+        ) from None
+    with server, ExitStack() as opened:
         came, calls, problem = {0: own}, [], ""
         count = int(own["facts"]["number of processes"])
         while not problem and len(came) < count:
@@ -56,17 +63,27 @@ def _welcome(port: int, address: str, own: dict, until: float) -> str:
                 missing = ", ".join(str(number) for number in range(count) if number not in came)
                 problem = f"of {count} processes {missing} did not come to {address}; start all of them"
                 break
-            open_calls.enter_context(call)
             call.settimeout(_SLOWEST)
-            with suppress(OSError, ValueError, KeyError, TypeError):  # somebody else, who is not of us
-                other = json.loads(call.makefile().readline(_LONGEST))
+            try:
+                other = json.loads(_line(call))
                 problem = _problem(own, came, other)
-                came[other["process"]] = other
-                calls.append(call)
-        for call in calls:
+            except (OSError, ValueError, KeyError, TypeError):  # somebody else, who is not of us
+                call.close()
+                continue
+            came[other["process"]] = other
+            calls.append((other["process"], opened.enter_context(call)))
+        for _, call in calls:
             with suppress(OSError):
                 call.sendall((json.dumps(problem) + "\n").encode())
-    return problem
+        if problem:
+            raise InputError(problem)
+        opened.pop_all()
+    return dict(calls)
+
+
+def _line(call: socket.socket) -> bytes:
+    """The next line, and nothing of what follows."""
+    return call.makefile("rb", buffering=0).readline(_LONGEST)
 
 
 def _problem(own: dict, came: dict, other: dict) -> str:
@@ -80,16 +97,24 @@ def _problem(own: dict, came: dict, other: dict) -> str:
     return ""
 
 
-def _call(host: str, port: int, address: str, own: dict, until: float) -> str:
-    """What the first process answers; empty: nothing keeps them from working together."""
+def _call(host: str, port: int, address: str, own: dict, until: float) -> socket.socket:
+    """The connection with the first process, which has said that nothing keeps them from working together."""
     why = "it does not answer"
     while (left := until - time.monotonic()) > 0:
-        try:
-            with socket.create_connection((host, port), timeout=left) as call:
+        with ExitStack() as opened:
+            try:
+                call = opened.enter_context(socket.create_connection((host, port), timeout=left))
                 call.sendall((json.dumps(own) + "\n").encode())
                 call.settimeout(max(until + _SLOWEST - time.monotonic(), 0.01))
-                return json.loads(call.makefile().readline(_LONGEST))
-        except (OSError, ValueError) as error:
-            why = getattr(error, "strerror", None) or why
-        time.sleep(_PAUSE)
-    return f"process {own['process']} found no process 0 at {address} ({why}); start all of them, with that address"
+                problem = json.loads(_line(call))
+            except (OSError, ValueError) as error:
+                why = getattr(error, "strerror", None) or why
+                time.sleep(_PAUSE)
+                continue
+            if problem:
+                raise InputError(problem)
+            opened.pop_all()
+            return call
+    raise InputError(
+        f"process {own['process']} found no process 0 at {address} ({why}); start all of them, with that address"
+    )

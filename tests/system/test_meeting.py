@@ -17,12 +17,15 @@ def address():
 
 
 def meeting(address, numbers, *, count=None, facts=None, seconds=10):
-    """What each process is told, None: nothing. facts: of each."""
+    """What each process is told, or the numbers of those that it is connected with then. facts: of each."""
     count, facts = count or len(numbers), facts or [{}] * len(numbers)
 
     def one(number, facts):
         try:
-            return meet(address, count, number, facts, seconds)
+            peers = meet(address, count, number, facts, seconds)
+            for peer in peers.values():
+                peer.close()
+            return sorted(peers)
         except InputError as error:
             return str(error)
 
@@ -32,7 +35,8 @@ def meeting(address, numbers, *, count=None, facts=None, seconds=10):
 
 def test_all_come_in_any_order_and_the_address_is_free_again(address):
     for numbers in ([0, 1, 2], [2, 1, 0], [0]):
-        assert meeting(address, numbers) == [None] * len(numbers)
+        others = sorted(set(numbers) - {0})
+        assert meeting(address, numbers) == [[0] if number else others for number in numbers]
 
 
 def test_nobody_is_at_the_address(address):
@@ -81,5 +85,5 @@ def test_strangers_are_not_counted(address):
     with ThreadPoolExecutor(1) as thread:
         first = thread.submit(meeting, address, [0], count=2)
         stranger()
-        assert meeting(address, [1], count=2) == [None]
-        assert first.result() == [None]
+        assert meeting(address, [1], count=2) == [[0]]
+        assert first.result() == [[1]]

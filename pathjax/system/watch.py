@@ -1,0 +1,153 @@
+"""Processes that work together watch each other: when one is lost the others end, and say which it was.
+
+The first process hears from all others, and each of them from it, by connections that stay open from their meeting. A
+connection ends with its process; a process that has stopped, or whose machine has, is silent.
+
+JAX, too, ends a process whose first one is lost, at once and without a name. So it talks with the first process through
+`Relay`, which stays open.
+"""
+
+from __future__ import annotations
+
+import select
+import socket
+import threading
+import time
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+
+# Seconds between two beats, and beats that may be missing: a process in a long call of NumPy's cannot send any.
+BEAT, PATIENCE = 0.5, 20
+_BEAT, _END = b"", b"end"
+_LONGEST = 1 << 12
+
+
+class Watch:
+    """A thread that hears the other processes, and calls `lost`, once, with the reason for which one is lost."""
+
+    def __init__(self, peers: Mapping[int, socket.socket], lost: Callable[[str], object]):
+        self._peers, self._lost = dict(peers), lost
+        self._watched = dict(peers)  # those that have not ended as they should
+        self._heard = dict.fromkeys(peers, b"")  # of each, the line that it has begun
+        self._silent = dict.fromkeys(peers, 0)  # beats since it was heard
+        self._speaking = threading.Lock()
+        for peer in peers.values():
+            peer.setblocking(False)
+        self._thread = threading.Thread(target=self._watch, daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Watch no longer: a thread that goes on while Python ends ends it badly."""
+        self._watched.clear()
+        self._thread.join()
+
+    def end(self, reason: str = "") -> None:
+        """Tell the others that this process ends: as it should, or why not."""
+        self._say(" ".join(reason.split()).encode() or _END)
+
+    def _watch(self) -> None:
+        try:
+            while self._watched:
+                self._say(_BEAT)
+                self._listen()
+        except _Loss as loss:
+            self.end(str(loss))
+            self._lost(str(loss))
+
+    def _listen(self) -> None:
+        until = time.monotonic() + BEAT
+        while self._watched and (left := until - time.monotonic()) > 0:
+            peers = dict(self._watched)
+            readable, *_ = select.select(list(peers.values()), [], [], left)
+            for number, peer in peers.items():
+                if peer in readable:
+                    self._hear(number, peer)
+        for number in list(self._watched):
+            # In beats and not in seconds, during which this process may have been stopped itself.
+            self._silent[number] += 1
+            if self._silent[number] > PATIENCE:
+                raise _Loss(f"process {number} has not answered for {BEAT * PATIENCE:g} s")
+
+    def _hear(self, number: int, peer: socket.socket) -> None:
+        try:
+            said = peer.recv(_LONGEST)
+        except BlockingIOError:
+            return
+        except OSError:
+            said = b""
+        if not said:
+            raise _Loss(f"process {number} has ended")
+        self._silent[number] = 0
+        *lines, self._heard[number] = (self._heard[number] + said).split(b"\n")
+        for line in lines:
+            if line not in (_BEAT, _END):
+                raise _Loss(line.decode(errors="replace"))
+        if _END in lines:
+            self._watched.pop(number, None)
+
+    def _say(self, line: bytes) -> None:
+        with self._speaking:
+            for peer in self._peers.values():
+                with suppress(OSError):  # who does not listen is found to be silent
+                    peer.sendall(line + b"\n")
+
+
+class _Loss(Exception):
+    """A process is lost; its text says which, and why."""
+
+
+class Relay:
+    """An address on this machine, where a caller is connected with who is at another one.
+
+    When the other one ends, the connection with the caller stays.
+    """
+
+    def __init__(self, target: str, seconds: float):
+        """target: HOST:PORT. seconds: for which a caller waits until somebody is there."""
+        host, _, port = target.rpartition(":")
+        self._target, self._seconds, self._closed = (host, int(port)), seconds, False
+        self._server = socket.create_server(("127.0.0.1", 0))
+        self.address = "{}:{}".format(*self._server.getsockname())
+        self._thread = threading.Thread(target=self._serve, daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        self._closed = True
+        self._thread.join()
+
+    def _serve(self) -> None:
+        others: dict[socket.socket, socket.socket] = {}  # where to pass on what comes
+        calls: list[socket.socket] = []  # which are closed when nobody holds them
+        while not self._closed:
+            readable, *_ = select.select([self._server, *others], [], [], BEAT)
+            for source in readable:
+                if source is self._server:
+                    call, _ = self._server.accept()
+                    if target := self._connected():
+                        calls.append(call)
+                        others |= {call: target, target: call}
+                elif source in others and not _passed(source, others[source]):
+                    target = others.pop(source)
+                    if source in calls:
+                        others.pop(target, None)
+                        target.close()
+
+    def _connected(self) -> socket.socket | None:
+        until = time.monotonic() + self._seconds
+        while not self._closed and time.monotonic() < until:
+            with suppress(OSError):
+                target = socket.create_connection(self._target, timeout=BEAT)
+                target.settimeout(None)
+                return target
+            time.sleep(BEAT / 10)
+        return None
+
+
+def _passed(source: socket.socket, target: socket.socket) -> bool:
+    """Pass on what has come; False: the source has ended."""
+    try:
+        said = source.recv(1 << 16)
+        target.sendall(said)
+        return bool(said)
+    except OSError:
+        return False
