@@ -1,33 +1,37 @@
 """Branches that cost much, each run for those lanes alone that take it.
 
 Lanes of one branch are listed one after another, and laid side by side a few at a time. So the branches together cost
-what one costs for all lanes, and to gather what they read and to bring back their results comes on top.
+what one costs for all lanes, and to gather what they read and to bring back their results comes on top. A branch that
+costs less than that is run for all lanes, as branches of little work are anyway.
 """
 
 from __future__ import annotations
 
 import math
+from functools import partial
 
+import jax
 import jax.numpy as jnp
 from jax import lax
 
 from pathjax.compile.jax_compat import ClosedJaxpr
 from pathjax.compile.lanes import flags
-from pathjax.compile.lanes.columns import as_components, differs, gathered, with_entry
+from pathjax.compile.lanes.columns import as_components, differs, entry, gathered, with_entry
 from pathjax.compile.lanes.dataflow import variables, variables_read_by
 from pathjax.compile.lanes.primitive_rules import COMPONENTWISE
 
-# Lanes that run a branch at once: a few vectors of the processor, of which few are idle at the end of a run.
-WIDTH = 64
-# Operations on a number of all branches together, from which on this is quicker than to run them all and select; of a
-# gathered number, in such operations. Both are as measured.
-_LEAST_WORK, _GATHER = 1000, 20
+# Lanes that run a branch at once: one or two vectors of the processor, as few lanes take a branch, so that a longer run
+# would be idle for the most part.
+WIDTH = 16
+# Operations on a number, from which on this is quicker than to run all branches and select: of those together that are
+# listed; of a branch, that it is; of a gathered number, in such operations. All are as measured.
+_LEAST_WORK, _LITTLE, _GATHER = 1000, 200, 20
 
 
 def pays(width: int, branches: tuple[ClosedJaxpr, ...]) -> bool:
     """Whether branches are best run so. One that does nothing is taken by lanes that wait for others."""
     work = list(map(_work, branches))
-    return width > WIDTH and min(work) > 0 and sum(work) > _LEAST_WORK
+    return width > WIDTH and min(work) > 0 and sum(each for each in work if each > _LITTLE) > _LEAST_WORK
 
 
 def _work(program: ClosedJaxpr) -> int:
@@ -43,68 +47,78 @@ def _work(program: ClosedJaxpr) -> int:
     return total
 
 
-def _read_by_any(branches) -> list[bool]:
-    """Of each operand."""
-    programs = [branch.jaxpr for branch in branches]
-    read = [variables_read_by(jaxpr.eqns) | variables(jaxpr.outvars) for jaxpr in programs]
-    by_branch = ([v in r for v in jaxpr.invars] for jaxpr, r in zip(programs, read, strict=True))
-    return list(map(any, zip(*by_branch, strict=True)))
-
-
 def in_runs(interpreter, which, branches: tuple[ClosedJaxpr, ...], operands: list) -> list:
     """Results of the branch that each lane takes; which: (W,) int32 its number."""
-    width, size = interpreter.width, interpreter.width + WIDTH
+    width, outputs = interpreter.width, branches[0].out_avals
     active = jnp.ones((width,), bool) if interpreter.active is None else interpreter.active
+    costs_little = [_work(branch) <= _LITTLE for branch in branches]
+    rare = [k for k, little in enumerate(costs_little) if not little]
+    operands = interpreter.materialize(operands)
 
+    # What costs little all lanes do, and keep where it is theirs, or where a run writes over it.
+    results = [as_components(aval.shape, [jnp.zeros((), aval.dtype)] * math.prod(aval.shape)) for aval in outputs]
+    for k, branch in enumerate(branches):
+        if costs_little[k]:
+            found = interpreter.run_for(which == k, branch, operands)
+            results = [interpreter.select(which == k, *cases) for cases in zip(results, found, strict=True)]
+    columns = interpreter.pack(results, [True] * len(outputs))
+
+    # The others' lanes are listed, branch after branch.
     def enlist(lane, state):
-        listed, order, place = state
-        return listed + 1, with_entry(order, lane, listed), with_entry(place, listed, lane)
+        listed, order = state
+        return listed + 1, with_entry(order, lane, listed)
 
-    def enlist_all(k, state):
+    def enlist_all(place, state):
         listed, ends = state
-        listed = flags.for_each_lane(flags.packed(active & (which == k)), enlist, listed)
-        return listed, with_entry(ends, listed[0], k + 1)
+        mine = active & (which == entry(jnp.array(rare, jnp.int32), place))
+        listed = flags.for_each_lane(flags.packed(mine), enlist, listed)
+        return listed, with_entry(ends, listed[0], place + 1)
 
-    listed = jnp.int32(0), jnp.zeros((size,), jnp.int32), jnp.zeros((width,), jnp.int32)
-    ends = jnp.zeros((len(branches) + 1,), jnp.int32)
-    (_, order, place), ends = lax.fori_loop(0, len(branches), enlist_all, (listed, ends))
+    listed, ends = (jnp.int32(0), jnp.zeros((width + WIDTH,), jnp.int32)), jnp.zeros((len(rare) + 1,), jnp.int32)
+    (_, order), ends = lax.fori_loop(0, len(rare), enlist_all, (listed, ends))
+    for place, k in enumerate(rare):
+        run = _run(type(interpreter)(WIDTH), branches[k], operands, order, ends[place + 1])
+        _, columns = lax.while_loop(partial(_below, ends[place + 1]), run, (ends[place], columns))
+    return [as_components(aval.shape, items) for aval, items in zip(outputs, columns, strict=True)]
 
-    # What is read lies in that order, once for all branches: a run of lanes reads it from one place on.
-    def in_order(x, is_read):
+
+def _run(narrow, branch: ClosedJaxpr, operands: list, order, end):
+    """A function that runs a branch for WIDTH of the lanes in `order`, up to `end`, and stores what it finds of each.
+
+    It takes and returns the place in the order and the columns of the results.
+    """
+
+    def of_lanes(x, is_read, lanes):
         if not differs(x) or not is_read:
             return x
-        return as_components(x.shape, [gathered(item, order) if jnp.ndim(item) else item for item in x.flat])
+        return as_components(x.shape, [gathered(item, lanes) if jnp.ndim(item) else item for item in x.flat])
 
-    operands = interpreter.materialize(list(map(in_order, operands, _read_by_any(branches))))
-    outputs = branches[0].out_avals
-    narrow = type(interpreter)(WIDTH)
-    results = [[jnp.zeros((size,), aval.dtype)] * math.prod(aval.shape) for aval in outputs]
-    for k, branch in enumerate(branches):
-        first, end = ends[k], ends[k + 1]
+    def run(state):
+        first, columns = state
+        lanes = lax.dynamic_slice(order, (first,), (WIDTH,))
+        inputs = [of_lanes(x, is_read, lanes) for x, is_read in zip(operands, _reads(branch), strict=True)]
+        narrow.active = jnp.arange(WIDTH) < end - first
+        found = narrow.pack(narrow.run(branch, narrow.materialize(inputs)), [True] * len(branch.out_avals))
 
-        def step(state, branch=branch, end=end):
-            first, results = state
+        def store(state):
+            n, columns = state
+            lane = entry(lanes, n)
+            pairs = zip(jax.tree.leaves(columns), jax.tree.leaves(found), strict=True)
+            stored = [with_entry(column, entry(mine, n), lane) for column, mine in pairs]
+            return n + 1, jax.tree.unflatten(jax.tree.structure(columns), stored)
 
-            def mine(x):
-                if not differs(x):
-                    return x
-                window = (lax.dynamic_slice(item, (first,), (WIDTH,)) if jnp.ndim(item) else item for item in x.flat)
-                return as_components(x.shape, window)
+        most = jnp.minimum(end - first, WIDTH)
+        _, columns = lax.while_loop(partial(_below, most), store, (jnp.int32(0), columns))
+        return first + WIDTH, columns
 
-            narrow.active = jnp.arange(WIDTH) < end - first
-            found = narrow.pack(narrow.run(branch, list(map(mine, operands))), [True] * len(outputs))
-            # What is written beyond the run's end is written again by the next one.
-            stored = [
-                [lax.dynamic_update_slice(whole, part, (first,)) for whole, part in zip(*columns, strict=True)]
-                for columns in zip(results, found, strict=True)
-            ]
-            return first + WIDTH, stored
+    return run
 
-        def goes_on(state, end=end):
-            return state[0] < end
 
-        _, results = lax.while_loop(goes_on, step, (first, results))
-    return [
-        as_components(aval.shape, [gathered(column, place) for column in columns])
-        for aval, columns in zip(outputs, results, strict=True)
-    ]
+def _below(end, state):
+    return state[0] < end
+
+
+def _reads(branch: ClosedJaxpr) -> list[bool]:
+    """Which of the operands a branch reads."""
+    read = variables_read_by(branch.jaxpr.eqns) | variables(branch.jaxpr.outvars)
+    return [v in read for v in branch.jaxpr.invars]
