@@ -22,9 +22,11 @@ from jaxtyping import Array, Bool, Float, Int
 from pathjax.compile import register_dataclass
 from pathjax.core.math import at, dot, safe_divide
 from pathjax.core.types import BSDFSample, Ray
+from pathjax.core.warp import chosen
 from pathjax.kinds import Instance, Parameters, Row, Table, ordered
 from pathjax.kinds import register as register_kind
 from pathjax.media import grids
+from pathjax.media.blendphase import BlendPhase
 from pathjax.media.grids import Grids
 from pathjax.media.gridvolume import GridVolume
 from pathjax.media.hg import HG
@@ -38,6 +40,7 @@ __all__ = [
     "KINDS",
     "PHASES",
     "VOLUMES",
+    "BlendPhase",
     "GridVolume",
     "Grids",
     "Heterogeneous",
@@ -51,7 +54,7 @@ __all__ = [
 
 # By the name that scene files give them.
 KINDS = {"homogeneous": Homogeneous, "heterogeneous": Heterogeneous}
-PHASES: dict[str, type[Phase]] = {"isotropic": Isotropic, "hg": HG, "rayleigh": Rayleigh}
+PHASES: dict[str, type[Phase]] = {"isotropic": Isotropic, "hg": HG, "rayleigh": Rayleigh, "blendphase": BlendPhase}
 # In the place of a row: no medium; and of shapes that say nothing, which leave paths in the medium that they are in.
 NONE, SAME = -1, -2
 # Least probability of each colour: what the path carries nothing of may have a derivative.
@@ -67,7 +70,7 @@ def register(name: str):
 @dataclass(frozen=True)
 class Media:
     table: Table  # of all media, whatever their kind; without albedo where nothing scatters
-    phases: tuple[Table, ...]  # one for each kind of phase function present
+    phases: tuple[Table, ...]  # one for each kind of phase function present; that of blends comes last
     phase: Int[Array, "R 2"]  # of each medium: kind and row of its phase function
     sides: Int[Array, "S 2"]  # of each shape: rows of the media inside and outside, or NONE, or SAME twice
     camera: Int[Array, ""]  # row of the medium in which paths begin, or NONE
@@ -103,9 +106,14 @@ def build(
     extinctions, albedos = (_grids(rows, key, dtype, parameters) for key in ("sigma_t", "albedo"))
     phases, code = [], {}
     if scatters:
-        for kind, instances in ordered(dict.fromkeys(each.values["phase"] for each in present), PHASES).items():
+        asked = [each.values["phase"] for each in present]
+        asked += [held for each in asked for held in each.values.get("held", ())]
+        for kind, instances in sorted(ordered(dict.fromkeys(asked), PHASES).items(), key=lambda item: _blends(item[0])):
             code |= {each: (len(phases), row) for row, each in enumerate(instances)}
             phases.append(kind.build(instances, dtype, (*path, "phases", len(phases)), parameters, None))
+            if _blends(kind):
+                codes = [[code[held] for held in each.values["held"]] for each in instances]
+                phases[-1] = phases[-1].with_column("codes", np.asarray(codes, np.int32))
     phase = [code.get(each.values["phase"], (NONE, NONE)) for each in present]
     rows = [(SAME, SAME) if pair == (None, None) else tuple(number[each] for each in pair) for pair in sides]
     sides = np.asarray(rows, np.int32).reshape(-1, 2)
@@ -253,24 +261,55 @@ def _chances(throughput):
 
 def evaluate(media: Media, medium: Int[Array, ""], wo: Float[Array, "3"]) -> tuple[Float[Array, "3"], Float[Array, ""]]:
     """The phase function, as a bsdf is evaluated, and its density."""
-    f = _of_phase(media, medium, lambda kind, p: kind.evaluate(p, wo))
+    code = at(media.phase, jnp.maximum(medium, 0))
+    f = _of_phase(media, code, lambda kind, p: kind.evaluate(p, wo)) if not _mixes(media) else _mixture(media, code, wo)
     return jnp.broadcast_to(f, wo.shape), lax.stop_gradient(f)
 
 
 def sample(media: Media, medium: Int[Array, ""], u: Float[Array, "2"]) -> BSDFSample:
-    """Draw `wo` from the phase function, as if it were a bsdf."""
+    """Draw `wo` from the phase function, as if it were a bsdf; of a blend, from the one or the other by its weight."""
+    code = blend = at(media.phase, jnp.maximum(medium, 0))
+    if _mixes(media):
+        one, other, weight = _held(media, blend)
+        takes_one, u = chosen(u, lax.stop_gradient(1 - weight))
+        code = jnp.where(takes_one, one, other)
 
     def draw(kind, p):
         wo = kind.sample(p, u)
         return wo, kind.evaluate(p, wo)
 
-    wo, f = _of_phase(media, medium, draw)
+    wo, f = _of_phase(media, code, draw)
+    if _mixes(media):
+        f = _mixture(media, blend, wo)
     pdf = lax.stop_gradient(f)
     weight = jnp.broadcast_to(safe_divide(f, pdf), wo.shape)
     return BSDFSample(wo, weight, pdf, jnp.bool_(False), jnp.ones_like(pdf))
 
 
-def _of_phase(media, medium, of):
-    code = at(media.phase, jnp.maximum(medium, 0))
-    branches = [lambda table=table: of(table.kind, Row(table, code[1])) for table in media.phases]
+def _of_phase(media, code, of):
+    """What a function finds of the kind and the row of a phase function that is no blend."""
+    tables = media.phases[:-1] if _mixes(media) else media.phases
+    branches = [lambda table=table: of(table.kind, Row(table, code[1])) for table in tables]
     return branches[0]() if len(branches) == 1 else lax.switch(code[0], branches)
+
+
+def _blends(kind: type[Phase]) -> bool:
+    return issubclass(kind, BlendPhase)
+
+
+def _mixes(media) -> bool:
+    return _blends(media.phases[-1].kind)
+
+
+def _held(media, code):
+    """The phase functions that a blend holds, and the weight of the second; of what is none, itself twice, and 0."""
+    is_blend = code[0] == len(media.phases) - 1
+    p = Row(media.phases[-1], jnp.where(is_blend, code[1], 0))
+    one, other = (jnp.where(is_blend, held, code) for held in p.codes)
+    return one, other, jnp.where(is_blend, p.weight, 0)
+
+
+def _mixture(media, code, wo):
+    one, other, weight = _held(media, code)
+    first, second = (_of_phase(media, each, lambda kind, p: kind.evaluate(p, wo)) for each in (one, other))
+    return (1 - weight) * first + weight * second

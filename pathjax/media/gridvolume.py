@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -16,6 +17,8 @@ from pathjax.system.files import write_whole
 
 _HEADER = struct.Struct("<3sB5i6f")  # "VOL", version, encoding, x, y, z, channels, the corners of the box
 _VERSION, _FLOAT32 = 3, 1
+# Of a grid that repeats: 4 GB of colours in float32.
+MOST_CELLS = 4e9 / 12
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,12 +31,12 @@ class GridVolume:
     data: np.ndarray  # (Z, Y, X, C), C being 1 or 3
     to_grid: np.ndarray  # (3, 4), from world space to where the centre of cell i lies at i; x, y, z
     box: np.ndarray  # (2, 3) lower and upper corner in world space of the box around it, beyond which nothing is
+    repeats: bool = False  # instead: see `repeated`
 
     unused: ClassVar[Mapping[str, Unused]] = {
         "accel": Unused("boolean"),
         "max_value": Unused("float", "it bounds Mitsuba's steps", at_least=0),
         "raw": Unused("boolean", "its colours are linear RGB"),
-        "wrap_mode": Unused("string", "beyond the grid its outermost values count", choices=("clamp", "mirror")),
         "filter_type": Unused("string", "values are interpolated", choices=("trilinear",)),
     }
 
@@ -54,7 +57,22 @@ class GridVolume:
         if not ((data >= 0) & (data <= high)).all():  # also where one is NaN
             what = "not be negative" if high == np.inf else f"lie between 0 and {high:g}"
             raise fields.element.error(f"{path}: its values must {what}, and are {data.min():g} to {data.max():g}")
-        return cls(data, *_placed(fields.transform("to_world"), box, data.shape[2::-1]))
+        repeats = fields.string("wrap_mode", "clamp", choices=("clamp", "mirror", "repeat")) == "repeat"
+        return cls(data, *_placed(fields.transform("to_world"), box, data.shape[2::-1]), repeats)
+
+    def repeated(self, box: np.ndarray) -> GridVolume:
+        """The same laid side by side, as far as a box (2, 3) in world space reaches.
+
+        Raises:
+            InputError: that would be more than MOST_CELLS.
+        """
+        corners = corners_of(box) @ self.to_grid[:, :3].T + self.to_grid[:, 3]
+        low, high = np.floor(corners.min(0)).astype(int), np.ceil(corners.max(0)).astype(int)
+        if (cells := math.prod((high - low + 1).tolist())) > MOST_CELLS:
+            raise InputError(f"a repeated grid fills its medium with {cells:.2g} cells, more than {MOST_CELLS:.2g}")
+        x, y, z = (np.arange(low[k], high[k] + 1) % self.data.shape[2 - k] for k in range(3))
+        moved = self.to_grid - np.pad(low[:, None], ((0, 0), (3, 0)))
+        return GridVolume(self.data[np.ix_(z, y, x)], moved, self.box)
 
 
 def boxed(value: np.ndarray, to_world: np.ndarray) -> GridVolume:
@@ -68,8 +86,13 @@ def _placed(to_world: np.ndarray, box: np.ndarray, size: tuple[int, ...]) -> tup
     extent = box[1] - box[0]
     to_cells = np.diag([*(np.array(size) / extent), 1.0])
     to_cells[:3, 3] = -box[0] * np.array(size) / extent - 0.5
-    corners = np.stack(np.meshgrid(*box.T, indexing="ij"), -1).reshape(-1, 3) @ to_world[:3, :3].T + to_world[:3, 3]
+    corners = corners_of(box) @ to_world[:3, :3].T + to_world[:3, 3]
     return (to_cells @ np.linalg.inv(to_world))[:3], np.stack([corners.min(0), corners.max(0)])
+
+
+def corners_of(box: np.ndarray) -> np.ndarray:
+    """(8, 3)."""
+    return np.stack(np.meshgrid(*box.T, indexing="ij"), -1).reshape(-1, 3)
 
 
 def read_vol(path: Path) -> tuple[np.ndarray, np.ndarray]:

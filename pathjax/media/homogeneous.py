@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
 import numpy as np
@@ -89,6 +89,11 @@ class Homogeneous(Kind):
         grey = np.ptp(extinction.data if isinstance(extinction, GridVolume) else extinction, -1).max() == 0
         if not fields.boolean("has_spectral_extinction", True) and not grey:
             raise fields.error("has_spectral_extinction", "is false, but sigma_t has a colour; leave it out")
+        for key in ("sigma_t", "albedo"):
+            if isinstance(value := made.values[key], GridVolume) and value.repeats:
+                if not isinstance(extinction, GridVolume):
+                    raise fields.error(key, "repeats without end; only that of a heterogeneous medium may, in its box")
+                made = replace(made, values={**made.values, key: value.repeated(extinction.box)})
         return cls.scattering(made, loader.shared(phases[0], name) if phases else EVEN)
 
     @staticmethod

@@ -154,6 +154,12 @@ CASES = {
     ).replace('"homogeneous"', '"heterogeneous"'),
     "isotropic": filled(rgb("sigma_t", "0.5, 2, 4"), rgb("albedo"), '<phase type="isotropic"/>'),
     "hg": filled(rgb("sigma_t", "1"), rgb("albedo"), f'<phase type="hg" id="phase">{numbers(g=0.6)}</phase>'),
+    "blendphase": filled(
+        rgb("sigma_t", "1"),
+        rgb("albedo"),
+        f'<phase type="blendphase" id="phase">{numbers(weight=0.3)}<phase type="isotropic"/>'
+        f'<phase type="hg" id="held">{numbers(g=0.6)}</phase></phase>',
+    ),
     "rayleigh": filled(rgb("sigma_t", "0.5, 2, 4"), rgb("albedo"), '<phase type="rayleigh"/>'),
     "area": BALL.format(GREY)
     + '<shape type="sphere"><point name="center" value="1, 1, 1"/><float name="radius" value="0.5"/>'

@@ -80,6 +80,9 @@ def test_one_that_scatters_draws_what_another_absorbs_too(estimate, agree):
 # ---- scattering -----------------------------------------------------------------------------------------------------
 
 
+EVEN = {"type": "isotropic"}
+
+
 @slow
 @pytest.mark.parametrize(
     "inside",
@@ -87,6 +90,7 @@ def test_one_that_scatters_draws_what_another_absorbs_too(estimate, agree):
         medium(albedo=1.0, sigma_t=(0.5, 2.0, 8.0)),
         medium(albedo=1.0, sigma_t=3.0, phase={"type": "hg", "g": 0.8}),
         medium(albedo=1.0, sigma_t=(0.5, 2.0, 8.0), phase={"type": "hg", "g": -0.8}),
+        medium(albedo=1.0, sigma_t=3.0, phase={"type": "blendphase", "weight": 0.3, "a": {"type": "hg"}, "b": EVEN}),
     ],
 )
 def test_a_white_medium_cannot_be_told_from_the_sky(inside, estimate, agree):

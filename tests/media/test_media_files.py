@@ -71,12 +71,19 @@ def test_older_files_name_the_extinction_in_their_way(tmp_path):
     assert load(tmp_path / "old.xml").shapes[0].interior.values["sigma_t"][0] == 3
 
 
+HG, WEIGHT = '<phase type="hg"/>', '<float name="weight" value="0.5"/>'
+BLEND = f'<phase type="blendphase">{WEIGHT}{2 * HG}</phase>'
+
+
 @pytest.mark.parametrize(
     ("body", "says"),
     [
         (ball(medium='<rgb name="albedo" value="1.5, 0, 0"/>'), '"albedo" of .* must lie between 0 and 1'),
         (ball(medium='<float name="sigma_t" value="-1"/>'), '"sigma_t" of .* must not be negative'),
         (ball(medium='<float name="scale" value="-1"/>'), '"scale" of .* must be at least 0'),
+        (ball(medium='<phase type="blendphase"><phase type="hg"/></phase>'), "needs two <phase>s inside, and has 1"),
+        (ball(medium=f'<phase type="blendphase">{2 * HG}</phase>'), 'needs <float name="weight"'),
+        (ball(medium=f'<phase type="blendphase">{WEIGHT}{HG}{BLEND}</phase>'), "blend two that are no blends"),
         (ball(medium='<phase type="hg"><float name="g" value="1"/></phase>'), '"g" of .*must be above -1 and below 1'),
         (ball(medium='<phase type="sggx"/>'), "sggx.*not supported yet; use one of isotropic"),
         (ball(medium='<phase type="isotropc"/>'), 'did you mean "isotropic"'),

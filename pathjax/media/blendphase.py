@@ -1,0 +1,35 @@
+"""Mixtures of two phase functions."""
+
+from __future__ import annotations
+
+from pathjax.kinds import Instance, Number, PerRow
+from pathjax.media.phase import Phase
+
+
+class BlendPhase(Phase):
+    """The first phase function inside where the weight is 0, the second one where it is 1.
+
+    An `Instance` holds both under "held". What scatters is one of these: see `media.sample`.
+    """
+
+    weight = Number(bounds=(0, 1))
+    codes = PerRow()  # (2, 2) int32: kind and row of each
+
+    @classmethod
+    def read(cls, loader, fields, name):
+        made, elements = super().read(loader, fields, name), fields.objects("phase", limit=2)
+        if len(elements) < 2:
+            raise fields.element.error(f"{fields.element} needs two <phase>s inside, and has {len(elements)}")
+        if made.values["weight"] is None:
+            raise fields.element.error(f'{fields.element} needs <float name="weight" ...>')
+        held = tuple(loader.shared(each, loader.unique(f"{name}_{place}")) for place, each in enumerate(elements))
+        for each, element in zip(held, elements, strict=True):
+            if issubclass(each.kind, cls):
+                raise element.error(f"{element} cannot stand inside another one; blend two that are no blends")
+        return Instance(cls, name, {**made.values, "held": held})
+
+    @staticmethod
+    def evaluate(p, wo):
+        raise NotImplementedError("the phase functions that a blend holds scatter")
+
+    sample = evaluate
