@@ -21,7 +21,7 @@ class Conductor(BSDF):
 
     specular_reflectance = Color(1.0)
     eta = Color(None, bounds=(0, math.inf))
-    k = Color(None, bounds=(0, math.inf))
+    k = Color(None, bounds=(0, math.inf), absent=1.0)  # of ideal mirrors among metals, whose eta is 0
     delta = True
 
     @classmethod
@@ -40,15 +40,6 @@ class Conductor(BSDF):
             # Of "none" eta is 0 and k is 1: all is reflected.
             defaults = {"eta": np.zeros(3), "k": np.ones(3)} if given else {}
         return cls.instance(name, **{key: defaults.get(key) if v is None else v for key, v in values.items()})
-
-    @classmethod
-    def build(cls, instances, dtype, path, parameters, code):
-        table = super().build(instances, dtype, path, parameters, code)
-        if (k := table.column("k")) is None:
-            return table
-        # Ideal mirrors among metals: with eta = 0 any k > 0 reflects all.
-        ideal = np.array([instance.values["k"] is None for instance in instances])[:, None]
-        return table.with_column("k", np.where(ideal, np.ones(1, k.values.dtype), k.values))
 
     @staticmethod
     def reflectance(p: Row, cos: Float[Array, ""]) -> Float[Array, "3"]:

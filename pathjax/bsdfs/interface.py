@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from pathjax.bsdfs.bsdf import BSDF
 from pathjax.kinds import Color, Row
-
-LOBES = ("specular_reflectance", "specular_transmittance")
 
 
 class Interface(BSDF):
@@ -18,18 +15,9 @@ class Interface(BSDF):
     A colour of a lobe is 1 where a file gives none. It is compiled, and is a parameter, only where one is given.
     """
 
-    specular_reflectance = Color(None)
-    specular_transmittance = Color(None)
+    specular_reflectance = Color(None, absent=1.0)
+    specular_transmittance = Color(None, absent=1.0)
     transmissive = sided = True
-
-    @classmethod
-    def build(cls, instances, dtype, path, parameters, code):
-        table = super().build(instances, dtype, path, parameters, code)
-        for name in LOBES:
-            if (column := table.column(name)) is not None:
-                missing = np.array([instance.values[name] is None for instance in instances])[:, None]
-                table = table.with_column(name, np.where(missing, np.ones(1, column.values.dtype), column.values))
-        return table
 
     @staticmethod
     def tinted(p: Row, value: Float[Array, ""], reflects: Bool[Array, ""]) -> Float[Array, "3"]:

@@ -17,11 +17,10 @@ from pathjax.kinds import Declared, Kind, Row
 class Weight(Declared):
     """How often lights are sampled, relative to their `power`. No parameter: it changes noise alone."""
 
+    absent: object = 1.0
+
     def read(self, loader, fields, name, owner):
         return fields.float(name, None, at_least=self.bounds[0])
-
-    def standing_in(self):
-        return np.ones(())
 
 
 class Emitter(Kind):

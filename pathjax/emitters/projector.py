@@ -27,15 +27,12 @@ class Projector(DiracEmitter):
 
     @classmethod
     def read(cls, loader, fields, name):
-        irradiance = cls.irradiance.read(loader, fields, "irradiance", name)
         to_world = fields.transform("to_world")
         if not np.allclose(to_world[:3, :3].T @ to_world[:3, :3], np.eye(3), atol=2e-3):
             raise fields.error("to_world", "scales or shears; a projector can be turned and moved only")
-        scale = cls.scale.read(loader, fields, "scale", name)
-        lens = _extent(*field_of_view(fields), irradiance)
-        weight = cls.sampling_weight.read(loader, fields, "sampling_weight", name)
-        placed = {"sampling_weight": weight, "position": to_world[:3, 3], "to_world": to_world[:3, :3]}
-        return cls.instance(name, irradiance=irradiance, scale=scale, **placed, **lens)
+        placed = {"position": to_world[:3, 3], "to_world": to_world[:3, :3]}
+        values = super().read(loader, fields, name, **placed).values
+        return cls.instance(name, **values | _extent(*field_of_view(fields), values["irradiance"]))
 
     @classmethod
     def instance(cls, name="", **values):

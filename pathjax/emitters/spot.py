@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import jax.numpy as jnp
 import numpy as np
@@ -14,18 +13,11 @@ from pathjax.emitters.point import Point
 from pathjax.kinds import Angle, Color, Direction, Rotation, Row
 
 
-@dataclass(frozen=True)
-class Cover(Color):
-    """A colour that light is multiplied by; white of rows that lack it."""
-
-    def standing_in(self):
-        return np.ones(self.shape)
-
-
 class Spot(Point):
     """A cone of light: `intensity` up to `beam_width` off its axis, falling linearly from there to `cutoff_angle`."""
 
-    texture = Cover(None, bounds=(0, math.inf), radiance=True)  # over the square around the cone, seen from the light
+    # Over the square around the cone, seen from the light; white of rows that lack it.
+    texture = Color(None, bounds=(0, math.inf), radiance=True, absent=1.0)
     cutoff_angle = Angle(20.0, bounds=(0, 180))
     beam_width = Angle(None)  # by default 3/4 of the cutoff angle
     direction = Direction()
@@ -33,24 +25,22 @@ class Spot(Point):
 
     @classmethod
     def read(cls, loader, fields, name):
-        texture = cls.texture.read(loader, fields, "texture", name)
-        intensity = cls.intensity.read(loader, fields, "intensity", name)
-        cutoff = cls.cutoff_angle.read(loader, fields, "cutoff_angle", name)
-        beam = fields.float("beam_width", None, at_least=0)
-        if beam is not None and beam > cutoff:
-            loader.note(fields.where("beam_width"), f"is wider than cutoff_angle, {cutoff:g}, where the light ends")
-            beam = cutoff
-        weight = cls.sampling_weight.read(loader, fields, "sampling_weight", name)
         to_world = fields.transform("to_world")
         axes = to_world[:3, :3] / np.linalg.norm(to_world[:3, 2])
         if not np.allclose(axes.T @ axes, np.eye(3), atol=2e-3):
             raise fields.error("to_world", "shears or scales unevenly, and its cone would not be round")
-        placed = {"sampling_weight": weight, "position": to_world[:3, 3], "direction": Direction.of(to_world[:3, 2])}
-        if texture is not None:
-            if cutoff >= 90:
-                raise fields.error("cutoff_angle", f"must be below 90 where a texture covers the cone, is {cutoff:g}")
-            placed["to_world"] = axes
-        return cls.instance(name, intensity=intensity, texture=texture, cutoff_angle=cutoff, beam_width=beam, **placed)
+        placed = {"position": to_world[:3, 3], "direction": Direction.of(to_world[:3, 2]), "to_world": axes}
+        beam = fields.float("beam_width", None, at_least=0)
+        values = dict(super().read(loader, fields, name, beam_width=beam, **placed).values)
+        cutoff = values["cutoff_angle"]
+        if values["beam_width"] > cutoff:
+            loader.note(fields.where("beam_width"), f"is wider than cutoff_angle, {cutoff:g}, where the light ends")
+            values["beam_width"] = cutoff
+        if values["texture"] is None:
+            values["to_world"] = None
+        elif cutoff >= 90:
+            raise fields.error("cutoff_angle", f"must be below 90 where a texture covers the cone, is {cutoff:g}")
+        return cls.instance(name, **values)
 
     @classmethod
     def instance(cls, name="", **values):

@@ -17,6 +17,7 @@ class Declared:
     textured: bool = False  # a texture may stand in its place
     moves_paths: bool = False
     least: float = -math.inf  # what is smaller counts as this
+    absent: object = 0.0  # the value of rows that lack it, which nothing reads, or which means the same
     shape = ()  # of a row's value
     dtype = None  # of the scene's reals, unless it is given
     listed = False  # is a parameter of the scene, to be set, differentiated and fitted
@@ -25,10 +26,6 @@ class Declared:
     def read(self, loader, fields, name: str, owner: str):
         """The value that a file gives it, or the default. Raises InputError where it is out of range."""
         return self.default
-
-    def standing_in(self):
-        """The value of rows that lack it, which nothing reads, or which means the same."""
-        return np.zeros(self.shape)
 
 
 @dataclass(frozen=True)
@@ -73,6 +70,7 @@ class Color(Declared):
 class Transform2(Declared):
     """(2, 3) applied to (u, v, 1); in files a transform of x and y."""
 
+    absent: object = field(default_factory=lambda: np.eye(2, 3))
     shape = (2, 3)
 
     def read(self, loader, fields, name, owner):
@@ -80,9 +78,6 @@ class Transform2(Declared):
         if not np.allclose([matrix[:2, 2], matrix[2, :2]], 0, atol=1e-9):
             raise fields.error(name, "mixes z with u and v; shifts are <translate>, or the last column of 16 numbers")
         return matrix[np.ix_([0, 1], [0, 1, 3])]
-
-    def standing_in(self):
-        return np.eye(2, 3)
 
 
 @dataclass(frozen=True)

@@ -40,15 +40,17 @@ class Kind:
         return cls._places[name]
 
     @classmethod
-    def read(cls, loader, fields, name: str) -> Instance:
+    def read(cls, loader, fields, name: str, **known) -> Instance:
         """What a scene file says of one object of this kind.
 
         Args:
             loader: of scene files: `loader.texture(fields, parameter, owner)`, `loader.notes`, ...
             fields: `description.fields.Fields`, which refuses what nobody asks for.
             name: by which its parameters are known.
+            known: values of parameters that are not to be read.
         """
-        return cls.instance(name, **{key: d.read(loader, fields, key, name) for key, d in cls.declared.items()})
+        asked = {key: d for key, d in cls.declared.items() if key not in known}
+        return cls.instance(name, **known, **{key: d.read(loader, fields, key, name) for key, d in asked.items()})
 
     @classmethod
     def instance(cls, name: str = "", **values) -> Instance:
@@ -105,7 +107,7 @@ def _column(declared: Declared, values: list, dtype, code: Callable | None) -> C
     textured = [isinstance(value, Instance) for value in values]
     missing = [value is None or is_texture for value, is_texture in zip(values, textured, strict=True)]
     constants = [
-        np.broadcast_to(declared.standing_in() if is_missing else value, declared.shape)
+        np.broadcast_to(declared.absent if is_missing else value, declared.shape)
         for value, is_missing in zip(values, missing, strict=True)
     ]
     codes = [code(value) if is_texture else (-1, 0) for value, is_texture in zip(values, textured, strict=True)]

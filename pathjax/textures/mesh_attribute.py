@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, Int
 
 from pathjax.core.math import at
 from pathjax.core.types import Surface
-from pathjax.kinds import Column, Declared, Instance, Number, PerRow, Row, Setting, Table
+from pathjax.kinds import Declared, Instance, Number, PerRow, Row, Setting
 from pathjax.textures.texture import Texture
 
 
@@ -37,9 +37,7 @@ class MeshAttribute(Texture):
         table = super().build(instances, dtype, path, parameters, code)
         names = sorted({instance.values["names"] for instance in instances})
         numbers = np.array([names.index(instance.values["names"]) for instance in instances], np.int32)
-        columns = list(table.columns)
-        columns[cls.place("number")] = Column(numbers)
-        return Table(tuple(columns), cls, (("names", " ".join(names)),))
+        return table.with_column("number", numbers).with_setting("names", " ".join(names))
 
     @staticmethod
     def look_up(p: Row, uv: Float[Array, "2"], surface: Surface) -> Float[Array, "3"]:

@@ -405,7 +405,7 @@ def test_a_beam_wider_than_its_cone_ends_with_it(make_scene):
         (emitter("spot", cone(180)), "must be above 0 and below 180, is 180"),
         (emitter("spot", cone(0)), "must be above 0 and below 180, is 0"),
         (emitter("spot", cone(None, -1)), "must be at least 0, is -1"),
-        (emitter("spot", vector("position", (0, 1, 0))), "it has: texture, intensity, cutoff_angle, beam"),
+        (emitter("spot", vector("position", (0, 1, 0))), "it has: to_world, beam_width, sampling_weight"),
         (emitter("spot", placed('<scale x="2"/>')), "scales unevenly"),
         (emitter("spot", cone(90) + '<rgb name="texture" value="1"/>'), "must be below 90 where a texture covers"),
         (emitter("projector", placed('<scale value="2"/>')), "scales or shears"),

@@ -165,7 +165,7 @@ class _Writer:
             return False
         for key, value in values.items():
             x, declared = np.asarray(value), made.kind.declared[key]
-            read = declared.standing_in() if again.values.get(key) is None else again.values[key]
+            read = declared.absent if again.values.get(key) is None else again.values[key]
             if not np.array_equal(np.broadcast_to(np.asarray(read, x.dtype), x.shape), x):
                 return False
         return True
