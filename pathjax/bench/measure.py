@@ -141,7 +141,7 @@ def _reference(scene: Scene, spp: int) -> Reference:
 
 
 def _timed(scene: Scene, kinds: dict, seeds) -> dict:
-    """Of every kind {name: (spp, strategy)}, one of each seed: seconds, images, CPU seconds. Kinds take turns."""
+    """Seconds, images and CPU seconds of every kind {name: (spp, strategy)}, one of each seed. Kinds take turns."""
     done = {name: ([], [], []) for name in kinds}
     for seed in seeds:
         for name, (spp, strategy) in kinds.items():

@@ -67,5 +67,5 @@ class BSDF(Kind):
 
     @classmethod
     def leaves(cls, instance: Instance) -> tuple[Instance, ...]:
-        """Of all that it may be, those that scatter."""
+        """The bsdfs that scatter, of all that it may be."""
         return (instance,)

@@ -25,7 +25,7 @@ COAT_R0, COAT_MASKED, COAT_ALPHA = 0.04, 0.25, (0.1, 0.001)
 
 
 def facets(roughness: Number, anisotropic: Number | None) -> GGX:
-    """Of the main lobe: alpha = roughness^2, more of it along x (2012, 5.4)."""
+    """Facets of the main lobe: alpha = roughness^2, more of it along x (2012, 5.4)."""
     alpha = roughness * roughness
     aspect = 1.0 if anisotropic is None else safe_sqrt(1 - 0.9 * anisotropic)
     return GGX(larger(alpha / aspect, MIN_ALPHA), larger(alpha * aspect, MIN_ALPHA))
@@ -55,7 +55,7 @@ def towards(share: Number | None, color: Color) -> Color | float:
 
 
 def diffuse(roughness: Number, flatness: Number | None, cos_i: Number, cos_o: Number, cos_d: Number) -> Number:
-    """Of a white base: darker, or by roughness brighter at grazing angles (2012, 5.3); flattened as by scattering below
+    """A white base: darker, or by roughness brighter at grazing angles (2012, 5.3); flattened as by scattering below
     the surface (2015, after Hanrahan and Krueger 1993)."""
     at_i, at_o = schlick_weight(cos_i), schlick_weight(cos_o)
     back = 2 * roughness * cos_d * cos_d

@@ -38,7 +38,7 @@ _TO_TERMS = np.cos(np.outer(np.arange(TERMS), _ANGLES)) * np.where(np.arange(TER
 def coats(
     distribution: str, alpha: Float[Array | np.ndarray, " R"], eta: Float[Array | np.ndarray, " R"]
 ) -> Float[Array | np.ndarray, "R values terms_and_share"]:
-    """Of each row what `SHAPE` says, detached; eta: IOR of the coat over that outside."""
+    """What `SHAPE` says of each row, detached; eta: IOR of the coat over that outside."""
     shape = jax.ShapeDtypeStruct((*alpha.shape, *SHAPE), alpha.dtype)
 
     def on_host(alpha, eta):

@@ -113,7 +113,7 @@ def _conductor_to_differentiate(cos_i, eta, k):
 
 
 def _half_root(cos_i, eta, k):
-    """Of sqrt(x + i y), which is a + i b above: whether x >= 0, y, |x + i y|, and the larger one of a, then, and b."""
+    """Parts of sqrt(x + i y), a + i b above: whether x >= 0, y, |x + i y|, and the larger of a, if so, and b."""
     # Nothing cancels, be (eta + i k)^2 near 0 or near 1.
     near_0, near_1 = (eta - k) * (eta + k) - (1 - cos_i) * (1 + cos_i), (eta - 1) * (eta + 1) - k * k + cos_i * cos_i
     x, y = jnp.where(eta < 0.5, near_0, near_1), 2 * eta * k

@@ -56,7 +56,7 @@ class Plastic(BSDF):
 
 
 def reflectance(w: Float[Array, "3"], eta: Float[Array, ""]) -> Float[Array, ""]:
-    """Of the coat, from outside."""
+    """Reflectance of the coat, from outside."""
     return fresnel.dielectric(jnp.clip(w[2], 0, 1), eta)[0]
 
 

@@ -146,7 +146,7 @@ def _look(p: Row) -> Look:
 
 
 def _reflectance(look: Look, cos: Float[Array, ""], inside: Bool[Array, ""] | None):
-    """Of the facets (3,), that of their glass alone, and the cosine behind them; Burley 2012, 5.5, and 2015.
+    """Reflectance of the facets (3,), that of their glass alone, and the cosine behind them (Burley 2012, 2015).
 
     inside: None: never.
     """
@@ -166,12 +166,12 @@ def _reflectance(look: Look, cos: Float[Array, ""], inside: Bool[Array, ""] | No
 
 
 def mean(color: Float[Array, "3"]) -> Float[Array, ""]:
-    """Of the channels, for chances."""
+    """Mean of the channels, for chances: never 0."""
     return larger(jnp.mean(color), LEAST_REFLECTANCE)
 
 
 class Chances(NamedTuple):
-    """Of lobes, by about the light that they carry; detached."""
+    """Chances of the lobes, by about the light that they carry; detached."""
 
     base: Float[Array, ""]
     coat: Float[Array, ""] | None  # of what is not from the base; the facets have the rest

@@ -93,12 +93,12 @@ class Look(NamedTuple):
         return 0.0 if self.diff_trans is None else self.diff_trans / 2
 
     def facets(self, through: Bool[Array, ""]) -> burley.GGX:
-        """Of light that passes two interfaces directions spread by the IOR, too (Burley 2015, 5.3)."""
+        """The facets; those that light passes, by two interfaces, spread it by the IOR, too (Burley 2015, 5.3)."""
         spread = jnp.where(through, 0.65 * self.eta - 0.35, 1)
         return burley.facets(spread * self.roughness, self.anisotropic)
 
     def reflectance(self, cos: Float[Array, ""]) -> tuple[Float[Array, "3"], Float[Array, ""]]:
-        """Of the facets, and the part that is let through."""
+        """Reflectance of the facets, and the part that is let through."""
         exact, cos_t = fresnel.dielectric(cos, self.eta)
         total = exact
         if self.spec_tint is not None:

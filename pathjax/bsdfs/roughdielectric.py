@@ -65,7 +65,7 @@ class RoughDielectric(Rough, Interface):
 
     @staticmethod
     def sample(p: Row, wi: Float[Array, "3"], u: Float[Array, " numbers"]) -> BSDFSample:
-        """Of a normal that wi sees reflect with the probability R, or else refract."""
+        """Reflect at a normal that wi sees with the probability R, or else refract."""
         eta, side = lax.stop_gradient(_eta(p, wi)), _side(wi)
         seen = wi * side
         m = compute_once(Rough.facets(p).sample(seen, u))

@@ -61,7 +61,7 @@ class Choosing(Wrapper):
     @staticmethod
     @abstractmethod
     def share(p: Row) -> Float[Array, ""]:
-        """Of the second one, in [0, 1]."""
+        """The probability of the second one."""
 
 
 class Turning(Wrapper):

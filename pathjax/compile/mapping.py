@@ -195,7 +195,7 @@ def _form(form: str | None) -> str:
 
 
 def _bytes(made: Callable) -> int:
-    """Of the arrays that it makes."""
+    """Size of the arrays that a function makes."""
     return sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(jax.eval_shape(made)))
 
 

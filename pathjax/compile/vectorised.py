@@ -96,6 +96,6 @@ def _switch(branches, which, operands) -> list:
 
 
 def _pick(which, cases):
-    """Of each lane the row of one of the cases (N, ...)."""
+    """The rows that lanes take, each of one of the cases (N, ...)."""
     shape = (len(which),) + (1,) * (cases[0].ndim - 1)
     return lax.select_n(jnp.broadcast_to(which.reshape(shape), cases[0].shape), *cases)

@@ -83,7 +83,7 @@ class Background(Emitter):
 
     @staticmethod
     def entries(p: Row, d: Float[Array, "3"]) -> list[tuple[str, Int[Array, ""], Float[Array, ""]]]:
-        """Of which colours of `Shared` arrays `emitted` takes a sum, for derivatives: the parameter, entry and share.
+        """Return the colours of `Shared` arrays whose sum `emitted` is, for derivatives: parameter, entry, share.
 
         `emitted` adds `p.nudge(parameter)` to the sum.
         """

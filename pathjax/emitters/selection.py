@@ -49,7 +49,7 @@ class Lights:
         return issubclass(self.kind, Background) and self.kind.left_to_bsdfs
 
     def parameters(self, light: Number, surface: Surface | None = None) -> Row:
-        """Of the light of this number among those of this kind; surface: where it is met, if it has textures."""
+        """The parameters of light number `light` of this kind; surface: where it is met, if it has textures."""
         return Row(self.table, light if self.row is None else at(self.row, light), surface, self.textures)
 
     def power(self, weighted: bool = False) -> Float[Array, " R"]:

@@ -238,8 +238,8 @@ def scatter(
     else:
         survival = roulette.survival(scene, path.depth, throughput, passive)
     # A direction of density 0 (in the surface, by rounding; a branch of glass that cannot be) carries nothing.
-    some = (here.kind >= 0) | here.scattered if scene.scatters else here.kind >= 0
-    carries = some & (drawn.pdf > 0) & (options.derivative | (roulette.largest(throughput) > 0))
+    scatters = (here.kind >= 0) | here.scattered if scene.scatters else here.kind >= 0
+    carries = scatters & (drawn.pdf > 0) & (options.derivative | (roulette.largest(throughput) > 0))
     on = path._replace(
         ray=spawn_ray(here.surface, d, here.hit.primitive),
         L=L,

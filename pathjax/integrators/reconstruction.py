@@ -153,7 +153,7 @@ def spread_samples(
     ends = (0, 0), (0, 0), (0, 0), (2 * edge, spare)
     u, weighted = (jnp.pad(jnp.moveaxis(x, -1, 2), ends) for x in (u, weighted))
 
-    def of_run(first, size, some, u, weighted):
+    def of_run(first, size, there, u, weighted):
         def window(x):
             return lax.dynamic_slice_in_dim(x, first, size + 2 * edge, axis=-1)
 
@@ -161,14 +161,14 @@ def spread_samples(
         spread = jax.vmap(partial(_spread, through, x))
 
         def add(total, sample):
-            some, *sample = sample
-            return lax.cond(some, lambda: total + spread(*sample), lambda: total), None
+            present, *sample = sample
+            return lax.cond(present, lambda: total + spread(*sample), lambda: total), None
 
         total = jnp.zeros((*weighted.shape[1:3], size), weighted.dtype)
-        return lax.scan(add, total, (some, window(u), window(weighted)))[0]
+        return lax.scan(add, total, (there, window(u), window(weighted)))[0]
 
-    some = (scale != 0).any((1, 2))
-    return split_map(of_run, values.shape[2] + 2 * edge, some, u, weighted, devices=devices)
+    there = (scale != 0).any((1, 2))
+    return split_map(of_run, values.shape[2] + 2 * edge, there, u, weighted, devices=devices)
 
 
 def _spread(

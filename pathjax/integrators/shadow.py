@@ -18,7 +18,7 @@ from pathjax.shapes import geometry
 
 
 class Passed(NamedTuple):
-    """Of the surfaces that a shadow ray passes, the one that `Materials.nudged` names."""
+    """The one of the surfaces that a shadow ray passes which `Materials.nudged` names."""
 
     count: Int[Array, ""]  # of all of them
     surface: Surface

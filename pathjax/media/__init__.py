@@ -132,7 +132,7 @@ def _constant(medium: Instance) -> Instance:
 
 
 def _grids(rows: list[Instance], key: str, dtype, parameters: Parameters) -> Grids | None:
-    """Of what of media is grids; no parameter stands in its place. None: nothing is."""
+    """The grids that stand in the place of a parameter of media, which is none then; None: there are none."""
     values = {each: each.values[key] for each in rows if isinstance(each.values[key], GridVolume)}
     for each in values:
         name = f"{each.name}.{key}"
@@ -184,9 +184,9 @@ def distance(
     sigma, chances = extinction(media, medium), _chances(throughput)
     red, green = u[0] < chances[0], u[0] < chances[0] + chances[1]
     of_colour = lax.stop_gradient(jnp.where(red, sigma[0], jnp.where(green, sigma[1], sigma[2])))
-    some = of_colour > 0
+    dims = of_colour > 0
     # In units of the values of a grid; else it is the distance.
-    wanted = jnp.where(some, -jnp.log1p(-u[1]) / jnp.where(some, of_colour, 1), jnp.inf)
+    wanted = jnp.where(dims, -jnp.log1p(-u[1]) / jnp.where(dims, of_colour, 1), jnp.inf)
     if media.extinctions is None:
         return wanted
     values, ray = lax.stop_gradient((media.extinctions, ray))

@@ -150,8 +150,8 @@ def _ends(grids, grid, ray):
 
 def _at_planes(line, plane):
     """Distances of planes, one of each axis; inf where there is none."""
-    some = (line.d != 0) & (plane >= 0) & (plane <= line.last)
-    return jnp.where(some, (plane - line.o) / jnp.where(line.d != 0, line.d, 1), jnp.inf)
+    exists = (line.d != 0) & (plane >= 0) & (plane <= line.last)
+    return jnp.where(exists, (plane - line.o) / jnp.where(line.d != 0, line.d, 1), jnp.inf)
 
 
 def _next(line, march):
@@ -215,7 +215,7 @@ def _interpolated(corners, share):
 
 
 def _channel(depth, channel):
-    """Of one channel or three."""
+    """The depth () of a channel, of those of one channel for all, or of three."""
     if depth.shape[0] == 1:
         return depth[0]
     return jnp.where(channel == 0, depth[0], jnp.where(channel == 1, depth[1], depth[2]))

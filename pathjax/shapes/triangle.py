@@ -23,7 +23,7 @@ from pathjax.shapes.shape import Primitives, Shape, Table
 # Of the files that meshes come from: those of `io.mesh`.
 FORMATS = ("obj", "ply", "stl", "glb", "gltf")
 # Triangles among which to look for a large one, whose plane is that of the mesh if it is flat.
-_SOME = 100
+_FIRST = 100
 
 
 @dataclass
@@ -53,12 +53,12 @@ class Facets(Primitives):
 
     def faces(self, glass, lamp, dtype):
         """One face if all triangles lie in one plane."""
-        some = self.vertices[:_SOME]
-        largest = some[np.argmax(_areas(some))]
+        first = self.vertices[:_FIRST]
+        largest = first[np.argmax(_areas(first))]
         corner, edge, normal = largest[0], largest[1] - largest[0], unit_normal(largest)
         bent = Faces(self.vertices, None, None, glass, lamp)
         farthest = [np.abs(self.vertices[:, :, axis]).max() for axis in range(3)]
-        if np.abs((some - corner) @ normal).max() > 2 * precision(dtype) * (farthest @ np.abs(normal)):
+        if np.abs((first - corner) @ normal).max() > 2 * precision(dtype) * (farthest @ np.abs(normal)):
             return bent  # without a look at all of a large mesh
         from_corner = self.vertices - corner
         reach = (np.abs(self.vertices) @ np.abs(normal)).max()

@@ -63,7 +63,7 @@ def _while_outputs_differ(eqn, inputs_differ):
 
 
 def carried_memory(eqn) -> list[bool]:
-    """Of what a while loop carries, whether it is the memory of `together`, which lanes share."""
+    """Whether what a while loop carries is the memory of `together`, which lanes share: of each value."""
     body = eqn.params["body_jaxpr"].jaxpr
     changed = variables(v for e in body.eqns if e.primitive is together_p for v in e.outvars)
     return [not isinstance(v, Literal) and v in changed for v in body.outvars]

@@ -172,7 +172,7 @@ class _Reader:
         return _element("rgb", key, place, _text(_array(given["value"], place).reshape(-1)))
 
     def _spectrum(self, key: str, value: Mapping, place: str) -> Element:
-        """Of one number, of pairs of wavelength and number, or of a file."""
+        """A spectrum of one number, of pairs of wavelength and number, or of a file."""
         if "filename" in value:
             filename = _only(value, ("filename",), place)["filename"]
             return Element("spectrum", {"name": key, "filename": _string(filename, place)}, place, 0)
@@ -257,7 +257,7 @@ def _array(value: object, place: str) -> np.ndarray:
 
 
 def _as_texture(child: Element) -> Element:
-    """Of an array, the bitmap that holds it; `data` is what an object consists of."""
+    """The element, or in the place of an array the bitmap that holds it; `data` is what an object consists of."""
     if child.tag != "array" or child.attributes["name"] == "data":
         return child
     data = Element("array", {"name": "data"}, child.file, 0, data=child.data)

@@ -98,7 +98,7 @@ class Wrapper:
 
     @classmethod
     def alone(cls, loader, fields: Fields) -> d.Integrator:
-        """Of one that has nothing inside."""
+        """What it stands for if it has nothing inside."""
         raise fields.element.error(f"{fields.element} needs an <integrator> inside")
 
 

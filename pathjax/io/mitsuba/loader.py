@@ -156,7 +156,7 @@ class _Loader:
         return element
 
     def view(self, element: Element, seen: Element) -> d.View | InputError:
-        """Of a sensor. One other than that which is used may be what is not supported, and has one note alone."""
+        """What a sensor sees. One that is not used may be of a kind that is not supported, and gets one note alone."""
         if element is seen:
             return self.make(element, sensors.KINDS, read=_sensor)
         notes = list(self.notes)
@@ -178,13 +178,13 @@ class _Loader:
     ) -> None:
         """Tell whether media are rendered; elements: the integrator, if there is one."""
         root = elements[0] if elements else self.document.root
-        some = medium is not None or any(shape.interior or shape.exterior for shape in shapes)
-        if integrator.media and not some:
+        present = medium is not None or any(shape.interior or shape.exterior for shape in shapes)
+        if integrator.media and not present:
             same = "without media is the same as path, which is used"
             self.note(root, f"{same}; what goes straight on through a surface takes no depth")
-        elif some and not integrator.media:
+        elif present and not integrator.media:
             self.note(root, 'takes no notice of media, as in Mitsuba; <integrator type="volpath"> renders them')
-        elif some and not shapes:
+        elif present and not shapes:
             raise root.error(f"{root}: a medium without a shape around it never ends; add a <shape>")
 
     def note(self, element: Element, text: str) -> None:
@@ -231,7 +231,7 @@ class _Loader:
     bsdf = shared
 
     def emitter(self, element: Element, name: str, inside: bool = False) -> Instance:
-        """Of those that stand inside shapes, or outside."""
+        """The light of an element that stands inside a shape, or outside of shapes."""
         kind = emitters.KINDS.get(element.attributes.get("type", ""))
         if kind is not None and inside and not kind.on_surfaces:
             raise element.error(f"{element} shines from no surface; it stands directly in <scene>")
@@ -279,13 +279,13 @@ class _Loader:
         return self.document.find(fields.string(parameter), fields.where(parameter))
 
     def read_mesh(self, *how: object, **choices: object) -> Mesh:
-        """Of `io.mesh.load`."""
+        """The mesh of `io.mesh.load`, whose notes are kept."""
         made, notes = mesh.load(*how, **choices)
         self.notes += notes
         return made
 
     def mesh_of_arrays(self, fields: Fields, **arrays: object) -> Mesh:
-        """Of `io.mesh.of_arrays`."""
+        """The mesh of `io.mesh.of_arrays`, whose notes are kept."""
         made, notes = mesh.of_arrays(fields.element.place, **arrays)
         self.notes += notes
         return made
@@ -370,7 +370,7 @@ def _sensor(loader: _Loader, fields: Fields) -> d.View:
 
 
 def _kind_of_light(element: Element) -> type[emitters.Emitter]:
-    """Of an emitter; any of one whose type is unknown, which `emitter` refuses."""
+    """The class of an emitter's type; that of any, where the type is unknown, which `emitter` refuses."""
     return emitters.KINDS.get(element.attributes.get("type", ""), emitters.Emitter)
 
 

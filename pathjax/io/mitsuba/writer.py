@@ -173,7 +173,7 @@ class _Writer:
     # ---- files
 
     def image(self, child: Element, parent: Element, name: str) -> Element:
-        """Of an array, the <string> that names the file to which it goes."""
+        """The element, or in the place of an array the <string> that names the file to which it goes."""
         if child.tag != "array":
             return child
         if child.attributes["name"] != "data":
@@ -201,7 +201,7 @@ class _Writer:
         return Element(element.tag, element.attributes, element.file, element.line, children)
 
     def mesh(self, element: Element, shape: d.Shape) -> Element:
-        """Of a mesh that Mitsuba reads from no file, or not in its format, the PLY that holds it in world space."""
+        """The element of a PLY file that holds a mesh, in world space, which Mitsuba could not read as it was given."""
         file, geometry = self.file(shape.name, ".ply"), shape.geometry
         self.files[file] = lambda: ply_writer.write(file, geometry)
         gone = ("filename", "to_world", "face_normals", "flip_tex_coords")
@@ -222,7 +222,7 @@ class _Writer:
 
 
 def _changed_images(made: Iterable[object], values: Mapping[str, np.ndarray]) -> dict[Instance, tuple[str, np.ndarray]]:
-    """Of images that are parameters and have changed, by instance, the parameter's name and the texels."""
+    """The images that are parameters and have changed: instance -> the parameter's name, and its texels."""
     owners = [owner for owner in made if isinstance(owner, Instance)]
     images = [(x, f"{owner.name}.{key}") for owner in owners for key, x in owner.values.items()]
     images += [(owner, f"{owner.name}.radiance") for owner in owners]  # of environment maps
