@@ -20,7 +20,7 @@ class BumpMap(Mapped):
 
     @staticmethod
     def normal(p: Row, surface: Surface, to_local) -> Float[Array, "3"]:
-        """That of the raised surface, but for how the normal below changes from place to place."""
+        """The normal of the raised surface, but for how the normal below changes from place to place."""
         by_u, by_v = p.scale * p.gradient("heights")
         (u_x, u_y, _), (v_x, v_y, _) = (to_local(d) for d in surface.along)
         n = cross(jnp.stack([u_x, u_y, by_u]), jnp.stack([v_x, v_y, by_v]))

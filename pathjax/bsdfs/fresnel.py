@@ -94,7 +94,7 @@ def _conductor_jvp(primals, tangents):
 
 
 def _conductor_to_differentiate(cos_i, eta, k):
-    """The same, where little is reflected by squares of differences."""
+    """`conductor` where little is reflected, by squares of differences."""
     cos2, sin2 = cos_i * cos_i, (1 - cos_i) * (1 + cos_i)
     right, y, _, large = _half_root(cos_i, eta, k)
     small = _ratio(y, 2 * large)

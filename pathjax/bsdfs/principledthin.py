@@ -22,7 +22,7 @@ from pathjax.kinds import Color, Number, Row, Unused
 
 
 class PrincipledThin(BSDF):
-    """The same from both sides (Burley 2015, 5.3). Of what `spec_trans` leaves, half of `diff_trans` shines through."""
+    """Alike on both sides (Burley 2015, 5.3). Of what `spec_trans` leaves, half of `diff_trans` shines through."""
 
     base_color = Color(0.5)
     roughness = Number(0.5, bounds=(0, 1), textured=True)

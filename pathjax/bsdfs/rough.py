@@ -60,7 +60,7 @@ class Rough(BSDF):
 
     @staticmethod
     def facets(p: Row) -> Distribution:
-        """Those of one row, at the point."""
+        """The facets of one row, at the point."""
         made = DISTRIBUTIONS[p.distribution].of
         if (alpha := p.alpha) is not None:
             return made(alpha, alpha)

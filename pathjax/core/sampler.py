@@ -89,8 +89,8 @@ def independent_point(stream: Word, sample: Word, vertex: Number) -> Float[Array
 
 
 def subpixel_point(stream: Word, sample: Word, vertex: Number) -> Float[Array, "4"]:
-    """The same, but of four samples in a row each has the film position, the first pair of vertex 0, in its own quarter
-    of the unit square, as in smallpt (Beason 2008)."""
+    """Independent numbers, but of four samples in a row each has the film position, the first pair of vertex 0, in its
+    own quarter of the unit square, as in smallpt (Beason 2008)."""
     bits, sample = _point_hashes(stream, sample, vertex), _u32(sample)
     quarter = jnp.stack([sample & 1, (sample >> 1) & 1]) << 31
     first = jnp.where(_u32(vertex) == 0, quarter | (bits[:2] >> 1), bits[:2])

@@ -61,7 +61,7 @@ class Description:
     seen: str = ""  # the name of `view`
 
     def seen_by(self, which: int | str) -> Description:
-        """The same, seen by the sensor of this number or name.
+        """The description as the sensor of this number or name sees it.
 
         Raises:
             InputError: there is none, or it cannot be used.

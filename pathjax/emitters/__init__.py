@@ -140,7 +140,7 @@ def _arranged(made: list[Lights], places: list[np.ndarray | None], dtype) -> tup
 
 
 def _textures(instances: list[Instance], dtype, path: tuple, parameters: Parameters) -> tuple[Textures | None, dict]:
-    """Those of lights, and their codes. What is known by name has one place in a scene."""
+    """The textures of lights, and their codes. What is known by name has one place in a scene."""
     used = dict.fromkeys(v for each in instances for v in each.values.values() if isinstance(v, Instance))
     own = Parameters()
     made, codes = textures.build(list(used), dtype, path, own)
@@ -224,7 +224,7 @@ def backgrounds(emitters: tuple[Lights, ...]) -> list[int]:
 
 
 def even_lights(emitters: tuple[Lights, ...]) -> Lights | None:
-    """Those of surfaces that emit the same radiance in all directions; None: there is no light.
+    """The lights of surfaces that emit the same radiance in all directions; None: there is no light.
 
     Raises:
         InputError: there are other lights.

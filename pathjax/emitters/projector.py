@@ -40,7 +40,7 @@ class Projector(DiracEmitter):
 
     @staticmethod
     def power(p) -> Float[Array, " R"]:
-        """That of a point light, times the root of the share of directions in which it shines, as for a spot."""
+        """The power of a point light, times the root of the share of directions in which it shines, as for a spot."""
         wide, high = p.tan_x, p.tan_y
         solid_angle = 4 * jnp.arcsin(wide * high / jnp.sqrt((1 + wide * wide) * (1 + high * high)))
         return (4 * math.pi) * luminance(p.irradiance) * p.scale * jnp.sqrt(solid_angle / (4 * math.pi))

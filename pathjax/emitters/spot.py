@@ -50,7 +50,7 @@ class Spot(Point):
 
     @staticmethod
     def power(p) -> Float[Array, " R"]:
-        """That of a point light, times the root of the share of its light that is left.
+        """The power of a point light, times the root of the share of its light that is left.
 
         The mean square error of an image is least if lights are chosen by the root mean square of what they add to it.
         """

@@ -90,7 +90,7 @@ DEFAULTS = Options()
 
 
 def strategies(scene: Scene) -> tuple[str, ...]:
-    """Those that find all light of a scene."""
+    """The strategies that find all light of a scene."""
     return tuple(each for each in STRATEGIES if each != "bsdf" or not emitters.met_by_no_ray(scene.emitters))
 
 

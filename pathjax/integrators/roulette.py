@@ -38,7 +38,7 @@ def survival(
 
 
 def bounded(survival: Float[Array, ""]) -> Float[Array, ""]:
-    """The same within its bounds; the least of them for NaN."""
+    """A survival within its bounds; the least of them for NaN."""
     least, most = (jnp.full_like(survival, x) for x in (MIN_SURVIVAL, MAX_SURVIVAL))
     return larger(smaller(survival, most), least)
 

@@ -72,7 +72,7 @@ class Row:
         self._table, self._row, self._surface, self._textures, self._colors = table, row, surface, textures, colors
 
     def on(self, uv: Float[Array, "2"]) -> Row:
-        """The same, with textures looked up at uv."""
+        """The row with its textures looked up at uv."""
         return Row(self._table, self._row, SimpleNamespace(uv=uv), self._textures)
 
     def nudged(self, nudges: Mapping[int, Array]) -> Row:

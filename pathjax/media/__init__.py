@@ -126,7 +126,7 @@ def _numbers(value: object) -> object:
 
 
 def _constant(medium: Instance) -> Instance:
-    """The same with ones in the place of grids, which multiply them."""
+    """The medium with ones in the place of grids, which multiply them."""
     values = {key: np.ones(3) if isinstance(value, GridVolume) else value for key, value in medium.values.items()}
     return Instance(medium.kind, medium.name, values)
 

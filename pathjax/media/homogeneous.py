@@ -103,6 +103,6 @@ class Homogeneous(Kind):
 
 
 class Heterogeneous(Homogeneous):
-    """The same, whose extinction is that of a volume, beyond whose box there is nothing."""
+    """A medium whose extinction is that of a volume, beyond whose box there is nothing."""
 
     sigma_t = BoxedColor(1.0, bounds=(0, math.inf))

@@ -1,4 +1,4 @@
-"""As particles much smaller than the wavelength scatter (Rayleigh 1871; sampled after Frisvad 2011, JOSA A 28(12))."""
+"""How particles much smaller than the wavelength scatter (Rayleigh 1871; drawn after Frisvad 2011, JOSA A 28(12))."""
 
 from __future__ import annotations
 

@@ -131,7 +131,7 @@ def of_samples(film: Film) -> Film:
 
 
 def cropped(film: Film, image: Float[Array, "R N *rest"]) -> Float[Array, "R HW *rest"]:
-    """Those pixels of `of_samples(film)` that are in the film's own crop window."""
+    """The pixels of `of_samples(film)` that are in the film's own crop window."""
     _, _, width, height = of_samples(film).crop
     out = _outside(film)
     inside = image.reshape(len(image), height, width, *image.shape[2:])[:, out : height - out, out : width - out]

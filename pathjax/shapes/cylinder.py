@@ -136,7 +136,7 @@ class Cylinders(Table):
         return self.from_square(row, u)
 
     def sample_lamp(self, lamps, lamp, ref, u, u_part):
-        """As of any lamp, but of an inner wall only what is seen through the ends: a shadow ray passes its own lamp."""
+        """Draw as for any lamp; of an inner wall only what is seen through the ends: a shadow ray passes its lamp."""
         drawn = super().sample_lamp(lamps, lamp, ref, u, u_part)
         tube = at(self.tubes, drawn.primitive)
         start, axis, radius, length = tube[:3], tube[3:6], tube[6], tube[7]

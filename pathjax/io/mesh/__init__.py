@@ -76,8 +76,8 @@ def of_arrays(
     face_normals: bool = False,
     **attributes: np.ndarray | None,
 ) -> tuple[Mesh, list[str]]:
-    """The same of arrays: vertices (V, 3), faces (F, 3) integers, normals (V, 3) and uv (V, 2). Without normals it is
-    flat.
+    """`load` of arrays: vertices (V, 3), faces (F, 3) integers, normals (V, 3) and uv (V, 2). Without normals the mesh
+    is flat.
 
     place: for messages; attributes: "vertex_*" (V, 3) and "face_*" (F, 3).
     """

@@ -137,7 +137,7 @@ def _first_row(data: bytes, at: int, element: _Element) -> np.dtype | None:
 
 
 def _read_uneven_rows(path: Path, data: bytes, at: int, element: _Element) -> int:
-    """The same, row by row: where a row begins depends on the lists before."""
+    """Fill the columns row by row: where a row begins depends on the lists before."""
     # A row is a stretch of single numbers, a list, the next stretch, and so on.
     place, plan, offset = {}, [], 0
     for name, kind, length in element.layout():

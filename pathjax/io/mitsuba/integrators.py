@@ -56,7 +56,7 @@ class PRB(Path):
 
 
 class PRBVolPath(PRB, VolPath):
-    """The same with participating media."""
+    """Mitsuba's differentiable tracer of paths through participating media."""
 
     same = "volpath"
 

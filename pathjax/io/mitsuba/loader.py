@@ -46,7 +46,7 @@ def load(path: str | Path, sensor: int | str = 0, /, **parameters: object) -> d.
 
 
 def load_dict(scene: Mapping, sensor: int | str = 0) -> d.Description:
-    """The same of a scene that a dictionary holds.
+    """`load` of a scene that a dictionary holds.
 
     Raises:
         InputError: what is wrong, with the keys that lead there.

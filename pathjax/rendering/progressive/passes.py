@@ -109,7 +109,7 @@ class State:
 
 @dataclass
 class SharedState(State):
-    """That of a film that shares samples: its pixels are those of `film.of_samples`, and its means are sums.
+    """The state of a film that shares samples: its pixels are those of `film.of_samples`, and its means are sums.
 
     A pixel's samples weigh `scale` each, so that in the end all pixels weigh the same, however many samples they have:
     the image is A / W of `reconstruction`. What is chosen for a round by the noise of earlier ones changes no mean.
