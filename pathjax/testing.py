@@ -34,7 +34,7 @@ COSINES = (1.0, 0.7, 0.2)
 CELLS, POINTS = (20, 24), 12
 # Cells in which fewer samples are expected are put together: the chi-square distribution is an approximation.
 LEAST_EXPECTED = 10
-# Of differences: float32 keeps five digits of them, and what they err by is of second order.
+# Step of differences: float32 keeps five digits of them, and their error is of second order.
 STEP = 0.01
 # All that kinds of the package ask of a surface: where textures are looked up.
 _SURFACE = SimpleNamespace(uv=jnp.full(2, 0.5, jnp.float32))

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 TINY = 1e-18
-# Of entry and exit: a few roundings, of subtraction, reciprocal and product.
+# Relative error of entry and exit: a few roundings, of subtraction, reciprocal and product.
 SLACK = 5 * np.finfo(float).eps
 
 

@@ -20,7 +20,7 @@ Color = Float[Array, "3"]
 
 # Mitsuba's least roughness here.
 MIN_ALPHA = 1e-3
-# Of the clear coat: reflectance at normal incidence, roughness by which it is masked, and those of its facets.
+# The clear coat: reflectance at normal incidence, roughness by which it is masked, and those of its facets.
 COAT_R0, COAT_MASKED, COAT_ALPHA = 0.04, 0.25, (0.1, 0.001)
 
 

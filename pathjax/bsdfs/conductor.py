@@ -37,7 +37,7 @@ class Conductor(BSDF):
                 raise fields.error(given[0], "cannot stand beside material; give either eta and k, or material")
             defaults = dict(zip(("eta", "k"), map(np.array, METALS[material]), strict=True))
         else:
-            # Of "none" eta is 0 and k is 1: all is reflected.
+            # "none" has the eta 0 and the k 1: all is reflected.
             defaults = {"eta": np.zeros(3), "k": np.ones(3)} if given else {}
         return cls.instance(name, **{key: defaults.get(key) if v is None else v for key, v in values.items()})
 

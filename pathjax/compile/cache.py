@@ -13,7 +13,7 @@ from pathlib import Path
 
 import jax
 
-# Of compiled kernels on disk, some 100 kB each; those used longest ago go first.
+# Most bytes of compiled kernels on disk, some 100 kB each; those used longest ago go first.
 _CACHE_BYTES = 1 << 28
 # Lines of /proc/cpuinfo that tell which machine code a processor runs, on x86 and Arm.
 _CPU_LINES = ("vendor_id", "cpu family", "model", "flags", "CPU implementer", "CPU part", "Features")

@@ -131,7 +131,7 @@ def turns(y: Float[Array, ""], x: Float[Array, ""]) -> Float[Array, ""]:
     return jnp.where(angle < 0, angle + 1, angle)
 
 
-# Of red, green and blue in luminance: Rec. 709.
+# Shares of red, green and blue in luminance: Rec. 709.
 LUMINANCE = 0.2126, 0.7152, 0.0722
 
 

@@ -96,7 +96,7 @@ def push(
         return jnp.broadcast_to(array, (len(array), 3))
 
     rows = list(map(entries, paths, changed))
-    # Of one array alone no copy is made, as it may be large.
+    # One array alone is not copied, as it may be large.
     v = rows[0] if len(rows) == 1 else jnp.concatenate(rows)
     of_pixel = partial(pixel_change, options=options, slots=slots, paths=paths)
     work = pixels, first_sample, spp, seed

@@ -36,7 +36,7 @@ class Slot:
     """What a vertex adds to the derivatives in one number that it looked up, times the adjoint and the throughput."""
 
     places: tuple[Int[Array, ""], ...]  # of the number, in the list of derivatives
-    # Of each place in the number, or in each of its channels; None: there is one place.
+    # The share of each place in the number, or in each of its channels; None: there is one place.
     shares: tuple[Float[Array, "..."], ...] | None
     now: Float[Array, "3"]  # d(Le + n)
     later: Float[Array, "3"] | None  # dw, to be multiplied by R
@@ -110,7 +110,7 @@ def extend(
     if not of_passed:
         return on, record, jnp.bool_(True)
 
-    # Of what is passed nothing but its own derivatives.
+    # What is passed has nothing but its own derivatives.
     passed, on = on.L.nudged, on._replace(L=on.L._replace(nudged=None))
     itself = number >= passed.count
     found = [jax.tree.map(lambda x: jnp.where(itself, x, 0).astype(x.dtype), slot) for slot in found]

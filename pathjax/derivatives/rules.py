@@ -25,7 +25,7 @@ from pathjax.kinds.parameter import Parameter
 from pathjax.scene import parameters as named
 from pathjax.scene.scene import Scene
 
-# Of a step down to a leaf, the field that says where it goes.
+# The field of a step down to a leaf that says where it goes.
 KEYS = {jax.tree_util.GetAttrKey: "name", jax.tree_util.SequenceKey: "idx", jax.tree_util.DictKey: "key"}
 
 

@@ -16,7 +16,7 @@ from pathjax.kinds.parameter import Parameter
 from pathjax.scene import parameters as named
 from pathjax.scene.scene import Scene
 
-# Of each colour the path to its table and its index there.
+# The path to the table of each colour, and its index there.
 Places = tuple[tuple[tuple, tuple], ...]
 
 

@@ -56,7 +56,7 @@ class Description:
     # What was read, to be written again, and what each of its elements became: an `Instance`, a `Shape`, ...
     document: Document | None = None
     made: Mapping[Element, object] = field(default_factory=dict)
-    # Of all sensors, by id, or by number where they have none, in the order of the file; or why one cannot be used.
+    # All sensors in the order of the file, by id, or by number where they have none; or why one cannot be used.
     views: Mapping[str, View | InputError] = field(default_factory=dict)
     seen: str = ""  # the name of `view`
 

@@ -108,7 +108,7 @@ class DiracEmitter(Emitter):
     """What shines from one direction at each point: no ray hits it, and no bsdf finds it."""
 
     dirac = True
-    # Of weight 0 nothing would find it.
+    # With the weight 0 nothing would find it.
     sampling_weight = Weight(None, bounds=(float(np.finfo(np.float32).tiny), math.inf))
 
     @staticmethod

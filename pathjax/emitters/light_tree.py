@@ -30,8 +30,8 @@ from pathjax.core.math import at, dot, larger, safe_divide, safe_sqrt
 # the tree is 1.1 to 2.9 times as efficient, with 200 of them 2.3 to 5.7 times (a room 20 wide, 16 spp); where
 # flat ones face all ways, 1.2 times as much by how they face.
 FEWEST = 9
-# Of lights, what is taken to face all sides at least: of large ones and of many some may face a point that their middle
-# does not face.
+# Least share of lights that is taken to face all sides: some of many, or a part of a large one, may face a point that
+# their middle does not face.
 _LEAST_AROUND = 1 / 16
 
 

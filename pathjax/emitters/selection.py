@@ -29,7 +29,7 @@ class Lights:
     lamps: Lamps | None  # what shines, of kinds that stand inside shapes; None: each row is one light
     row: Int[Array, " R"] | None  # row of the table, of each lamp
     textures: Textures | None = None  # in the place of parameters; None: there are none
-    # Of each, lower and upper corner around it and the mean normal of its area; None: nothing chooses by them.
+    # Lower and upper corner around each, and the mean normal of its area; None: nothing chooses by them.
     places: Float[Array, "R 3 3"] | None = None
     leaf: Int[Array, " R"] | None = None  # of each in the tree by which they are chosen
 

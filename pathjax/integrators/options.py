@@ -22,7 +22,7 @@ STRATEGIES = ("mis", "light", "bsdf")
 SAMPLERS = tuple(sampler.POINTS)
 # Branches double with each.
 MOST_SPLITS = 8
-# Of samples, or a seed: one number or one of each pixel or replicate.
+# Numbers of samples, or seeds: one for all, or one for each pixel or replicate.
 Counts = int | np.integer | Integer[Array | np.ndarray, "..."]
 
 

@@ -35,7 +35,7 @@ from pathjax.scene.scene import Scene
 from pathjax.sensors import film
 from pathjax.sensors.film import Film
 
-# Of each of N pixels what `pixel.Work` is of one.
+# What `pixel.Work` is of one pixel, of each of N.
 Works = tuple[Int[Array, " N"], UInt[Array, " N"], UInt[Array, " N"], UInt[Array, " N"]]
 # Pixels in a row of `film.of_samples`, of R images: the first, and of each (R, n) first sample, spp, seed, and what a
 # sample weighs, 1/n_q above.

@@ -27,7 +27,7 @@ class Stepper:
         self.step = eqx.filter_jit(step).lower(y, self.begin(y, arguments), arguments).compile()
 
 
-# Of one process, so that fits of the same problem compile once: the latest, by solver, parameters, and shapes.
+# The latest of this process, by solver, parameters and shapes, so that fits of the same problem compile once.
 _programs: dict = {}
 _MAX_PROGRAMS = 12
 

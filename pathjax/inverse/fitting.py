@@ -261,7 +261,7 @@ def _seen(problem: Problem, halves: weights.Halves, noise: weights.Noise):
     for (a, b), target, variance in zip(halves, problem.targets, noise.values, strict=True):
         mean = (a + b) / 2
         images.append((mean + target.image) / problem.exposure)
-        # Of both: the scatter of the residuals themselves says how noisy the target is.
+        # The noise of both: the scatter of the residuals themselves says how noisy the target is.
         relative = np.where(target.usable, mean / np.sqrt(variance), np.nan)
         spread = np.nanstd(relative) if target.usable.any() else 1.0
         residuals.append(relative / max(spread, np.finfo(float).tiny))

@@ -71,6 +71,6 @@ def read_target(path: str | Path) -> Target:
     levels, opaque = png.storage(path)
     code = np.rint(linear_to_srgb(image) * levels)
     low, high = (srgb_to_linear(np.clip((code + off) / levels, 0, None)) for off in (-0.5, 0.5))
-    # Of 0 too the noise is that of a whole step: all of its half lies on one side.
+    # A stored 0 has the noise of a whole step as well: all of its half lies on one side.
     step = np.where(code > 0, high - low, 2 * high)
     return Target(image, step, float(srgb_to_linear(1 - 0.5 / levels)), opaque[..., None])

@@ -89,7 +89,7 @@ def rounding_images(step, phase, noise) -> np.ndarray:
 
 def deviation(values) -> float:
     """Standard deviation of noise, whatever a few of the values are; 1 of none."""
-    # Of normal noise half lies below 0.6745 standard deviations.
+    # Half of normal noise lies below 0.6745 standard deviations.
     return float(np.median(np.abs(values)) / 0.6745) if values.size else 1.0
 
 

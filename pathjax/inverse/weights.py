@@ -81,7 +81,7 @@ def target_rounding(halves: Halves, problem: Problem, noise: Noise) -> list[tupl
         step = np.where(target.step > 0, target.step, np.inf)
         # Neighbours are of nearly equal value where this matters, and their mean is less noisy.
         image = _smoothed((a + b) / 2 + target.image, 5)
-        # Of each channel by itself, without a floor: one may be rounded alike where others are noisy.
+        # Each channel by itself, without a floor: one may be rounded alike where others are noisy.
         deviation = np.sqrt(ratio * _smoothed((a - b) ** 2 / 2, 5))
         parts.append((target.step, (image - target.image) / step, deviation / step))
     return parts
@@ -102,7 +102,7 @@ def structure(halves: Halves, problem: Problem, noise: Noise, used: list[np.ndar
     unit = uncertainty.deviation(np.concatenate([(m / n)[u & (np.abs(m) > least)] for m, n, u, _ in parts]))
     misfits = []
     for mean, deviation, use, target in parts:
-        # Of values that are clipped, or may be, only what is beyond noise is known to be wrong.
+        # Where values are clipped, or may be, only what is beyond noise is known to be wrong.
         misfit = target.misfit(target.image + mean, np.where(use, 0, CLIP_MARGIN * deviation * unit))
         misfits.append(np.where(np.abs(mean) > least, misfit, 0) / (deviation * unit))
     agreement, significance = uncertainty.structure(misfits, problem.reach + 1, problem.alike)

@@ -46,7 +46,7 @@ class Parameter:
     rows: int | None = None  # of a texture: how many entries of the array, from the index on; None: the entry alone
     # Paths to arrays, and rows of these, where the mean of a texture stands, by which lights are chosen.
     means: tuple[tuple[tuple[str | int, ...], int], ...] = ()
-    # Of what the vertices or faces of a mesh carry, (rows, 3): which of them a corner has.
+    # (rows, 3) which of the values that vertices or faces of a mesh carry a corner has; None: they are of no mesh.
     corners: Fixed | None = None
 
     @property
@@ -97,7 +97,7 @@ class Parameters:
 
     known: dict[str, Parameter] = field(default_factory=dict)
     refused: dict[str, str] = field(default_factory=dict)  # names that look like parameters, and why they are none
-    # Of textures that are one parameter each, named after what they stand in: where they live, and their first name.
+    # Textures that are one parameter each, named after what they stand in: where they live, and their first name.
     textures: dict[object, Parameter] = field(default_factory=dict)
     names: dict[object, str] = field(default_factory=dict)
 

@@ -218,7 +218,7 @@ def flight_weight(
         return number * _in_grid(values, medium, lambda grid: one * grids.look_up(values, grid, p), lambda: one)
 
     sigma = at_end(extinction(media, medium), media.extinctions)
-    # Of each colour, the density with which it would have had the light end here, or go on further than this.
+    # The density with which each colour would have had the light end here, or go on further than this.
     density = jnp.where(scatters, sigma, 1) * passed
     drawn = lax.stop_gradient(dot(_chances(throughput), density))
     albedo = at_end(Row(media.table, jnp.maximum(medium, 0)).albedo, media.albedos)

@@ -124,7 +124,7 @@ def _follow(grids, grid, ray, distance, target) -> _March:
     x = line.o + start * line.d
     plane = jnp.where(line.d > 0, larger(jnp.floor(x) + 1, 0), smaller(jnp.ceil(x) - 1, line.last))
     nothing = jnp.zeros_like(grids.values[0])
-    # Of a ray that misses the box nothing is asked.
+    # Nothing is asked of a ray that misses the box.
     begun = _March(jnp.where(start < end, start, end), nothing, plane, start < end)
     return lax.while_loop(lambda march: march.goes_on, step, begun)
 

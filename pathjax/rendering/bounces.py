@@ -29,7 +29,7 @@ from pathjax.sensors import film
 MOST_TERMS = 64
 # Samples of a replicate that are summed up plainly: float32 keeps 5 digits even where all are equal.
 _PORTION = 1 << 12
-# Of `pilot`: enough that the light of a scene is spread evenly by the last terms.
+# What `pilot` renders: enough that the light of a scene is spread evenly by the last terms.
 PILOT_TERMS, PILOT_PIXELS, PILOT_SPP = 12, 1 << 12, 64
 
 
@@ -208,5 +208,5 @@ def _kernel(scene, pixels, first_sample, spp, seeds, *, depth, options: Options,
     work = tiled, *pixel.numbers(tiled, first_sample, counts.ravel(), jnp.repeat(seeds, len(pixels)))
     results = map_pixels(one_pixel, work, scene, choice, tangents.unit_tangents(scene, colors), options=options)
     results = (x.reshape(*spp.shape, *x.shape[1:]) for x in results)
-    # Those of a film that shares samples are means.
+    # A film that shares samples gives means.
     return tuple(x * spp.reshape(*spp.shape, *[1] * (x.ndim - 2)) if options.shared else x for x in results)

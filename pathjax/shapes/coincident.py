@@ -125,7 +125,7 @@ def _coplanar(shapes: list[Faces], movable, others, least, dtype):
     """
     if not movable or not others:
         return
-    # Of a large mesh few triangles lie in the box around all that may touch them.
+    # Few triangles of a large mesh lie in the box around all that may touch them.
     around = np.concatenate([shapes[i].corners.reshape(-1, 3) for i in movable])
     slack = precision(dtype) * np.abs(around).max(0)
     bottom, top = around.min(0) - slack, around.max(0) + slack

@@ -22,7 +22,7 @@ from pathjax.shapes.rectangle import Rectangles
 from pathjax.shapes.shape import Searched
 
 FACES = 6
-# Of [-1, 1]^3, in the order of `Cubes`: centre, directions of u and v, normal; uv as in Mitsuba's cube.
+# The faces of [-1, 1]^3 in the order of `Cubes`: centre, directions of u and v, normal; uv as in Mitsuba's cube.
 _CUBE = np.array(
     [
         [[-1, 0, 0], [0, 1, 0], [0, 0, 1], [-1, 0, 0]],
@@ -70,7 +70,7 @@ class Cubes(Searched):
         end = [jnp.copysign(jnp.ones_like(i), i) for i in inverse]  # of each slab where the ray leaves it
         near = [(-end[axis] - x[axis]) * inverse[axis] for axis in range(3)]
         far = [(end[axis] - x[axis]) * inverse[axis] for axis in range(3)]
-        # Of a slab in whose border the ray lies one distance is 0 / 0: as a first argument it drops out.
+        # Where the ray lies in the border of a slab, one distance is 0 / 0: as a first argument it drops out.
         enter, leave = jnp.full_like(near[0], -jnp.inf), jnp.full_like(far[0], jnp.inf)
         for axis in range(3):
             enter, leave = larger(near[axis], enter), smaller(far[axis], leave)

@@ -18,7 +18,7 @@ from pathjax.shapes.accel.leaves import numbers_of, pack, rows_of
 from pathjax.shapes.accel.traverse import Tree
 from pathjax.shapes.shape import ROUND, Primitives, Shape, Table
 
-# Of the way to a lamp: what lies in its last part, seen from a point on the lamp itself, is that point.
+# Share of the way to a lamp: what lies in its last part, seen from a point on the lamp itself, is that point.
 CLEAR = 1e-3
 
 

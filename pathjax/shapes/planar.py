@@ -22,7 +22,7 @@ from pathjax.shapes.accel.traverse import Tree
 from pathjax.shapes.coincident import Faces
 from pathjax.shapes.shape import Primitives, Searched, Shape, Table
 
-# Of [-1, 1]^2 in the xy plane, or of what lies in it: as in `Frames`.
+# The frame, as in `Frames`, of [-1, 1]^2 in the xy plane, or of what lies in it.
 FLAT = np.array([[[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]], float)
 
 

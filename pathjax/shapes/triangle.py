@@ -20,7 +20,7 @@ from pathjax.shapes.accel.traverse import Tree
 from pathjax.shapes.coincident import Faces, precision, unit_normal
 from pathjax.shapes.shape import Primitives, Shape, Table
 
-# Of the files that meshes come from: those of `io.mesh`.
+# Formats of the files that meshes come from, as `io.mesh` reads them.
 FORMATS = ("obj", "ply", "stl", "glb", "gltf")
 # Triangles among which to look for a large one, whose plane is that of the mesh if it is flat.
 _FIRST = 100
@@ -143,7 +143,7 @@ class Triangles(Table):
         _, _, width = self.leaves.shape
 
         if self.tree is None:
-            # Of all nine numbers, which lanes share, those of an axis are selected, not gathered.
+            # The numbers of an axis are selected, not gathered, from all nine, which lanes share.
             block = numbers_of(at(self.leaves, leaf)[:9], ray.dtype).reshape(3, 3, width)
 
         def coordinates(axis):

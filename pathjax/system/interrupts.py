@@ -20,7 +20,7 @@ R = TypeVar("R")
 # Not every system has the one of a closed terminal.
 SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
 
-# Of calls that `wait_for` began: set at their end. (A thread whose `join` was interrupted is said to be dead, in 3.11.)
+# Set at the end of calls that `wait_for` began. (A thread whose `join` was interrupted is said to be dead, in 3.11.)
 _ends: list[threading.Event] = []
 
 

@@ -138,7 +138,7 @@ def _points(corners, order):
     weights = np.outer(w, w).ravel()[:, None]
     a, b, last = corners[1] - corners[0], corners[3] - corners[0], corners[2] - corners[3]
     triangle = (last == 0).all(0)
-    # Of a triangle, the square is folded onto it; the fold's density goes into the weights.
+    # The square is folded onto a triangle; the density of the fold goes into the weights.
     t_folded = np.where(triangle, t * (1 - s), t)
     weights = np.where(triangle, weights * 2 * (1 - s[:, 0]), weights)
     return corners[0] + s * a + t_folded * b, weights

@@ -75,7 +75,7 @@ class _Writer:
         start = f"{'    ' * depth}<{element.tag}" + "".join(f" {key}={quoteattr(x)}" for key, x in attributes.items())
         if not element.children:
             return f"{start}/>\n"
-        # Of several sensors the one that is used comes first.
+        # The sensor that is used comes first.
         children = sorted(
             element.children, key=lambda child: child.tag == "sensor" and self.made.get(child) is not self.seen
         )
