@@ -5,17 +5,17 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from pathjax.bsdfs.turned import Heights, Mapped, Scale
+from pathjax.bsdfs.turned import Heights, Mapped
 from pathjax.core.math import cross, dot
 from pathjax.core.types import Surface
-from pathjax.kinds import Row
+from pathjax.kinds import Number, Row
 
 
 class BumpMap(Mapped):
     """Shading as if the surface had the heights of a texture, times `scale`, on it (Blinn 1978)."""
 
     heights = Heights()
-    scale = Scale(1.0)
+    scale = Number(1.0, listed=False)
     along_uv = True
 
     @staticmethod

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from jaxtyping import Array, Float
 
-from pathjax.bsdfs.turned import Mapped, Normals
+from pathjax.bsdfs.turned import Mapped
 from pathjax.core.types import Surface
-from pathjax.kinds import Row
+from pathjax.kinds import Color, Row
 
 
 class NormalMap(Mapped):
     """Shading by the normals of a texture, whose channels c hold 2 c - 1: along u, across, and along the normal."""
 
-    normalmap = Normals(None)
+    normalmap = Color(None, listed=False)
 
     @classmethod
     def read(cls, loader, fields, name):

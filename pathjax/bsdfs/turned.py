@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from pathjax.bsdfs.wrapper import Turning
-from pathjax.kinds import Color, Flag, Instance, Number
+from pathjax.kinds import Flag, Instance, Number
 
 REFUSED = "turns shading frames, and derivatives do not follow these; change it in the scene file"
 
@@ -15,20 +15,10 @@ class Heights(Number):
     """The one texture in an element, whatever it is called."""
 
     textured: bool = True
-    listed = False
+    listed: bool = False
 
     def read(self, loader, fields, name, owner):
         return loader.shared(fields.only_texture(), owner)
-
-
-@dataclass(frozen=True)
-class Scale(Number):
-    listed = False
-
-
-@dataclass(frozen=True)
-class Normals(Color):
-    listed = False
 
 
 class Mapped(Turning):

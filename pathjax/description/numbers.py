@@ -59,14 +59,6 @@ def transform(element: Element) -> np.ndarray:
     return matrix
 
 
-def _translate(step: Element) -> np.ndarray:
-    return Transform().translate(triple(step, default=0.0)).matrix
-
-
-def _scale(step: Element) -> np.ndarray:
-    return Transform().scale(triple(step, default=1.0)).matrix
-
-
 def _rotate(step: Element) -> np.ndarray:
     axis = triple(step, default=0.0, extra=("angle",))
     require_attributes(step, required=("angle",), optional=("value", "x", "y", "z"))
@@ -105,4 +97,10 @@ def _vector(step: Element, text: str) -> np.ndarray:
     return np.array(values)
 
 
-STEPS = {"translate": _translate, "rotate": _rotate, "scale": _scale, "lookat": _lookat, "matrix": _matrix}
+STEPS = {
+    "translate": lambda step: Transform().translate(triple(step, default=0.0)).matrix,
+    "rotate": _rotate,
+    "scale": lambda step: Transform().scale(triple(step, default=1.0)).matrix,
+    "lookat": _lookat,
+    "matrix": _matrix,
+}

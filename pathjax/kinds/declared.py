@@ -18,9 +18,9 @@ class Declared:
     moves_paths: bool = False
     least: float = -math.inf  # what is smaller counts as this
     absent: object = 0.0  # the value of rows that lack it, which nothing reads, or which means the same
+    listed: bool = False  # is a parameter of the scene, to be set, differentiated and fitted
     shape = ()  # of a row's value
     dtype = None  # of the scene's reals, unless it is given
-    listed = False  # is a parameter of the scene, to be set, differentiated and fitted
     shared = False  # one array for all rows
 
     def read(self, loader, fields, name: str, owner: str):
@@ -32,7 +32,7 @@ class Declared:
 class Number(Declared):
     """A number; where it may be textured, also the mean of a colour, or the luminance of a texture, as in Mitsuba."""
 
-    listed = True
+    listed: bool = True
 
     def read(self, loader, fields, name, owner):
         if self.textured and (made := loader.texture(fields, name, owner)) is not None:
@@ -50,8 +50,8 @@ class Color(Declared):
     bounds: tuple[float, float] = (0, 1)
     textured: bool = True
     radiance: bool = False  # of a light: uniform spectra have another colour, see `Fields.color`
+    listed: bool = True
     shape = (3,)
-    listed = True
 
     def read(self, loader, fields, name, owner):
         if self.textured and (made := loader.texture(fields, name, owner)) is not None:
