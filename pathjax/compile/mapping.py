@@ -1,4 +1,4 @@
-"""A function of one item over millions of them: on CPUs one native loop a device, elsewhere chunks of `vmap`.
+"""A function of one item over millions of them: on CPUs one native loop a device, elsewhere `vectorised` items.
 
 Where several processes have joined (`distributed`), the devices are those of all of them. Each holds all items, does
 its share, and gets all results, so that whatever comes before and after is the same program in each.
@@ -18,7 +18,7 @@ from jax.sharding import Mesh, PartitionSpec
 
 from pathjax.compile.lanes import lanes
 from pathjax.compile.promotion import usual_promotion
-from pathjax.compile.vectorised import vectorised
+from pathjax.compile.vectorised import most_lanes, vectorised, vectorised_sum
 from pathjax.compile.xla import native
 
 # Items that a native loop takes at once: enough that loops over them vectorise and their overheads vanish, few enough
@@ -27,9 +27,8 @@ _LANES, _FEW_LANES = 256, 64
 MANY_ITEMS = 2 * _LANES
 # Of a sum over items: so many for a part, so that few lanes wait for its last one; and bytes of the sums of all parts.
 ITEMS_OF_A_PART, MOST_PARTS, MOST_BYTES = 8192, 16, 1 << 26
-# Bytes of live values that one lane of a vmapped path keeps; sizes the chunks on an accelerator.
-_BYTES_PER_LANE = 4096
-_CHUNK_BYTES = 1 << 30
+# On an accelerator items of a kernel may be cut in parts, so that there are some for each of its lanes.
+_ITEMS_OF_A_LANE, _MOST_CUTS = 4, 16
 
 
 @usual_promotion
@@ -41,8 +40,8 @@ def native_map(f: Callable, xs, *shared, form: str | None = None, devices: int |
         xs: pytree of arrays (N, ...).
         shared: pytrees that every item sees whole.
         form: "lanes" (one native loop a device over groups of items, see `lanes`), "loop" (the same, item by item),
-            "vmap" (chunks of vectorised items), or None: what suits the backend. All give the same results up to
-            rounding.
+            "vmap" (as many vectorised items as fit into memory), or None: what suits the backend. All give the same
+            results up to rounding.
         devices: how many devices of this process to use; None: all, of all processes, each of which calls it then.
     Returns:
         pytree of arrays (N, ...); bitwise the same for every number of devices.
@@ -106,8 +105,7 @@ def native_fold(
 
     def part(xs, width, shared):
         if form == "vmap":
-            each = _BYTES_PER_LANE + _bytes(lambda: start(1)) + _bytes(lambda: finish(start(1)))
-            return _vmap_sum(alone, xs, jax.tree.map(jnp.asarray, shared), max(_CHUNK_BYTES // each, 1))
+            return vectorised_sum(alone, xs, jax.tree.map(jnp.asarray, shared))
         (memory,) = lanes(lambda *args: (f(*args),), width, memory=start(width))(xs, *shared)
         return finish(memory)
 
@@ -115,18 +113,30 @@ def native_fold(
 
 
 @usual_promotion
-def native_rows(f: Callable, xs, *shared, start: Callable, finish: Callable, devices: int | None = None):
+def native_rows(
+    f: Callable, xs, *shared, start: Callable, finish: Callable, form: str | None = None, devices: int | None = None
+):
     """What every item leaves in rows of memory that are its own, as `native_fold` has it, and what it gives.
 
     Args:
         f: (x, number of the item, *shared, memory) -> (y, memory); items of a part are numbered from 0.
         start: (number of lanes, number of items, *shared) -> memory before the first item.
         finish: memory after the last item of a part -> pytree of arrays (items, ...).
-        xs, shared, devices: of `native_fold`.
+        xs, shared, form, devices: of `native_fold`.
     Returns:
         y and the rows of all items, pytrees of arrays (N, ...). Under `jax.vmap` one call follows another.
     """
     count = jax.tree.leaves(xs)[0].shape[0]
+    form = _form(form)
+    if form == "loop":
+        raise ValueError("items with rows of memory have no form loop; use lanes or vmap")
+
+    def alone(x, *shared):
+        y, memory = f(x, jnp.int32(0), *shared, start(1, 1, *shared))
+        return y, jax.tree.map(lambda row: row[0], finish(memory))
+
+    if form == "vmap":
+        return native_map(alone, xs, *shared, form=form, devices=devices)
 
     @custom_vmap
     def run(xs, *shared):
@@ -190,6 +200,11 @@ def _by_parts(part: Callable, xs, shared, devices: int | None, most: int = MOST_
     return results if total is None else jax.tree.map(lambda first, x: reduce(jnp.add, list(x), first), total, results)
 
 
+def cuts(count: int, form: str | None = None) -> int:
+    """In how many parts an item is best cut, of so many: a lane of an accelerator needs items to go on with."""
+    return 1 if _form(form) != "vmap" else min(-(-_ITEMS_OF_A_LANE * most_lanes() // max(count, 1)), _MOST_CUTS)
+
+
 def _form(form: str | None) -> str:
     return form or ("lanes" if native() else "vmap")
 
@@ -235,7 +250,7 @@ def _map(f, xs, shared, form, devices):
         # By the items of all devices, so that their number does not change the program.
         "lanes": partial(_lanes, width=_LANES if count >= MANY_ITEMS else _FEW_LANES),
         "loop": _loop,
-        "vmap": partial(_vmap_chunks, chunk=_CHUNK_BYTES // _BYTES_PER_LANE),
+        "vmap": vectorised,
     }[form]
     if len(used) == 1:
         return run(f, xs, shared)
@@ -277,37 +292,3 @@ def _loop(f, xs, shared):
 
 def _lanes(f, xs, shared, width):
     return lanes(f, width)(xs, *shared)
-
-
-def _vmap_chunks(f, xs, shared, chunk):
-    count = jax.tree.leaves(xs)[0].shape[0]
-    chunks = -(-count // chunk)
-    each = -(-count // chunks)
-
-    # Chunks of one size are one program; the first item fills the last one up.
-    def split(x):
-        x = jnp.concatenate([x, jnp.broadcast_to(x[:1], (each * chunks - count, *x.shape[1:]))])
-        return x.reshape(chunks, each, *x.shape[1:])
-
-    def join(y):
-        return y.reshape(chunks * each, *y.shape[2:])[:count]
-
-    return jax.tree.map(join, lax.map(lambda rows: vectorised(f, rows, shared), jax.tree.map(split, xs)))
-
-
-def _vmap_sum(f, xs, shared, chunk):
-    """The sum of f over all items, and over items of zeros, which fill the last chunk up."""
-    count = jax.tree.leaves(xs)[0].shape[0]
-    chunks = -(-count // chunk)
-    each = -(-count // chunks)
-
-    def split(x):
-        x = jnp.pad(x, [(0, each * chunks - count), *[(0, 0)] * (x.ndim - 1)])
-        return x.reshape(chunks, each, *x.shape[1:])
-
-    def add(total, rows):
-        return jax.tree.map(lambda total, y: total + y.sum(0), total, vectorised(f, rows, shared)), None
-
-    one = jax.eval_shape(f, jax.tree.map(lambda x: x[0], xs), *shared)
-    zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), one)
-    return lax.scan(add, zeros, jax.tree.map(split, xs))[0]

@@ -272,7 +272,7 @@ batching.primitive_batchers[persistent_test_p] = lambda values, axes: (persisten
 
 
 def _alone(*inputs, f, shared):
-    return f(inputs[:shared], jnp.ones((1,), bool), [x[None] for x in inputs[shared:]])
+    return f(inputs[:shared], jnp.ones((1,), bool), [jnp.asarray(x)[None] for x in inputs[shared:]])
 
 
 def _together_batch(inputs, axes, **params):

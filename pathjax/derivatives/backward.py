@@ -360,9 +360,9 @@ def pullback(
     return [of_array(path) for path in paths]
 
 
-@partial(jax.jit, static_argnames=("paths", "options", "ring", "devices"))
+@partial(jax.jit, static_argnames=("paths", "options", "ring", "form", "devices"))
 def rows(
-    scene: Scene, pixels, first_sample, spp, seed, *, paths, options: Options, ring, devices=None
+    scene: Scene, pixels, first_sample, spp, seed, *, paths, options: Options, ring, form=None, devices=None
 ) -> tuple[Float[Array, "N 3"], Float[Array, "N M 3"]]:
     """Means of pixels, and their derivatives in each of the list of colours: of each channel in its own.
 
@@ -380,4 +380,4 @@ def rows(
         return finish(structure, memory).reshape(-1, entries, 3)
 
     work = pixels, first_sample, spp, seed
-    return native_rows(of_pixel, work, scene, choice, start=begin, finish=end, devices=devices)
+    return native_rows(of_pixel, work, scene, choice, start=begin, finish=end, form=form, devices=devices)

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from pathjax import emitters
-from pathjax.compile import compute_once, native_map, persistent_loop
+from pathjax.compile import compute_once, persistent_loop
 from pathjax.core import sampler
 from pathjax.core.math import at, luminance
 from pathjax.derivatives import places
@@ -25,6 +25,7 @@ from pathjax.emitters import Choice
 from pathjax.integrators import path, pixel
 from pathjax.integrators.options import Options
 from pathjax.integrators.random_numbers import bounce_numbers
+from pathjax.integrators.reconstruction import map_pixels
 from pathjax.scene.scene import Scene
 
 
@@ -100,4 +101,4 @@ def push(
     v = rows[0] if len(rows) == 1 else jnp.concatenate(rows)
     of_pixel = partial(pixel_change, options=options, slots=slots, paths=paths)
     work = pixels, first_sample, spp, seed
-    return native_map(of_pixel, work, scene, choice, v, form=form, devices=devices)
+    return map_pixels(of_pixel, work, scene, choice, v, options=options, form=form, devices=devices)

@@ -25,7 +25,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int, UInt
 
-from pathjax.compile import native_map, split_map
+from pathjax.compile import cuts, native_map, split_map
 from pathjax.core import sampler
 from pathjax.core.math import safe_divide
 from pathjax.integrators.options import Options
@@ -46,24 +46,50 @@ Run = tuple[Int[Array, ""], UInt[Array, "R n"], UInt[Array, "R n"], UInt[Array, 
 _SAMPLES, _OF_PIXEL, _NUMBERS = 1 << 16, 16, 1 << 24
 
 
-def map_pixels(of_pixel: Callable, work: Works, scene: Scene, *shared, options: Options, **how) -> object:
+def map_pixels(
+    of_pixel: Callable, work: Works, scene: Scene, *shared, options: Options, means: bool = True, **how
+) -> object:
     """`native_map` of pixels; of a film that shares samples, the images that these make.
 
     Args:
-        of_pixel: (`pixel.Work`, scene, *shared) -> pytree, the mean over samples of a pixel.
+        of_pixel: (`pixel.Work`, scene, *shared) -> pytree, the mean over samples of a pixel, or the sum.
         work: arrays (N,); where samples are shared `film.pixels` of one image or of some, one after another.
+        means: whether it gives the mean. Of a film that shares samples, sums become means.
         how: `form` and `devices` of `native_map`.
     Returns:
         pytree of (N, ...); of a film that shares samples, without the pixels outside of its crop window.
     """
     if not options.shared:
-        return native_map(of_pixel, work, scene, *shared, **how)
+        return _own_samples(of_pixel, work, scene, *shared, means=means, **how)
     count = film.pixel_count(film.of_samples(scene.film))
     _, first_sample, spp, seed = (x.reshape(-1, count) for x in work)
     scale = 1 / jnp.maximum(spp, 1).astype(scene.camera.origin.dtype)
     run = jnp.int32(0), first_sample, spp, seed, scale
     totals, weights = sums(of_pixel, run, scene, *shared, options=options, **how)
     return jax.tree.map(lambda total: _images(scene.film, total, weights), totals)
+
+
+def _own_samples(of_pixel: Callable, work: Works, scene: Scene, *shared, means: bool, **how) -> object:
+    """`map_pixels`, where no sample is shared. An accelerator takes some samples of a pixel at once."""
+    pixels, first_sample, spp, seed = work
+    parts = cuts(len(pixels), how.get("form"))
+    if parts == 1:
+        return native_map(of_pixel, work, scene, *shared, **how)
+    k, each, more = jnp.arange(parts, dtype=spp.dtype)[:, None], spp // parts, spp % parts
+    counts = each + (k < more).astype(spp.dtype)
+    work = pixels, first_sample + each * k + jnp.minimum(k, more), counts, seed
+    work = tuple(jnp.broadcast_to(x, counts.shape).ravel() for x in work)
+    results = native_map(of_pixel, work, scene, *shared, **how)
+
+    def joined(x):
+        x = x.reshape(*counts.shape, *x.shape[1:])
+        if not means:
+            return x.sum(0)
+        # A mean of no samples may be anything.
+        share = (counts / jnp.maximum(spp, 1)).reshape(*counts.shape, *[1] * (x.ndim - 2)).astype(x.dtype)
+        return jnp.where(share > 0, x * share, 0).sum(0)
+
+    return jax.tree.map(joined, results)
 
 
 def _images(

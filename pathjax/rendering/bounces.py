@@ -206,7 +206,8 @@ def _kernel(scene, pixels, first_sample, spp, seeds, *, depth, options: Options,
     if options.shared:
         counts = film.extended(scene.film, spp)
     work = tiled, *pixel.numbers(tiled, first_sample, counts.ravel(), jnp.repeat(seeds, len(pixels)))
-    results = map_pixels(one_pixel, work, scene, choice, tangents.unit_tangents(scene, colors), options=options)
+    shared = scene, choice, tangents.unit_tangents(scene, colors)
+    results = map_pixels(one_pixel, work, *shared, options=options, means=False)
     results = (x.reshape(*spp.shape, *x.shape[1:]) for x in results)
     # A film that shares samples gives means.
     return tuple(x * spp.reshape(*spp.shape, *[1] * (x.ndim - 2)) if options.shared else x for x in results)

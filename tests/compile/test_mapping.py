@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from jax import lax
 
-from pathjax.compile import mapping, native_fold, native_map, persistent_loop, together
+from pathjax.compile import mapping, native_fold, native_map, native_rows, persistent_loop, together, vectorised
+from pathjax.compile.jax_compat import ClosedJaxpr, program_of
 
 
 def collatz(n):
@@ -62,11 +63,79 @@ def test_order_is_kept_for_every_number_of_devices():
 
 def test_chunks_of_the_vectorised_form_cover_all_items(monkeypatch):
     """Chunks that do not divide the number of items, as an accelerator would have them."""
-    monkeypatch.setattr(mapping, "_CHUNK_BYTES", 7 * mapping._BYTES_PER_LANE)
+    monkeypatch.setattr(vectorised, "MOST_LANES_OF_CPU", 7)
     xs = jnp.arange(1, 101, dtype=jnp.int32)
     np.testing.assert_array_equal(
         native_map(collatz, xs, form="vmap", devices=1), [collatz_by_hand(n) for n in range(1, 101)]
     )
+
+
+@pytest.mark.parametrize("lanes", [1, 8, 40])
+def test_lanes_of_the_vectorised_form_that_are_done_take_other_items(monkeypatch, lanes):
+    """Also items that end at once; and hardly a trip is made beyond those that all lanes are busy in."""
+    monkeypatch.setattr(vectorised, "MOST_LANES_OF_CPU", lanes)
+    steps = np.random.default_rng(0).geometric(0.02, 300).astype(np.int32) - 1
+    table, made = jnp.arange(5.0), []
+
+    def f(n, table):
+        scale = table[n % 5]
+
+        def step(state):
+            jax.debug.callback(lambda: made.append(1))
+            return state[0] + 1, state[1] + scale
+
+        k, total = persistent_loop(lambda state: state[0] < n, step, (jnp.int32(0), jnp.float32(0)))
+        return {"steps": k, "total": total + n}
+
+    found = jax.jit(lambda xs: native_map(f, xs, table, form="vmap", devices=1))(steps)
+    np.testing.assert_array_equal(found["steps"], steps)
+    np.testing.assert_allclose(found["total"], steps * (1 + steps % 5.0), rtol=1e-6)
+    jax.effects_barrier()
+    if lanes > 1:
+        assert len(made) < 1.15 * steps.sum() / lanes + steps.max()
+
+
+def test_live_values_are_those_that_something_still_reads():
+    def f(x, table):
+        y = x + table.sum()
+        z = jnp.sin(y)
+        return (z * z)[:1]
+
+    program, _ = program_of(f, jnp.zeros(4, jnp.float32), jnp.zeros(1000, jnp.float32))
+    # x, y, what y is made of; of a table that is shared, nothing.
+    of_item = ClosedJaxpr(program.jaxpr.replace(invars=program.jaxpr.invars[::-1]), ())
+    assert 32 <= vectorised.live_bytes(of_item, 1) <= 52
+    assert vectorised.live_bytes(program, 1) >= 4000
+
+
+@pytest.mark.parametrize("form", ["lanes", "vmap"])
+def test_items_keep_rows_of_their_own(form):
+    """Of an accelerator each item alone."""
+
+    def f(x, number, scale, memory):
+        def add(memory, here, values):
+            k, row, scale = values
+
+            def one(lane, memory):
+                return memory.at[row[lane], k[lane]].add(jnp.where(here[lane], scale[lane], 0))
+
+            return lax.fori_loop(0, len(k), one, memory)
+
+        def step(state):
+            k, memory = state
+            return k + 1, together(add)(memory, (k, number, scale))
+
+        k, memory = persistent_loop(lambda state: state[0] != x, step, (jnp.int32(0), memory))
+        return 2 * k, memory
+
+    xs = np.array([3, 0, 1, 4, 2], np.int32)
+
+    def start(lanes, items, scale):
+        return jnp.zeros((items + 1, 4))
+
+    twice, rows = native_rows(f, xs, jnp.float32(0.5), start=start, finish=lambda memory: memory[:-1], form=form)
+    np.testing.assert_array_equal(twice, 2 * xs)
+    np.testing.assert_array_equal(rows, 0.5 * (np.arange(4) < xs[:, None]))
 
 
 def test_map_passes_tangents():
