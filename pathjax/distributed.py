@@ -63,6 +63,11 @@ def start(coordinator: str | None = None, processes: int | None = None, process:
         devices = None
         if coordinator is None:
             coordinator, processes, process, devices = found_cluster(MEETING)
+            if None in (coordinator, processes, process):
+                raise InputError(
+                    "no cluster is found here (SLURM, Open MPI, Kubernetes); give the address of the first process, "
+                    "how many there are and which of them this is"
+                )
         peers = meet(coordinator, processes, process, facts, MEETING)
         _threads.append(Watch(peers, _end))
         if process:

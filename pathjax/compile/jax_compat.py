@@ -148,16 +148,12 @@ def gathered(tree):
     return multihost_utils.process_allgather(tree)
 
 
-def found_cluster(seconds: int) -> tuple[str, int, int, list[int] | None]:
+def found_cluster(seconds: int) -> tuple[Any, Any, Any, Any]:
     """What `jax.distributed.initialize` finds out by itself: address, processes, number of this one, its devices.
 
-    Raises:
-        ValueError: it finds no cluster.
+    None: it does not know.
     """
     from jax._src.clusters import ClusterEnv
 
     address = os.environ.get("JAX_COORDINATOR_ADDRESS")
-    found: Any = ClusterEnv.auto_detect_unset_distributed_params(address, None, None, None, None, seconds)
-    if None in found[:3]:
-        raise ValueError("no cluster is found here")
-    return found
+    return ClusterEnv.auto_detect_unset_distributed_params(address, None, None, None, None, seconds)

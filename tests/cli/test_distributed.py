@@ -24,6 +24,7 @@ PATIENCE = 15
         (["--coordinator", "127.0.0.1:1"], "give all three"),
         (["--processes", 2, "--process", 0], "give all three"),
         (["--coordinator", "127.0.0.1:1", "--processes", 2, "--process", 2], "counted from 0"),
+        (["--coordinator", "auto"], "no cluster is found here"),
     ],
 )
 def test_wrong_numbers_are_refused(refused, tmp_path, arguments, says):
