@@ -91,6 +91,9 @@ def traverse(tree: Tree, leaf, prepared, entry, t, found, result=lambda t, found
         rest = entry & (entry - 1)
         return rest, rest & ((1 << WIDTH) - 1) != 0
 
+    def push(stack, entry, free):
+        return lax.dynamic_update_slice(stack, entry[None], (free.astype(jnp.uint32),), allow_negative_indices=False)
+
     def begin():
         stack = jnp.zeros((tree.depth + 1,), jnp.int32)
         root = entry.astype(jnp.int32)
@@ -106,8 +109,7 @@ def traverse(tree: Tree, leaf, prepared, entry, t, found, result=lambda t, found
         below = _hit_children(tree, child, ray, _weights(octant, entry != 0), t)
         rest, some = rest_of(entry)
         # Push the rest, unless it is empty; then go below, or pop.
-        place = free.astype(jnp.uint32)
-        stack = lax.dynamic_update_slice(stack, rest[None], (place,), allow_negative_indices=False)
+        stack = push(stack, rest, free)
         free = jnp.maximum(free + some.astype(jnp.int32) - (below == 0).astype(jnp.int32), 0)
         entry = jnp.where(below != 0, child << WIDTH | below, at(stack, free))
         return _State(free, entry, first_child(entry), stack, t, found)
@@ -116,8 +118,10 @@ def traverse(tree: Tree, leaf, prepared, entry, t, found, result=lambda t, found
         free, entry, child, stack, t, found = state
         t, found = leaf(~child, t, found)
         rest, some = rest_of(entry)
+        # The rest is pushed and popped again: a branch would be guessed wrong too often.
+        stack = push(stack, rest, free)
         free = free - (~some).astype(jnp.int32)
-        entry = jnp.where(t < 0, 0, jnp.where(some, rest, at(stack, free)))
+        entry = jnp.where(t < 0, 0, at(stack, free))
         return _State(free, entry, first_child(entry), stack, t, found)
 
     return interleaved(
