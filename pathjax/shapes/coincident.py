@@ -125,13 +125,10 @@ def _coplanar(shapes: list[Faces], movable, others, least, dtype):
     """
     if not movable or not others:
         return
-    # Few triangles of a large mesh lie in the box around all that may touch them.
-    around = np.concatenate([shapes[i].corners.reshape(-1, 3) for i in movable])
-    slack = precision(dtype) * np.abs(around).max(0)
-    bottom, top = around.min(0) - slack, around.max(0) + slack
-    near_by = []
-    for lo, hi in (_ends(shapes[j].corners) for j in others):
-        near_by.append(np.flatnonzero((lo <= top).all(1) & (hi >= bottom).all(1)))
+    low, high = map(np.concatenate, zip(*(_ends(shapes[i].corners) for i in movable), strict=True))
+    slack = precision(dtype) * np.maximum(np.abs(low), np.abs(high))
+    bottoms, tops = low - slack, high + slack
+    near_by = [_near_any(shapes[j].corners, bottoms, tops) for j in others]
     owner, rows = np.repeat(others, [len(each) for each in near_by]), np.concatenate(near_by)
     if not len(rows):
         return
@@ -166,6 +163,24 @@ def _coplanar(shapes: list[Faces], movable, others, least, dtype):
                 # The faces of a body differ from each other, and those of a mesh that stays in place are alike here.
                 groups = zip(*partners, strict=True) if shapes[j].normal is not None else [partners]
                 yield from ((i, row, j, *map(np.atleast_1d, group)) for group in groups)
+
+
+def _near_any(corners, bottoms, tops):
+    """Return the rows of the faces (F, K, 3) in the box around those boxes (M, 3) that reach the faces' own.
+
+    Few triangles of a large mesh are near what it stands on.
+    """
+    columns = np.moveaxis(corners, 2, 0)
+    reached = (bottoms <= [c.max() for c in columns]).all(1) & (tops >= [c.min() for c in columns]).all(1)
+    if not reached.any():
+        return np.zeros(0, np.int64)
+    bottom, top = bottoms[reached].min(0), tops[reached].max(0)
+    rows = np.arange(len(corners))
+    for axis in np.argsort(top - bottom):
+        ends = np.moveaxis(columns[axis] if len(rows) == len(corners) else columns[axis, rows], 1, 0)
+        reaches = (reduce(np.logical_or, flags) for flags in (ends <= top[axis], ends >= bottom[axis]))
+        rows = rows[np.logical_and(*reaches)]
+    return rows
 
 
 def _ends(corners):

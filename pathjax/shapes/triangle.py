@@ -93,7 +93,7 @@ class Triangles(Table):
     @classmethod
     def build(cls, parts, lit, dtype, rule, margins):
         def joined(arrays):
-            return np.concatenate([np.asarray(array, dtype) for array in arrays])
+            return np.concatenate(list(arrays), dtype=dtype, casting="unsafe")
 
         def optional(name, default):
             values = [getattr(part, name) for part in parts]
@@ -312,7 +312,9 @@ class Mesh(Shape):
 
     def primitives(self, flip):
         faces = self.faces[:, ::-1] if flip else self.faces
-        normals = None if self.normals is None else np.take(self.normals, faces, axis=0) * (-1 if flip else 1)
+        normals = None
+        if self.normals is not None:
+            normals = np.take(-self.normals if flip else self.normals, faces, axis=0)
         own = np.repeat(np.arange(len(faces))[:, None], 3, axis=1)
         entries = {name: faces if name.startswith("vertex_") else own for name in self.attributes}
         carried = {name: np.take(values, entries[name], axis=0) for name, values in self.attributes.items()}
