@@ -27,6 +27,7 @@ from pathjax.emitters.point import Point
 from pathjax.emitters.projector import Projector
 from pathjax.emitters.selection import Choice, Lights, choice, choose, probability
 from pathjax.emitters.spot import Spot
+from pathjax.emitters.sunsky import SunSky
 from pathjax.errors import InputError
 from pathjax.kinds import Instance, Parameters, Position, Table, ordered
 from pathjax.kinds import register as register_kind
@@ -47,6 +48,7 @@ __all__ = [
     "Point",
     "Projector",
     "Spot",
+    "SunSky",
     "SurfaceEmitter",
     "choice",
     "choose",
@@ -58,6 +60,7 @@ KINDS: dict[str, type[Emitter]] = {
     "area": Area,
     "constant": Constant,
     "envmap": Envmap,
+    "sunsky": SunSky,
     "point": Point,
     "spot": Spot,
     "projector": Projector,

@@ -26,14 +26,12 @@ from jaxtyping import Array, Float, Int
 
 from pathjax.compile import compute_once, is_traced
 from pathjax.core.math import at, cos_sin_turns, luminance, safe_atan2, safe_divide, safe_sqrt, turns
+from pathjax.emitters.cumulated import STEP, cumulated, search
 from pathjax.emitters.emitter import Background
 from pathjax.images import read_rgb
 from pathjax.kinds import Number, Parameter, PerRow, Rotation, Row, Shared, Unused
 from pathjax.textures.bitmap import texels_of
 
-# Tabled probabilities are multiples of this, and random numbers odd multiples of half of it: so what is tabled is what
-# is drawn, exactly.
-_STEP = 2.0**-23
 # What is made of the texels.
 TABLED = "importance", "rows", "columns", "from_pole", "per_solid_angle", "brightness"
 # Of luminance, by what directions are drawn at least: they have to reach all light, also where bsdfs seldom do. Shares
@@ -125,8 +123,8 @@ class Envmap(Background):
     @staticmethod
     def sample(p: Row, u: Float[Array, "2"], u_part: Float[Array, ""]) -> Float[Array, "3"]:
         height, width = _size(p)
-        y, above = _search(p.rows, 0, height - 1, u[0])
-        x, beside = _search(p.columns, y * (width + 1), width, u[1])
+        y, above = search(p.rows, 0, height - 1, u[0])
+        x, beside = search(p.columns, y * (width + 1), width, u[1])
         (a, b), (c, e) = _corners(p, jnp.stack([y, x]))
         above = _drawn(a + b, c + e, above)
         beside = _drawn(a + (c - a) * above, b + (e - b) * above, beside)
@@ -211,7 +209,7 @@ def _drawn(first: Float[Array, ""], last: Float[Array, ""], u: Float[Array, ""])
     a = jnp.where(total > 0, safe_divide(first, total), 0.5)
     b = 1 - a
     # The root of a x + (b - a) x^2 / 2 = u / 2, without a difference.
-    return jnp.minimum(safe_divide(u, a + safe_sqrt(a * a * (1 - u) + b * b * u)), 1 - _STEP)
+    return jnp.minimum(safe_divide(u, a + safe_sqrt(a * a * (1 - u) + b * b * u)), 1 - STEP)
 
 
 def _ends(p: Row, y: Int[Array, ""]) -> tuple[Float[Array, ""], Float[Array, ""]]:
@@ -254,21 +252,6 @@ def _patch(p: Row, d: Float[Array, "3"]) -> tuple[Int[Array, "2"], Float[Array, 
     return compute_once((first, place - first, lax.stop_gradient(down)))
 
 
-def _search(
-    cdf: Float[Array, " N"], first: Int[Array, ""] | int, count: int, u: Float[Array, ""]
-) -> tuple[Int[Array, ""], Float[Array, ""]]:
-    """The last i < count with cdf[first + i] <= u, and where u lies between that and the next, in [0, 1)."""
-    halvings = max(count - 1, 0).bit_length()
-
-    def halve(k, i):
-        further = i + jnp.left_shift(jnp.int32(1), halvings - 1 - k)
-        return jnp.where((further < count) & (at(cdf, first + jnp.minimum(further, count)) <= u), further, i)
-
-    i = lax.fori_loop(0, halvings, halve, jnp.int32(0))
-    low, high = at(cdf, first + i), at(cdf, first + i + 1)
-    return i, jnp.minimum((u - low) / (high - low), 1 - _STEP)
-
-
 def _probabilities(texels: np.ndarray) -> dict[str, np.ndarray]:
     """The tables of an image whose texels are given: all but the texels."""
     height, width, _ = texels.shape
@@ -289,8 +272,8 @@ def _probabilities(texels: np.ndarray) -> dict[str, np.ndarray]:
         both = importance[first : rows.stop + 1].astype(np.float64)
         both += np.roll(both, -1, axis=1)
         patches = both[:-1] * upper[rows, None] + both[1:] * lower[rows, None]
-        columns[rows], mass[rows] = _cumulated(patches), patches.sum(1)
-    rows = _cumulated(np.where(mass.any(), mass, solid))
+        columns[rows], mass[rows] = cumulated(patches), patches.sum(1)
+    rows = cumulated(np.where(mass.any(), mass, solid))
     per_solid_angle = np.diff(rows) / (solid * (2 * np.pi / width))
     return {
         "importance": importance.ravel(),
@@ -316,11 +299,3 @@ def _unfilled(shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
     memory = np.empty(size + _ALIGNED, np.uint8)
     start = -memory.ctypes.data % _ALIGNED
     return memory[start : start + size].view(dtype).reshape(shape)
-
-
-def _cumulated(weights: np.ndarray) -> np.ndarray:
-    """(..., N) weights to probabilities (..., N + 1) of what comes before; multiples of _STEP, of none but 0 less."""
-    weights = np.where(weights.any(-1, keepdims=True), weights, 1)
-    cumulated, lit = np.cumsum(weights, -1), np.cumsum(weights > 0, -1)
-    steps = np.rint(cumulated / cumulated[..., -1:] * (1 / _STEP - lit[..., -1:])) + lit
-    return np.concatenate([np.zeros_like(steps[..., :1]), steps * _STEP], -1)

@@ -172,6 +172,8 @@ CASES = {
     "constant": BALL.format(GREY) + f'<emitter type="constant" id="it">{rgb("radiance")}</emitter>',
     "envmap": BALL.format(GREY) + '<emitter type="envmap" id="it"><string name="filename" value="textures/marks.png"/>'
     '<float name="scale" value="0.7"/></emitter>',
+    "sunsky": BALL.format(GREY)
+    + '<emitter type="sunsky" id="it"><vector name="sun_direction" value="1, 2, 3"/></emitter>',
     "point": lit(
         f'<emitter type="point" id="it">{rgb("intensity", "5, 4, 3")}<point name="position" value="0, 2, 1"/></emitter>'
     ),

@@ -547,7 +547,7 @@ def test_constant_emitters_stand_in_the_scene_in_any_number(read):
 @pytest.mark.parametrize(
     ("body", "words"),
     [
-        ('<emitter type="sunsky"/>', '<emitter type="sunsky"> is not supported yet; use one of constant'),
+        ('<emitter type="timed_sunsky"/>', '<emitter type="timed_sunsky"> is not supported yet; use one of constant'),
         ('<emitter type="pint"/>', '<emitter type="pint"> is not supported; use one of constant'),
         ('<emitter type="area"><rgb name="intensity" value="1"/></emitter>', "sampling_weight, radiance"),
         (shape('<emitter type="constant"/>'), "shines from no surface; it stands directly in <scene>"),

@@ -1,0 +1,37 @@
+"""Tables from which numbers are drawn by what comes before them."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float, Int
+
+from pathjax.core.math import at
+
+# Tabled probabilities are multiples of this, and random numbers odd multiples of half of it: so what is tabled is what
+# is drawn, exactly.
+STEP = 2.0**-23
+
+
+def cumulated(weights: np.ndarray) -> np.ndarray:
+    """(..., N) weights to probabilities (..., N + 1) of what comes before; multiples of STEP, of none but 0 less."""
+    weights = np.where(weights.any(-1, keepdims=True), weights, 1)
+    total, lit = np.cumsum(weights, -1), np.cumsum(weights > 0, -1)
+    steps = np.rint(total / total[..., -1:] * (1 / STEP - lit[..., -1:])) + lit
+    return np.concatenate([np.zeros_like(steps[..., :1]), steps * STEP], -1)
+
+
+def search(
+    cdf: Float[Array, " N"], first: Int[Array, ""] | int, count: int, u: Float[Array, ""]
+) -> tuple[Int[Array, ""], Float[Array, ""]]:
+    """The last i < count with cdf[first + i] <= u, and where u lies between that and the next, in [0, 1)."""
+    halvings = max(count - 1, 0).bit_length()
+
+    def halve(k, i):
+        further = i + jnp.left_shift(jnp.int32(1), halvings - 1 - k)
+        return jnp.where((further < count) & (at(cdf, first + jnp.minimum(further, count)) <= u), further, i)
+
+    i = lax.fori_loop(0, halvings, halve, jnp.int32(0))
+    low, high = at(cdf, first + i), at(cdf, first + i + 1)
+    return i, jnp.minimum((u - low) / (high - low), 1 - STEP)
