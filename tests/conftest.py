@@ -27,6 +27,7 @@ import numpy as np
 import pytest
 from jax.experimental.compilation_cache import compilation_cache
 
+from pathjax.bench import peers
 from pathjax.derivatives import jacobian, tangents
 from pathjax.integrators import pixel
 from pathjax.integrators.options import DEFAULTS
@@ -251,6 +252,23 @@ def estimate():
     def render(scene, spp=16, count=16, first_seed=1, scale=1, **how):
         seeds = range(first_seed, first_seed + count)
         return estimate_of([np.asarray(pathjax.render(scene, spp, seed, **how)) * scale for seed in seeds])
+
+    return render
+
+
+@pytest.fixture(scope="session")
+def mitsuba():
+    """(scene file, spp, count, variant, **its parameters) -> Estimate of Mitsuba's image over `count` seeds."""
+    pytest.importorskip("mitsuba")
+
+    def render(path, spp, count, variant="llvm_ad_rgb", **parameters):
+        run = {"sampler": "independent", "spp": spp, "seeds": list(range(count))}
+        request = {"scene": str(path), "parameters": parameters, "variant": variant, "runs": [run]}
+        try:
+            _, arrays = peers.call("mitsuba3", request)
+        except peers.PeerMissing as error:
+            pytest.skip(str(error))
+        return estimate_of(arrays["images_0"])
 
     return render
 

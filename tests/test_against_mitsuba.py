@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 import pathjax as pj
-from pathjax.bench import peers
 from pathjax.sensors.filters import Box
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -37,24 +36,6 @@ def with_border(tmp_path):
     return copy
 
 
-@pytest.fixture
-def mitsuba(estimate_type):
-    """(scene file, variant) -> Estimate of Mitsuba's image."""
-    pytest.importorskip("mitsuba")
-
-    def render(path, variant="llvm_ad_rgb"):
-        run = {"sampler": "independent", "spp": SPP, "seeds": list(range(SEEDS))}
-        request = {"scene": str(path), "parameters": {"res": 32}, "variant": variant, "runs": [run]}
-        try:
-            _, arrays = peers.call("mitsuba3", request, timeout=300)
-        except peers.PeerMissing as error:
-            pytest.skip(str(error))
-        images = arrays["images_0"].astype(float)
-        return estimate_type(images.mean(0), images.var(0, ddof=1) / SEEDS, SEEDS)
-
-    return render
-
-
 def double_variant():
     """A variant of Mitsuba in double precision with RGB colours, if this build of it has one."""
     mi = pytest.importorskip("mitsuba")
@@ -75,7 +56,8 @@ def test_image_agrees_with_mitsuba(path, with_border, mitsuba, estimate, agree):
     # Mitsuba's wide filters share samples among neighbours: pixels then depend on each other, and their mean tells
     # less than its variance says.
     independent = isinstance(scene.film.filter, Box)
-    agree(estimate(scene, spp=SPP, count=SEEDS), mitsuba(path), whole=independent, rounding=ROUNDING)
+    ours, theirs = estimate(scene, SPP, SEEDS), mitsuba(path, SPP, SEEDS, res=32)
+    agree(ours, theirs, whole=independent, rounding=ROUNDING)
 
 
 @pytest.mark.slow
@@ -84,7 +66,8 @@ def test_images_through_other_filters_agree_with_mitsuba(kind, with_border, mits
     """The border of the lamp, that is, with the lobes that a filter draws beside it."""
     path = with_border(ROOT / "scenes" / "cornell_box.xml")
     path.write_text(path.read_text().replace('<rfilter type="box"/>', f'<rfilter type="{kind}"/>'))
-    agree(estimate(pj.load_scene(path, res=32), spp=SPP, count=SEEDS), mitsuba(path), whole=False, rounding=ROUNDING)
+    ours, theirs = estimate(pj.load_scene(path, res=32), SPP, SEEDS), mitsuba(path, SPP, SEEDS, res=32)
+    agree(ours, theirs, whole=False, rounding=ROUNDING)
 
 
 @pytest.mark.slow
@@ -93,7 +76,7 @@ def test_nine_spheres_agree_with_double_precision(shipped, mitsuba, estimate, ag
     build has no double precision (the wheels have none), pathjax itself in float64 does, with seeds of its own."""
     single = estimate(shipped("nine_spheres", res=32), spp=SPP, count=SEEDS)
     if variant := double_variant():
-        double = mitsuba(ROOT / "scenes" / "nine_spheres.xml", variant)
+        double = mitsuba(ROOT / "scenes" / "nine_spheres.xml", SPP, SEEDS, variant, res=32)
     else:
         with x64():
             double = estimate(shipped("nine_spheres", jnp.float64, res=32), spp=SPP, count=SEEDS, first_seed=1001)

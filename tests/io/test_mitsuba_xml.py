@@ -380,7 +380,9 @@ def test_conductor_is_an_ideal_mirror_unless_told_otherwise(read):
 @pytest.mark.parametrize(
     ("kind", "inside", "words"),
     [
-        ("hair", "", "is not supported yet; use one of diffuse, conductor, "),
+        ("hair", "", "is not supported: it stands on curves, which no ray is tested against; use one of diffuse, "),
+        ("polarizer", "", "is not supported: polarisation is not modelled; use one of diffuse, conductor, "),
+        ("circular", "", "is not supported yet; use one of diffuse, conductor, "),
         ("difuse", "", 'did you mean "diffuse"?'),
         ("diffuse", '<rgb name="reflectence" value="1"/>', 'it has: reflectance; did you mean "reflectance"?'),
         ("diffuse", '<rgb name="reflectance" value="1.1"/>', "between 0 and 1"),
@@ -547,7 +549,7 @@ def test_constant_emitters_stand_in_the_scene_in_any_number(read):
 @pytest.mark.parametrize(
     ("body", "words"),
     [
-        ('<emitter type="timed_sunsky"/>', '<emitter type="timed_sunsky"> is not supported yet; use one of constant'),
+        ('<emitter type="timed_sunsky"/>', '<emitter type="timed_sunsky"> is not supported: light does not change'),
         ('<emitter type="pint"/>', '<emitter type="pint"> is not supported; use one of constant'),
         ('<emitter type="area"><rgb name="intensity" value="1"/></emitter>', "sampling_weight, radiance"),
         (shape('<emitter type="constant"/>'), "shines from no surface; it stands directly in <scene>"),

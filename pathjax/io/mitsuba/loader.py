@@ -18,7 +18,7 @@ from pathjax.description.fields import VALUES, Fields
 from pathjax.errors import InputError
 from pathjax.io import bare, mesh
 from pathjax.io.mitsuba import dict_reader, instances, integrators, samplers
-from pathjax.io.mitsuba.plugins import PLUGINS
+from pathjax.io.mitsuba.plugins import PLUGINS, REASONS
 from pathjax.io.mitsuba.xml_reader import read
 from pathjax.kinds import Instance, Unused
 from pathjax.sensors import film
@@ -201,7 +201,8 @@ class _Loader:
         if fields.type not in kinds:
             use = f"use one of {', '.join(kinds)}"
             if fields.type in PLUGINS.get(element.tag, ()):
-                raise element.error(f"{element} is not supported yet; {use}")
+                reason = f": {REASONS[fields.type]}" if fields.type in REASONS else " yet"
+                raise element.error(f"{element} is not supported{reason}; {use}")
             raise element.error(f"{element} is not supported; {use}{nearest(fields.type, kinds)}")
         if element in self.making:
             raise element.error(f"{element} cannot stand inside itself")

@@ -24,3 +24,22 @@ PLUGINS = {
         "emitter": "area constant directional directionalarea envmap point projector spot sunsky timed_sunsky",
     }.items()
 }
+
+_POLARISED = "polarisation is not modelled"
+# Why some of these are not modelled; the others may come.
+REASONS = {
+    "measured_polarized": _POLARISED,
+    "polarizer": _POLARISED,
+    "pplastic": _POLARISED,
+    "retarder": _POLARISED,
+    "specfilm": "images are linear RGB",
+    "hair": "it stands on curves, which no ray is tested against",
+    "bsplinecurve": "rays are not tested against curves",
+    "linearcurve": "rays are not tested against curves",
+    "sdfgrid": "rays are not tested against grids of distances",
+    "measured": "files of measured reflectance are not read",
+    "distant": "sensors are cameras, whose pixels see from one place",
+    "irradiancemeter": "sensors are cameras, and see surfaces from outside",
+    "radiancemeter": "sensors are cameras, of whole images",
+    "timed_sunsky": "light does not change with time; <emitter type=\"sunsky\"> is its sky at one time",
+}
