@@ -14,7 +14,6 @@ from hypothesis import strategies as st
 from PIL import Image
 
 import pathjax as pj
-from pathjax.bench import peers
 from pathjax.io import bare, gltf
 
 CORNERS = np.array([(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)], "<f4")
@@ -373,16 +372,11 @@ def test_what_was_read_is_not_overwritten(tmp_path):
 
 
 @pytest.mark.slow
-def test_mitsuba_renders_what_is_saved(write, tmp_path, estimate, estimate_type, agree):
-    pytest.importorskip("mitsuba")
+def test_mitsuba_renders_what_is_saved(write, tmp_path, mitsuba, estimate, agree):
     # Opaque: to Mitsuba's shadow rays what is masked is, and lights without size are found by no others.
     scene = pj.load_scene(write(everything("OPAQUE")), res=32)
     pj.save_scene(scene, tmp_path / "saved.xml")
-    run = {"sampler": "independent", "spp": 64, "seeds": list(range(12))}
-    request = {"scene": str(tmp_path / "saved.xml"), "parameters": {}, "variant": "llvm_ad_rgb", "runs": [run]}
-    _, arrays = peers.call("mitsuba3", request, timeout=300)
-    images = arrays["images_0"].astype(float)
-    theirs = estimate_type(images.mean(0), images.var(0, ddof=1) / 12, 12)
+    theirs = mitsuba(tmp_path / "saved.xml", 64, 12)
     # The filter shares samples among pixels, so their mean tells less than its variance says.
     agree(estimate(scene, spp=64, count=12), theirs, whole=False, rounding=1e-3)
 

@@ -12,7 +12,6 @@ import trimesh
 
 import pathjax as pj
 from pathjax import bsdfs
-from pathjax.bench import peers
 from pathjax.bsdfs import Diffuse
 from pathjax.kinds import Color, Number
 from pathjax.scene import build
@@ -259,13 +258,8 @@ def test_mitsuba_loads_what_is_saved(path, tmp_path):
 
 
 @pytest.mark.slow
-def test_mitsuba_renders_what_is_saved(estimate, estimate_type, agree, tmp_path):
-    pytest.importorskip("mitsuba")
+def test_mitsuba_renders_what_is_saved(mitsuba, estimate, agree, tmp_path):
     scene = moved(pj.load_dict(dictionary()))
     pj.save_scene(scene, tmp_path / "saved.xml")
-    run = {"sampler": "independent", "spp": SPP, "seeds": list(range(SEEDS))}
-    request = {"scene": str(tmp_path / "saved.xml"), "parameters": {}, "variant": "llvm_ad_rgb", "runs": [run]}
-    _, arrays = peers.call("mitsuba3", request, timeout=300)
-    images = arrays["images_0"].astype(float)
-    theirs = estimate_type(images.mean(0), images.var(0, ddof=1) / SEEDS, SEEDS)
+    theirs = mitsuba(tmp_path / "saved.xml", SPP, SEEDS)
     agree(estimate(scene, spp=SPP, count=SEEDS), theirs, rounding=1e-3)
