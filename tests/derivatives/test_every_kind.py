@@ -76,6 +76,8 @@ def on_pane(*of_bsdf):
 
 
 AIMED = '<transform name="to_world"><lookat origin="1, 2, 3" target="0, 0, 0" up="0, 1, 0"/></transform>'
+# Mitsuba takes no colours above 1 here.
+SIGMA = rgb("sigma_t", "0.125, 0.5, 1") + numbers(scale=4)
 SHEEN = numbers(sheen=0.5, sheen_tint=0.4)
 CASES = {
     "diffuse": on_ball("diffuse", rgb("reflectance")),
@@ -152,7 +154,7 @@ CASES = {
         rgb("albedo"),
         numbers(scale=1.5),
     ).replace('"homogeneous"', '"heterogeneous"'),
-    "isotropic": filled(rgb("sigma_t", "0.5, 2, 4"), rgb("albedo"), '<phase type="isotropic"/>'),
+    "isotropic": filled(SIGMA, rgb("albedo"), '<phase type="isotropic"/>'),
     "hg": filled(rgb("sigma_t", "1"), rgb("albedo"), f'<phase type="hg" id="phase">{numbers(g=0.6)}</phase>'),
     "blendphase": filled(
         rgb("sigma_t", "1"),
@@ -160,7 +162,7 @@ CASES = {
         f'<phase type="blendphase" id="phase">{numbers(weight=0.3)}<phase type="isotropic"/>'
         f'<phase type="hg" id="held">{numbers(g=0.6)}</phase></phase>',
     ),
-    "rayleigh": filled(rgb("sigma_t", "0.5, 2, 4"), rgb("albedo"), '<phase type="rayleigh"/>'),
+    "rayleigh": filled(SIGMA, rgb("albedo"), '<phase type="rayleigh"/>'),
     "area": BALL.format(GREY)
     + '<shape type="sphere"><point name="center" value="1, 1, 1"/><float name="radius" value="0.5"/>'
     f'<bsdf type="diffuse" id="around-lamp"/><emitter type="area" id="it">{rgb("radiance", "4, 3, 2")}</emitter>'
@@ -265,7 +267,7 @@ def test_derivatives_are_those_of_differences(scene_of, case):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("case", [case for case in CASES if case != "spot, covered"])  # by a colour: not in Mitsuba
 def test_images_are_those_of_mitsuba(file_of, scene_of, mitsuba, estimate, agree, case):
     """Where both are right all cases pass, but for once in 1000 runs.
 
