@@ -33,7 +33,7 @@ from pathjax.scene.scene import Scene
 from pathjax.transport import factors as dense_factors
 from pathjax.transport import rays as ray_casting
 from pathjax.transport.control import Control
-from pathjax.transport.patches import Patches, cut
+from pathjax.transport.patches import Patches, cut_scene
 from pathjax.transport.view import Radiosity, radiosity
 
 # How form factors are found, and with how many rays: of a pair, of a patch.
@@ -250,7 +250,7 @@ def operator(
     One-sided surfaces are black from behind, as in the renderer. Not for jitted functions, as shapes are not traced;
     `Operator.with_scene` changes the colours within them.
     """
-    cells = cut(scene, patches, faceted)
+    cells = cut_scene(scene, patches, faceted)
     if method is None:
         few = cells.count <= _DENSE_PATCHES and cells.first.shape[0] <= dense_factors.MOST_BLOCKERS
         method = "dense" if few and dense_factors.are_exact(scene) else "rays"

@@ -43,7 +43,7 @@ class Patches:
         return self.cell.shape[0]
 
 
-def cut(scene: Scene, count: int, faceted: bool = False) -> Patches:
+def cut_scene(scene: Scene, count: int, faceted: bool = False) -> Patches:
     """Cut a scene into about `count` cells of about equal area, at least one for each primitive.
 
     Raises:

@@ -39,7 +39,7 @@ def test_points_of_a_patch_lie_in_it(make_scene, x64, dtype):
     body = "".join(shape(kind, inside + both).replace("it", kind) for kind, inside in SHAPES.items())
     with x64() if dtype == jnp.float64 else contextlib.nullcontext():
         scene = make_scene(body.replace('id="grey"', ""), dtype)
-        cells = patches_module.cut(scene, 150)
+        cells = patches_module.cut_scene(scene, 150)
 
         def found(x, cells, shapes):
             patch, u = x
@@ -62,15 +62,15 @@ def test_points_of_a_patch_lie_in_it(make_scene, x64, dtype):
 
 @pytest.mark.parametrize("kind, area", [("rectangle", 4.0), ("disk", np.pi), ("sphere", 4 * np.pi), ("cube", 24.0)])
 def test_areas_add_up_and_are_about_equal(make_scene, kind, area):
-    cells = patches_module.cut(make_scene(shape(kind, GREY)), 200)
+    cells = patches_module.cut_scene(make_scene(shape(kind, GREY)), 200)
     assert float(cells.area.sum()) == pytest.approx(area, rel=1e-5)
     assert 150 < cells.count < 260
     np.testing.assert_allclose(cells.area, area / cells.count, rtol=1e-5)
 
 
 def test_black_sides_are_no_patches(make_scene):
-    front = patches_module.cut(make_scene(shape("rectangle", GREY)), 9)
-    both = patches_module.cut(make_scene(shape("rectangle", f'<bsdf type="twosided">{GREY}</bsdf>')), 9)
+    front = patches_module.cut_scene(make_scene(shape("rectangle", GREY)), 9)
+    both = patches_module.cut_scene(make_scene(shape("rectangle", f'<bsdf type="twosided">{GREY}</bsdf>')), 9)
     assert (front.count, both.count) == (9, 18)
     assert not front.back.any()
 
