@@ -10,14 +10,7 @@ class BlendBSDF(Choosing):
     """The first bsdf inside where the weight is 0, the second one where it is 1."""
 
     nested = 2
-    weight = Number(bounds=(0, 1), textured=True)
-
-    @classmethod
-    def read(cls, loader, fields, name):
-        made = super().read(loader, fields, name)
-        if made.values["weight"] is None:
-            raise fields.element.error(f'{fields.element} needs <float name="weight" ...>, or a texture of that name')
-        return made
+    weight = Number(bounds=(0, 1), textured=True, required=True)
 
     @staticmethod
     def share(p: Row):

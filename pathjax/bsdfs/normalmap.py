@@ -12,14 +12,7 @@ from pathjax.kinds import Color, Row
 class NormalMap(Mapped):
     """Shading by the normals of a texture, whose channels c hold 2 c - 1: along u, across, and along the normal."""
 
-    normalmap = Color(None, listed=False)
-
-    @classmethod
-    def read(cls, loader, fields, name):
-        made = super().read(loader, fields, name)
-        if made.values["normalmap"] is None:
-            raise fields.element.error(f'{fields.element} needs <texture name="normalmap" ...>')
-        return made
+    normalmap = Color(listed=False, required=True)
 
     @staticmethod
     def normal(p: Row, surface: Surface, to_local) -> Float[Array, "3"]:

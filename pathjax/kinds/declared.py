@@ -17,11 +17,13 @@ class Declared:
     textured: bool = False  # a texture may stand in its place
     moves_paths: bool = False
     least: float = -math.inf  # what is smaller counts as this
+    required: bool = False  # files must give it
     absent: object = 0.0  # the value of rows that lack it, which nothing reads, or which means the same
     listed: bool = False  # is a parameter of the scene, to be set, differentiated and fitted
     shape = ()  # of a row's value
     dtype = None  # of the scene's reals, unless it is given
     shared = False  # one array for all rows
+    tag = "float"  # of the element that gives it
 
     def read(self, loader, fields, name: str, owner: str):
         """The value that a file gives it, or the default. Raises InputError where it is out of range."""
@@ -52,6 +54,7 @@ class Color(Declared):
     radiance: bool = False  # of a light: uniform spectra have another colour, see `Fields.color`
     listed: bool = True
     shape = (3,)
+    tag = "rgb"
 
     def read(self, loader, fields, name, owner):
         if self.textured and (made := loader.texture(fields, name, owner)) is not None:

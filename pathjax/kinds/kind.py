@@ -50,7 +50,12 @@ class Kind:
             known: values of parameters that are not to be read.
         """
         asked = {key: d for key, d in cls.declared.items() if key not in known}
-        return cls.instance(name, **known, **{key: d.read(loader, fields, key, name) for key, d in asked.items()})
+        values = {key: d.read(loader, fields, key, name) for key, d in asked.items()}
+        for key, d in asked.items():
+            if d.required and values[key] is None:
+                or_texture = ", or a texture of that name" if d.textured else ""
+                raise fields.element.error(f'{fields.element} needs <{d.tag} name="{key}" ...>{or_texture}')
+        return cls.instance(name, **known, **values)
 
     @classmethod
     def instance(cls, name: str = "", **values) -> Instance:

@@ -12,16 +12,15 @@ class BlendPhase(Phase):
     An `Instance` holds both under "held". What scatters is one of these: see `media.sample`.
     """
 
-    weight = Number(bounds=(0, 1))
+    weight = Number(bounds=(0, 1), required=True)
     codes = PerRow()  # (2, 2) int32: kind and row of each
 
     @classmethod
     def read(cls, loader, fields, name):
-        made, elements = super().read(loader, fields, name), fields.objects("phase", limit=2)
+        elements = fields.objects("phase", limit=2)
         if len(elements) < 2:
             raise fields.element.error(f"{fields.element} needs two <phase>s inside, and has {len(elements)}")
-        if made.values["weight"] is None:
-            raise fields.element.error(f'{fields.element} needs <float name="weight" ...>')
+        made = super().read(loader, fields, name)
         held = tuple(loader.shared(each, loader.unique(f"{name}_{place}")) for place, each in enumerate(elements))
         for each, element in zip(held, elements, strict=True):
             if issubclass(each.kind, cls):
