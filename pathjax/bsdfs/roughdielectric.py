@@ -68,7 +68,7 @@ class RoughDielectric(Rough, Interface):
         """Reflect at a normal that wi sees with the probability R, or else refract."""
         eta, side = lax.stop_gradient(_eta(p, wi)), _side(wi)
         seen = wi * side
-        m = compute_once(Rough.facets(p).sample(seen, u))
+        m = Rough.facets(p).sample(seen, u)
         i = jnp.clip(dot(seen, m), 0, 1)
         reflectance, cos_t = fresnel.dielectric(i, eta)
         reflects = u[2] < reflectance

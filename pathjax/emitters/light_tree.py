@@ -135,6 +135,6 @@ def _descend(tree: LightTree, ref, step: Callable, state):
     def down(level, state):
         first, second = compute_once((importance(2 * state[0]), importance(2 * state[0] + 1)))
         total = first + second
-        return step(level, state, compute_once(jnp.where(total > 0, first * safe_divide(1, total), 0.5)))
+        return step(level, state, jnp.where(total > 0, first * safe_divide(1, total), 0.5))
 
     return lax.fori_loop(0, tree.levels, down, state)
