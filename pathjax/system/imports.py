@@ -11,4 +11,15 @@ gc.disable()
 
 def done() -> None:
     if _enabled:
+        age()
         gc.enable()
+
+
+def age() -> None:
+    """Let Python take all objects for old ones, which it seldom goes through, without going through them now.
+
+    Where a program has frozen some, which only all together are let go of again, all stay as they are.
+    """
+    if not gc.get_freeze_count():
+        gc.freeze()
+        gc.unfreeze()
