@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Generic, TypeVar
 
 import jax
@@ -89,8 +90,13 @@ class Part:
     program: ClosedJaxpr
     places: tuple[int, ...]  # of the inputs that it reads
 
+    @cached_property
+    def _once(self) -> Callable:
+        """The program as one function of XLA's, however many slots call it: traced once, and once lowered."""
+        return jax.jit(jaxpr_as_fun(self.program))
+
     def __call__(self, inputs, *state):
-        return jaxpr_as_fun(self.program)(*(inputs[place] for place in self.places), *state)
+        return self._once(*(inputs[place] for place in self.places), *state)
 
     def reads(self) -> list[int]:
         """Which of the arrays of the state it reads."""
