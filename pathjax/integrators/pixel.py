@@ -28,7 +28,12 @@ def numbers(
     pixels: Integer[Array | np.ndarray, " N"], first_sample: Counts, spp: Counts, seed: Counts
 ) -> tuple[UInt[Array, " N"], ...]:
     """What to sample of each pixel, of what is one number or one of each."""
-    return tuple(jnp.broadcast_to(jnp.asarray(x, jnp.uint32), pixels.shape) for x in (first_sample, spp, seed))
+
+    def of_each(x):
+        module = jnp if isinstance(x, jax.Array) else np  # which compiles nothing
+        return module.broadcast_to(module.asarray(x, np.uint32), pixels.shape)
+
+    return tuple(map(of_each, (first_sample, spp, seed)))
 
 
 def camera_ray(
