@@ -134,7 +134,7 @@ class Envmap(Background):
         cos = jnp.where(2 * y > height - 2, -cos, cos)
         turn = (x.astype(u.dtype) + beside + jnp.asarray(0.5, u.dtype)) / width
         cos_phi, sin_phi = cos_sin_turns(turn - jnp.floor(turn))
-        return p.to_world @ jnp.stack([r * sin_phi, cos, -r * cos_phi])
+        return p.to_world @ compute_once(jnp.stack([r * sin_phi, cos, -r * cos_phi]))
 
     @staticmethod
     def emitted(p: Row, d: Float[Array, "3"]) -> Float[Array, "3"]:
@@ -236,14 +236,14 @@ def _patch(p: Row, d: Float[Array, "3"]) -> tuple[Int[Array, "2"], Float[Array, 
     """The patch of a direction: its row and column, how far below and beside its first texel the direction lies, and
     how far down in equal solid angles."""
     height, width = _size(p)
-    v = d @ p.to_world
+    v = compute_once(d @ p.to_world)
     squared = v[0] * v[0] + v[2] * v[2]
     # Nearer to a pole an azimuth is nothing but rounding; its derivative would overflow.
     x, z = jnp.where(squared > jnp.finfo(d.dtype).eps ** 2, jnp.stack([v[0], v[2]]), 0)
     polar = safe_atan2(safe_sqrt(x * x + z * z), v[1]) * ((height - 1) / math.pi)
     beside = turns(x, -z) * width - jnp.asarray(0.5, d.dtype)
     beside = jnp.where(beside < 0, beside + width, beside)
-    place = jnp.stack([polar, beside])
+    place = compute_once(jnp.stack([polar, beside]))
     first = jnp.clip(place.astype(jnp.int32), 0, jnp.array([height - 2, width - 1], jnp.int32))
     upper, lower = _ends(p, first[0])
     from_pole = squared / (1 + jnp.abs(v[1]))

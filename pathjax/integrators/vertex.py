@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from pathjax import bsdfs, media
 from pathjax.bsdfs import tree
+from pathjax.compile import compute_once
 from pathjax.core.math import frame_from_normal, shading_frame, to_local, to_world
 from pathjax.core.types import BSDFSample, Frame, Hit, Ray, Surface
 from pathjax.scene.scene import Scene
@@ -45,7 +46,7 @@ def vertex(scene: Scene, ray: Ray, hit: Hit, u: Float[Array, ""] | None = None, 
         u: chooses among bsdfs that hold others; None where there are none.
         differentiated: of `tree.leaf`.
     """
-    surface = geometry.surface(scene.geometry, ray, hit)
+    surface = compute_once(geometry.surface(scene.geometry, ray, hit))
     frame = shading_frame(surface)
     wi = to_local(frame, -ray.d)
     leaf = bsdfs.leaf(scene.materials, hit.shape, surface, frame, wi, u, differentiated)

@@ -28,7 +28,7 @@ class PerspectiveCamera(Camera):
     far: Float[Array, ""]
 
     def sample_ray(self, position: Float[Array, "2"], u_lens: Float[Array, "2"]) -> Ray:
-        xy = self.corner + position * self.extent
+        xy = compute_once(self.corner + position * self.extent)
         start, local = self.through_lens(jnp.stack([xy[0], xy[1], jnp.ones_like(xy[0])]), u_lens)
         right, up, forward = self.axes
 

@@ -228,7 +228,7 @@ class Table(Searched):
         u: uniform in [0, 1); u_part: chooses within a lamp of many primitives.
         """
         row, area = self.row_of_lamp(lamps, lamp, u_part), at(lamps.area, lamp)
-        p, n, margin = self.sample(row, u)
+        p, n, margin = compute_once(self.sample(row, u))
         # The far end of a shadow ray stays clear of what touches the lamp, as its near end does.
         p = p + n * jnp.copysign(margin, dot(n, ref - p))
         to_p = p - ref

@@ -106,8 +106,8 @@ class Spheres(Table):
         closest = f + b * d
         half_chord = safe_sqrt(radius * radius - dot(closest, closest))
         # t says which of the two roots was found.
-        outward = normalize(closest + jnp.copysign(half_chord, t - b) * d)
-        local = at(self.to_local, row) @ outward
+        outward = compute_once(normalize(closest + jnp.copysign(half_chord, t - b) * d))
+        local = compute_once(at(self.to_local, row) @ outward)
         theta = safe_atan2(safe_sqrt(local[0] * local[0] + local[1] * local[1]), local[2]) / math.pi
         uv = jnp.stack([turns(local[1], local[0]), theta])
         n = outward * at(self.sign, row)

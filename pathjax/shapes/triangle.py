@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from pathjax.compile import register_dataclass
+from pathjax.compile import compute_once, register_dataclass
 from pathjax.core.math import at, cross, dot, larger, normalize, rescale, safe_divide
 from pathjax.core.types import Surface
 from pathjax.core.warp import square_to_triangle
@@ -184,7 +184,7 @@ class Triangles(Table):
         """The point comes from barycentrics."""
         vertices = at(self.vertices, row)
         edge1, edge2 = vertices[1] - vertices[0], vertices[2] - vertices[0]
-        b0, b1, b2 = _barycentrics(vertices[0], edge1, edge2, o, d)
+        b0, b1, b2 = compute_once(_barycentrics(vertices[0], edge1, edge2, o, d))
         n = _normal(edge1, edge2)
 
         def interpolate(values):

@@ -119,7 +119,7 @@ def _corners(p, uv):
     size = p.size
     vu = jnp.stack([uv[1], uv[0]])
     # Texel centres lie at (i + 1/2) / size.
-    place = vu * size - jnp.where(p.nearest, 0, jnp.asarray(0.5, uv.dtype))
+    place = compute_once(vu * size - jnp.where(p.nearest, 0, jnp.asarray(0.5, uv.dtype)))
     low = jnp.floor(place)
     fraction = jnp.where(p.nearest, 0, place - low)
     # Twelve numbers are read at these places.
