@@ -13,6 +13,7 @@ from pathjax.scene import build
 from pathjax.sensors import Perspective
 from pathjax.sensors.film import HDRFilm
 from pathjax.shapes import Rectangle
+from pathjax.shapes.coincident import close_pairs
 
 SKY = '<emitter type="constant"><rgb name="radiance" value="1"/></emitter>'
 GREY = '<bsdf type="twosided"><bsdf type="diffuse"><rgb name="reflectance" value="0.5"/></bsdf></bsdf>'
@@ -225,3 +226,15 @@ def test_copies_get_a_margin_wherever_they_stand_among_thousands():
     apart = [rectangle(z, x) for z, x in zip(rng.permutation(3000), rng.uniform(-5, 5, 3000), strict=True)]
     (table,) = tables_of(*apart, apart[123])
     assert np.flatnonzero(np.asarray(table.margins)).tolist() == [123, 3000]
+
+
+@pytest.mark.parametrize("count, distance", [(0, 1), (1, 1), (2, 0), (300, 1e-9), (300, 0.2)])
+def test_close_pairs_are_those_of_all_pairs(count, distance):
+    """Of points on a lattice, some of them twice, some nearly so."""
+    generator = np.random.default_rng(1)
+    points = generator.integers(0, 4, (count, 3)) + generator.choice([0, 1e-10, 0.1], (count, 1))
+    between = np.linalg.norm(points[:, None] - points, axis=-1)
+    expected = {tuple(pair) for pair in np.argwhere(np.triu(between <= distance, 1))}
+    found = [tuple(sorted(pair)) for pair in close_pairs(points, distance).tolist()]
+    assert len(found) == len(set(found))
+    assert set(found) == expected
