@@ -280,9 +280,8 @@ def pixel_sweep(
         there = [replace(slot, places=tuple(first + place for place in slot.places)) for slot in record.slots]
         record = record._replace(begins=begins, slots=there)
         memory = together(partial(remember, structure))(memory, columns_of(record))
-        gain = weight * (on.L.emission + on.L.light)
+        gain = weight * now.throughput * record.gathered
         if slots.of_passed:
-            gain = jnp.where(itself, gain, 0)
             passed, on = jnp.where(itself, 0, passed + 1), jax.tree.map(partial(jnp.where, itself), on, now)
         sums = pixel.add_compensated(sums, compute_once(gain))
         return number + jnp.where(on.alive, 0, 1).astype(number.dtype), passed, on, weight, sums, memory

@@ -75,10 +75,10 @@ class Slots:
     def of_lights(self) -> int:
         return max([len(self.backgrounds), *map(len, self.lights)])
 
-    def numbered(self, start: int) -> list[range]:
+    def numbered(self) -> list[range]:
         """Slots of bsdfs, of lights, of choices among bsdfs and of what is passed, counted through all of these."""
         counts = self.of_bsdfs, self.of_lights, self.of_choices, self.of_passed
-        return [range(*each) for each in pairwise(accumulate(counts, initial=start))]
+        return [range(*each) for each in pairwise(accumulate(counts, initial=0))]
 
 
 # ---- what is differentiated -----------------------------------------------------------------------------------------
@@ -181,11 +181,11 @@ def prepared(scene: Scene, slots: Slots, number: Int[Array, ""]) -> Scene:
 
 
 def nudged(scene: Scene, slots: Slots, nudges: Float[Array, " slots"]) -> Scene:
-    """The scene where each slot's number is larger by its nudge, in all channels; behind the first, of `numbered`.
+    """The scene where each slot's number is larger by its nudge, in all channels.
 
     Those of choices are left as they are: see `by_choices`.
     """
-    of_bsdfs, of_lights, _, of_passed = slots.numbered(start=1)
+    of_bsdfs, of_lights, _, of_passed = slots.numbered()
 
     def of(table, columns, nudges):
         return table.nudged({column: nudges[s] for s, column in enumerate(columns) if column is not None})

@@ -77,36 +77,37 @@ def extend(
     hit, here, u = path.meet(scene, now, u, options)
     if slots.of_passed:
         now = now._replace(L=now.L._replace(nudged=none_passed(scene)))
-    of_bsdfs, of_lights, of_choices, of_passed = slots.numbered(start=1)
+    of_bsdfs, of_lights, of_choices, of_passed = slots.numbered()
 
     def varied(changes):
         changed = places.nudged(scene, slots, changes)
-        of, there = now._replace(throughput=now.throughput + changes[0]), here
+        there = here
         if of_choices:
             change = jnp.dot(changes[of_choices.start : of_choices.stop], places.by_choices(slots, here))
             there = here._replace(weight=here.weight + change)
-        on = path.onward(changed, choice, of, hit, there, u, options)
-        return (on.L.emission, on.L.light, on.throughput), on
+        on = path.onward(changed, choice, now, hit, there, u, options)
+        return (on.L.emission, on.L.light, on.L.weight), on
 
     count = of_passed.stop
-    zeros = jnp.zeros((count,), scale.dtype)
-    push = partial(jax.jvp, varied, (zeros,), has_aux=True)
-    _, (Le, n, w), on = jax.vmap(lambda change: push((change,)), out_axes=(None, 0, None))(jnp.eye(count))
-    w = jnp.where(on.alive, w, 0)
+    push = partial(jax.jvp, varied, (jnp.zeros((count,), scale.dtype),), has_aux=True)
+    (Le, n, w), changes, on = jax.vmap(lambda change: push((change,)), out_axes=(None, 0, None))(jnp.eye(count))
+    scale = scale * now.throughput
+    dLe, dn, dw = changes
+    w, dw = jnp.where(on.alive, w, 0), jnp.where(on.alive, dw, 0)
     found = []
     for s, k in enumerate(of_bsdfs if here is not None else ()):
         entries = places.of_bsdf(scene, paths, slots, s, here)
-        found.append(Slot(*entries, scale * n[k], scale * w[k], s >= slots.colors))
+        found.append(Slot(*entries, scale * dn[k], scale * dw[k], s >= slots.colors))
     for s, k in enumerate(of_lights):
         entries = places.of_hit(scene, paths, slots, s, now.ray, hit, here)
-        found.append(Slot(*entries, scale * Le[k], None))
+        found.append(Slot(*entries, scale * dLe[k], None))
         if choice is not None and here is not None:
             entries = places.of_light_sample(scene, choice, paths, slots, s, here, u)
-            found.append(Slot(*entries, scale * n[k], None))
+            found.append(Slot(*entries, scale * dn[k], None))
     for s, k in enumerate(of_choices):
         entries = places.of_choice(scene, paths, slots, s, here)
-        found.append(Slot(*entries, scale * n[k], scale * w[k], is_number=True))
-    record = Record(jnp.bool_(False), ~on.alive, Le[0] + n[0], w[0], found)
+        found.append(Slot(*entries, scale * dn[k], scale * dw[k], is_number=True))
+    record = Record(jnp.bool_(False), ~on.alive, Le + n, w, found)
     if not of_passed:
         return on, record, jnp.bool_(True)
 
@@ -116,6 +117,6 @@ def extend(
     found = [jax.tree.map(lambda x: jnp.where(itself, x, 0).astype(x.dtype), slot) for slot in found]
     for s, k in enumerate(of_passed):
         entries = places.of_passed(scene, paths, slots, s, passed)
-        found.append(Slot(*entries, jnp.where(itself, 0, scale * n[k]), None, is_number=True))
+        found.append(Slot(*entries, jnp.where(itself, 0, scale * dn[k]), None, is_number=True))
     gathered, weight = jnp.where(itself, record.gathered, 0), jnp.where(itself, record.weight, 1)
     return on, Record(record.begins, record.ends & itself, gathered, weight, found), itself

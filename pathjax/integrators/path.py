@@ -14,6 +14,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
@@ -36,10 +37,11 @@ from pathjax.shapes import geometry
 
 
 class Gain(NamedTuple):
-    """Radiance that a path gathers at one vertex, by the term of L = Le + T Le + T^2 Le + ... that it belongs to."""
+    """What one vertex does, by the terms of L = Le + T Le + T^2 Le + ...; all over the throughput before it."""
 
     emission: Float[Array, "3"]  # of the term T^depth Le, depth being that of the path before the vertex
     light: Float[Array, "3"]  # of the next one: the light sample
+    weight: Float[Array, "3"]  # what the throughput is multiplied by
     passed: Int[Array, ""] | None = None  # and of so many further ones; None: nothing lets light pass
     nudged: Passed | None = None  # on the way of the light sample; None: nothing asks for it
 
@@ -77,7 +79,7 @@ def start(scene: Scene, ray: Ray, options: Options) -> Path:
     splits = options.split_depth and bsdfs.occurs(scene.materials, "branches")
     path = Path(
         ray,
-        Gain(zero3, zero3, jnp.int32(0) if passes else None) if options.by_vertex else zero3,
+        Gain(zero3, zero3, one + zero3, jnp.int32(0) if passes else None) if options.by_vertex else zero3,
         zero3 + (scene.max_depth > 0),
         one * jnp.inf,
         jnp.int32(0),
@@ -137,10 +139,12 @@ def onward(
 ) -> Path:
     """`extend` of a path whose ray is known to meet `here`."""
     ray, first = path.ray, path.depth == 0
+    if options.by_vertex:
+        path = path._replace(L=path.L._replace(weight=jnp.ones_like(ray.o)))
     if scene.media is not None:
         flown, scattered = smaller(hit.t, ray.t_max), here.scattered if scene.scatters else None
         weight = media.flight_weight(scene.media, path.medium, ray, path.throughput, flown, scattered)
-        path = path._replace(throughput=path.throughput * weight)
+        path = _scaled(path, lambda carried: carried * weight)
     light = sky = None
     if here is not None and next_event.draws_background(scene, choice, options):
         light, sky = next_event.draw_or_meet(scene, choice, here, _met(scene, hit, here), u, ray.d)
@@ -197,7 +201,7 @@ def emission(
         if scene.hide_emitters:
             # Lights are black to camera rays, the background among them.
             share = jnp.where(path.depth == 0, 0, share)
-        return path.throughput * Le * share
+        return _carried(path) * Le * share
 
     # Most surfaces are dark.
     bright = True if here is None else ~found | geometry.emits(shapes, hit)
@@ -221,29 +225,26 @@ def scatter(
     light: of `next_event.draw_or_meet`, where that is known.
     """
     if here.weight is not None:
-        path = path._replace(throughput=path.throughput * here.weight)
-    L = path.L
+        path = _scaled(path, lambda carried: carried * here.weight)
     if next_event.occurs(scene, choice, options):
         medium, depth = path.medium, path.depth
         direct, *passed = next_event.light_sample(scene, choice, here, u, goes_on, depth, options, medium, light)
-        L = _with_light(L, path.throughput * direct, *passed)
+        path = path._replace(L=_with_light(path.L, _carried(path) * direct, *passed))
     drawn, d = compute_once(sample(scene, here, u.bsdf))
     if path.pending is not None:
         splits = splitting.takes_place(scene, here, path)
         drawn = drawn._replace(weight=jnp.where(splits, drawn.pdf, 1) * drawn.weight)
-    throughput = path.throughput * drawn.weight
+    behind = _scaled(path, lambda carried: carried * drawn.weight)
     passive = None if path.passive is None else lax.stop_gradient(path.passive * drawn.passive)
     if options.controlled:
         survival = jnp.ones_like(drawn.pdf)
     else:
-        survival = roulette.survival(scene, path.depth, throughput, passive)
+        survival = roulette.survival(scene, path.depth, behind.throughput, passive)
     # A direction of density 0 (in the surface, by rounding; a branch of glass that cannot be) carries nothing.
     scatters = (here.kind >= 0) | here.scattered if scene.scatters else here.kind >= 0
-    carries = scatters & (drawn.pdf > 0) & (options.derivative | (roulette.largest(throughput) > 0))
-    on = path._replace(
+    carries = scatters & (drawn.pdf > 0) & (options.derivative | (roulette.largest(behind.throughput) > 0))
+    on = _scaled(behind, lambda carried: carried / survival)._replace(
         ray=spawn_ray(here.surface, d, here.hit.primitive),
-        L=L,
-        throughput=throughput / survival,
         pdf=jnp.where(drawn.delta, jnp.inf, drawn.pdf),
         alive=carries & (u.roulette < survival),
         passive=passive,
@@ -265,6 +266,17 @@ def _met(scene, hit, here):
 
 def _ended(path: Path) -> Path:
     return path._replace(alive=jnp.bool_(False))
+
+
+def _scaled(path: Path, scale: Callable) -> Path:
+    """The path whose throughput is scaled, and with it what its vertex does to that."""
+    L = path.L._replace(weight=scale(path.L.weight)) if isinstance(path.L, Gain) else path.L
+    return path._replace(L=L, throughput=scale(path.throughput))
+
+
+def _carried(path: Path) -> Float[Array, "3"]:
+    """What light is multiplied by that the path meets."""
+    return path.L.weight if isinstance(path.L, Gain) else path.throughput
 
 
 def _with_emission(L, emitted):

@@ -68,7 +68,7 @@ def mean(work: Work, scene: Scene, choice: Choice | None, control=None, *, optio
     choice, control: of `path.extend`.
     """
 
-    def add(sums, depth, now, weight):
+    def add(sums, _, now, weight):
         value = compute_once(weight * now.L)
         return lax.cond(now.alive, lambda: sums, lambda: add_compensated(sums, value))
 
@@ -82,7 +82,7 @@ def over_vertices(work: Work, scene: Scene, choice: Choice | None, add: Callable
     """Sums over all vertices of a pixel's samples: one loop, so that no lane waits for the longest path of another.
 
     Args:
-        add: (sums, depth of the path before the vertex, Path after it, weight of the sample) -> sums.
+        add: (sums, Path before the vertex, Path after it, weight of the sample) -> sums.
         choice, control: of `path.extend`.
     """
     pixel, first_sample, spp, seed = work
@@ -90,11 +90,10 @@ def over_vertices(work: Work, scene: Scene, choice: Choice | None, add: Callable
 
     def step(state):
         number, now, weight, sums = state
-        now, weight = begun(scene, pixel, stream, number, now, weight, options)
-        depth = now.depth
-        u = bounce_numbers(scene, stream, number, path.vertices(now), options.sampler)
-        now = path.extend(scene, choice, now, u, options, control)
-        sums = add(sums, depth, now, weight)
+        before, weight = begun(scene, pixel, stream, number, now, weight, options)
+        u = bounce_numbers(scene, stream, number, path.vertices(before), options.sampler)
+        now = path.extend(scene, choice, before, u, options, control)
+        sums = add(sums, before, now, weight)
         return number + jnp.where(now.alive, 0, 1).astype(number.dtype), now, weight, sums
 
     state = first_sample, *no_path(scene, options), sums

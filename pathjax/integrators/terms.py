@@ -19,8 +19,9 @@ def sums(work: Work, scene: Scene, choice: Choice | None, depth: int, options: O
     """
     rows = jnp.arange(depth)[:, None]
 
-    def add(sums, k, now, weight):
-        emission, light = compute_once((weight * now.L.emission, weight * now.L.light))
+    def add(sums, before, now, weight):
+        k, scale = before.depth, weight * before.throughput
+        emission, light = compute_once((scale * now.L.emission, scale * now.L.light))
         beyond = k + 1 if now.L.passed is None else k + 1 + now.L.passed
         return sums + jnp.where(rows == k, emission, jnp.where(rows == beyond, light, 0))
 
