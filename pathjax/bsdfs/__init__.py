@@ -41,7 +41,7 @@ from pathjax.core.math import at
 from pathjax.core.types import BSDFSample, Frame, Surface
 from pathjax.kinds import Column, Instance, Parameters, Row, Table, ordered
 from pathjax.kinds import register as register_kind
-from pathjax.textures import Textures
+from pathjax.textures import Pairs, Textures
 
 __all__ = [
     "KINDS",
@@ -108,6 +108,8 @@ class Materials:
     wrappers: tuple[Table, ...] = ()
     levels: tuple[tuple[int, ...], ...] = field(default=(), metadata={"static": True})
     passing: tuple[tuple[int, ...], ...] = field(default=(), metadata={"static": True})
+    # Of derivatives: where the numbers of textures that are differentiated begin in their list, of `Textures.entries`.
+    listed: tuple[tuple[tuple[int, int | str], int], ...] = field(default=(), metadata={"static": True})
     # By wrapper, places of the columns in whose numbers `leaf` tells the derivative of its weight; empty: in none.
     recorded: tuple[tuple[int | None, ...], ...] = field(default=(), metadata={"static": True})
     # For derivatives: which of the surfaces that a shadow ray passes has its `passing` nudged, and by what.
@@ -237,10 +239,13 @@ def is_tree(materials: Materials, shape: Index, front: Bool[Array, ""]) -> Bool[
     return select(materials, shape, front)[0] >= len(materials.tables)
 
 
-def colors(materials: Materials, kind: Index, row: Index, surface: Surface) -> Colors | None:
+def colors(
+    materials: Materials, kind: Index, row: Index, surface: Surface
+) -> tuple[Colors | None, tuple[Pairs, ...] | None]:
     """Colours of the textures that a bsdf has at a point, as `Row` takes them; None where no bsdf has any.
 
-    A path asks for them several times, and of all kinds together there are seldom more than one or two.
+    A path asks for them several times, and of all kinds together there are seldom more than one or two. With them, of
+    each one, the `Textures.entries`; None where no texture is differentiated.
     """
     textured = [table.textured for table in materials.tables]
 
@@ -250,10 +255,13 @@ def colors(materials: Materials, kind: Index, row: Index, surface: Surface) -> C
 
     most = max(map(len, textured), default=0)
     if not most:
-        return None
+        return None, None
     calls = [partial(codes, *each) for each in zip(materials.tables, textured, strict=True)]
     found = calls[0]() if len(calls) == 1 else lax.switch(jnp.maximum(kind, 0), calls)
-    return tuple(materials.textures.look_up(code, surface) for code in found)
+    if not materials.listed:
+        return tuple(materials.textures.look_up(code, surface) for code in found), None
+    pairs = [materials.textures.with_entries(code, surface, dict(materials.listed)) for code in found]
+    return tuple(zip(*pairs, strict=True))
 
 
 def evaluate(

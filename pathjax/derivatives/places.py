@@ -32,14 +32,12 @@ from pathjax.kinds import Declared
 from pathjax.scene import parameters as named
 from pathjax.scene.scene import Scene
 from pathjax.shapes import geometry
-from pathjax.textures import alike
+from pathjax.textures import Pairs, alike
 
 # Of the arrays that are differentiated, where they are in the scene.
 Paths = tuple[tuple, ...]
 # Of one number: places in the list, and their shares where there are several.
 Entries = tuple[tuple[Int[Array, ""], ...], tuple[Float[Array, "..."], ...] | None]
-# The same, one after another; shares are numbers, or colours.
-Pairs = tuple[tuple[Int[Array, ""], Float[Array, "..."]], ...]
 # By slot, the column that is looked up; None: none.
 Columns = tuple[int | None, ...]
 
@@ -171,9 +169,11 @@ def slots(scene: Scene, paths: Paths) -> Slots:
     return Slots(bsdfs, lights, tuple(backgrounds), colors, wrappers, choices, on_the_way, corners)
 
 
-def prepared(scene: Scene, slots: Slots, number: Int[Array, ""]) -> Scene:
+def prepared(scene: Scene, paths: Paths, slots: Slots, number: Int[Array, ""]) -> Scene:
     """The scene that tells of its vertices what derivatives take. number: of a surface that a shadow ray passes."""
-    materials = replace(scene.materials, recorded=slots.wrappers)
+    first, _ = firsts(scene, paths)
+    listed = tuple((key, first[path]) for key, path in _in_textures(scene, paths, TEXTURES).items())
+    materials = replace(scene.materials, recorded=slots.wrappers, listed=listed)
     if slots.on_the_way:
         none = jnp.zeros((slots.on_the_way, len(slots.wrappers[0])), scene.camera.origin.dtype)
         materials = replace(materials, nudged=(number, none))
@@ -241,7 +241,7 @@ def of_bsdf(scene: Scene, paths: Paths, slots: Slots, slot: int, here: Vertex) -
     """Of the number that the bsdf of a vertex looks up for a slot; of any, where it looks up none."""
     first, _ = firsts(scene, paths)
     found = [
-        partial(_of_row, scene, first, (*BSDFS, number), columns[slot], here.row, TEXTURES, here.surface)
+        partial(_of_row, scene, first, (*BSDFS, number), columns[slot], here.row, TEXTURES, here.surface, here.entries)
         for number, columns in enumerate(slots.bsdfs)
     ]
     calls = alike(found, here.wi.dtype)
@@ -362,17 +362,26 @@ def _of_background(scene: Scene, first: dict, slots: Slots, slot: int, d) -> Pai
     return tuple((begins + entry, share) for each, entry, share in parts if each == name)
 
 
-def _of_row(scene: Scene, first: dict, path: tuple, column: int | None, row, of_textures, surface) -> Pairs:
-    """Of a column of the table at a path, and of the textures at another one, which are looked up on a surface."""
+def _of_row(scene: Scene, first: dict, path: tuple, column: int | None, row, of_textures, surface, known=None) -> Pairs:
+    """Of a column of the table at a path, and of the textures at another one, which are looked up on a surface.
+
+    known: what was found of the textures already, for each of `Table.textured`.
+    """
     if column is None:
         return ()
-    values, codes = (getattr(named.get(scene, path).columns[column], each) for each in ("values", "texture"))
+    table = named.get(scene, path)
+    values, codes = (getattr(table.columns[column], each) for each in ("values", "texture"))
     begins = first.get((*path, "columns", column, "values"))
     constant = () if begins is None else ((jnp.int32(begins + row), jnp.ones((), values.dtype)),)
     if codes is None or not (wanted := _in_textures(scene, first, of_textures)):
         return constant
     code, wanted = at(codes, row), {key: first[each] for key, each in wanted.items()}
-    textured = partial(named.get(scene, of_textures).entries, code, surface, wanted)
+
+    def textured():
+        if known is not None:
+            return known[table.textured.index(column)]
+        return named.get(scene, of_textures).entries(code, surface, wanted)
+
     return lax.cond(code[0] >= 0, *alike([textured, lambda: constant], values.dtype))
 
 

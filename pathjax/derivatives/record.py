@@ -73,7 +73,7 @@ def extend(
         scale: what derivatives are multiplied by, beside the throughput.
         number: of the Record among those of the vertex.
     """
-    scene = places.prepared(scene, slots, number)
+    scene = places.prepared(scene, paths, slots, number)
     hit, here, u = path.meet(scene, now, u, options)
     if slots.of_passed:
         now = now._replace(L=now.L._replace(nudged=none_passed(scene)))

@@ -15,6 +15,7 @@ from pathjax.core.math import frame_from_normal, shading_frame, to_local, to_wor
 from pathjax.core.types import BSDFSample, Frame, Hit, Ray, Surface
 from pathjax.scene.scene import Scene
 from pathjax.shapes import geometry
+from pathjax.textures import Pairs
 
 
 class Vertex(NamedTuple):
@@ -29,6 +30,7 @@ class Vertex(NamedTuple):
     turns: tuple[tree.Turn, ...] = ()
     chosen: tuple[tree.Chosen, ...] = ()
     colors: bsdfs.Colors | None = None  # of the textures of the bsdf; None: there are none
+    entries: tuple[Pairs, ...] | None = None  # of these textures; None: none is differentiated
     medium: Int[Array, ""] | None = None  # that scatters here, or media.NONE: a surface does. None: no medium scatters
 
     @property
@@ -54,8 +56,8 @@ def vertex(scene: Scene, ray: Ray, hit: Hit, u: Float[Array, ""] | None = None, 
     side = jnp.where(bsdfs.has(scene.materials, kind, "sided") | (wi[2] > 0), 1, -1).astype(wi.dtype)
     frame, wi = frame._replace(n=frame.n * side), jnp.stack([wi[0], wi[1], wi[2] * side])
     turns = tuple(turn._replace(n=turn.n * side) for turn in turns)
-    colors = bsdfs.colors(scene.materials, kind, row, surface)
-    return Vertex(hit, surface, frame, wi, kind, row, weight, turns, chosen, colors)
+    colors, entries = bsdfs.colors(scene.materials, kind, row, surface)
+    return Vertex(hit, surface, frame, wi, kind, row, weight, turns, chosen, colors, entries)
 
 
 def within(here: Vertex, ray: Ray, medium: Int[Array, ""], distance: Float[Array, ""]) -> Vertex:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -30,6 +31,7 @@ __all__ = [
     "Bitmap",
     "Checkerboard",
     "MeshAttribute",
+    "Pairs",
     "Texture",
     "Textures",
     "Uniform",
@@ -52,6 +54,10 @@ def register(name: str):
     return register_kind(KINDS, Texture, name, "textures")
 
 
+# Places in a list of derivatives and their shares in a number, or in each channel of a colour.
+Pairs = tuple[tuple[Int[Array, ""], Float[Array, "..."]], ...]
+
+
 @register_dataclass
 @dataclass(frozen=True)
 class Textures:
@@ -71,29 +77,44 @@ class Textures:
 
     def entries(
         self, code: Int[Array, "2"], surface: Surface, first: Mapping[tuple[int, int | str], int]
-    ) -> tuple[tuple[Int[Array, ""], Float[Array, "..."]], ...]:
+    ) -> Pairs:
         """Where the numbers that a colour is the sum of stand in a list of derivatives, and their shares.
 
         first: by table and column, or the name of what meshes carry, where its entries begin. Of what is not there the
             share is 0.
         """
 
+        return self._found(code, surface, first, lambda kind, *where: (None, kind.entries(*where)))[1]
+
+    def with_entries(
+        self, code: Int[Array, "2"], surface: Surface, first: Mapping[tuple[int, int | str], int]
+    ) -> tuple[Float[Array, "3"], Pairs]:
+        """`look_up` and `entries`."""
+        return self._found(code, surface, first, lambda kind, *where: kind.with_entries(*where))
+
+    def _found(self, code, surface, first, find):
         def of(number, table):
-            def entries():
+            def found():
                 row = jnp.maximum(code[1], 0)
                 p, known = Row(table, row), {table.kind.place(name): name for name in table.kind.declared}
                 wanted = {known.get(column, column): at for (each, column), at in first.items() if each == number}
-                parts = table.kind.entries(p, _uv(p, surface), surface) if wanted else ()
-                return tuple(
+                color, parts = find(table.kind, p, _uv(p, surface), surface)
+                return color, tuple(
                     (wanted[name] + (row if entry is None else entry), share)
                     for name, entry, share in parts
                     if name in wanted
                 )
 
-            return entries
+            return found
 
         calls = [of(*each) for each in enumerate(self.tables)]
-        return self._switch(code, alike(calls, surface.uv.dtype))
+        filled = _filling([lambda call=call: call()[1] for call in calls], surface.uv.dtype)
+
+        def made_alike(call):
+            color, pairs = call()
+            return color, filled(pairs)
+
+        return self._switch(code, [partial(made_alike, call) for call in calls])
 
     def _switch(self, code, calls):
         """What the call of the texture's kind gives."""
@@ -102,18 +123,21 @@ class Textures:
 
 def alike(calls: Sequence[Callable], dtype) -> list[Callable]:
     """Calls that give places and shares; now all give as many, of which those that they lack have the share 0."""
+    filled = _filling(calls, dtype)
+    return [lambda call=call: filled(call()) for call in calls]
+
+
+def _filling(calls: Sequence[Callable], dtype) -> Callable:
+    """What makes of the Pairs of each of these calls as many as the most."""
     found = [jax.eval_shape(lambda call=call: tuple(call())) for call in calls]
     most = max(1, *map(len, found))
     shape = np.broadcast_shapes(*(share.shape for pairs in found for _, share in pairs))
 
-    def padded(call):
-        def pairs():
-            known = tuple((place, jnp.broadcast_to(share, shape)) for place, share in call())
-            return known + ((jnp.int32(0), jnp.zeros(shape, dtype)),) * (most - len(known))
+    def filled(pairs):
+        known = tuple((place, jnp.broadcast_to(share, shape)) for place, share in pairs)
+        return known + ((jnp.int32(0), jnp.zeros(shape, dtype)),) * (most - len(known))
 
-        return pairs
-
-    return [padded(call) for call in calls]
+    return filled
 
 
 def _uv(p: Row, surface: Surface) -> Float[Array, "2"]:

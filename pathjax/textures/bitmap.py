@@ -69,20 +69,16 @@ class Bitmap(Texture):
 
     @staticmethod
     def look_up(p: Row, uv: Float[Array, "2"], surface: Surface) -> Float[Array, "3"]:
-        index, fraction = _corners(p, uv)
-
-        def texel(i, j):
-            return at(p.texels, index(i, j))
-
-        top = texel(0, 0) * (1 - fraction[1]) + texel(0, 1) * fraction[1]
-        bottom = texel(1, 0) * (1 - fraction[1]) + texel(1, 1) * fraction[1]
-        return top * (1 - fraction[0]) + bottom * fraction[0]
+        return _between(p, *_corners(p, uv))
 
     @staticmethod
     def entries(p: Row, uv: Float[Array, "2"], surface: Surface) -> list[tuple[str, Int[Array, ""] | None, Array]]:
-        index, fraction = _corners(p, uv)
-        shares = [[1 - part, part] for part in fraction]
-        return [("texels", index(i, j), shares[0][i] * shares[1][j]) for i in (0, 1) for j in (0, 1)]
+        return _entries(*_corners(p, uv))
+
+    @classmethod
+    def with_entries(cls, p, uv, surface):
+        corners = _corners(p, uv)
+        return _between(p, *corners), _entries(*corners)
 
     @classmethod
     def span(cls, texture: Instance) -> tuple[float, float]:
@@ -130,6 +126,20 @@ def _corners(p, uv):
         return p.first + corners[i][0] * size[1] + corners[j][1]
 
     return index, fraction
+
+
+def _between(p, index, fraction):
+    def texel(i, j):
+        return at(p.texels, index(i, j))
+
+    top = texel(0, 0) * (1 - fraction[1]) + texel(0, 1) * fraction[1]
+    bottom = texel(1, 0) * (1 - fraction[1]) + texel(1, 1) * fraction[1]
+    return top * (1 - fraction[0]) + bottom * fraction[0]
+
+
+def _entries(index, fraction):
+    shares = [[1 - part, part] for part in fraction]
+    return [("texels", index(i, j), shares[0][i] * shares[1][j]) for i in (0, 1) for j in (0, 1)]
 
 
 def _wrapped(low, size, wrap):
