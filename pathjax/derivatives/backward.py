@@ -62,7 +62,8 @@ def columns_of(record: Record) -> list:
 
 
 class Memory(NamedTuple):
-    total: list[Float[Array, " W"]] | Float[Array, "M 3"]  # of few entries, a column for each; or the list
+    # Of few entries, a column for each number of theirs; or the list, of which whole vectors are added up.
+    total: list[Float[Array, " W"]] | Float[Array, " 3M"]
     clock: Int[Array, ""]  # trips
     swept: Int[Array, ""]  # trips before the last sweep
     lost: Int[Array, ""]  # 1: a path was longer than the ring
@@ -78,7 +79,7 @@ class Sweep(NamedTuple):
     complete: Int[Array, " W"]  # 1: has met the end of a path, so that it knows what arrives
     stopped: Int[Array, " W"]  # 1: all that is older has been swept before
     R: list[Float[Array, " W"]]
-    total: list[Float[Array, " W"]] | Float[Array, "M 3"]
+    total: list[Float[Array, " W"]] | Float[Array, " 3M"]
 
 
 def start(scene: Scene, record: Record, entries: int, ring: int, lanes: int) -> Memory:
@@ -97,7 +98,7 @@ def start(scene: Scene, record: Record, entries: int, ring: int, lanes: int) -> 
         )
     dtype = scene.camera.origin.dtype
     few = entries <= FEW
-    total = [jnp.zeros((lanes,), dtype)] * (3 * entries) if few else jnp.zeros((entries, 3), dtype)
+    total = [jnp.zeros((lanes,), dtype)] * (3 * entries) if few else jnp.zeros((3 * entries,), dtype)
     # No trip is read that was not written. On CPUs it is filled with zeros all the same, so it had better be short.
     buffers = [lax.empty((ring, lanes), x.dtype) for x in jax.eval_shape(columns_of, record)]
     zero = jnp.int32(0)
@@ -217,21 +218,28 @@ def add(total, slot: Slot, change: list[Float[Array, " W"]]):
         for place, share in of_lane(list(zip(places, slot.shares or [None], strict=True))):
             # Number by number: a loop over three would not be unrolled.
             for channel, number in enumerate(_part(x, share)):
-                where = place, jnp.int32(channel)
-                new = lax.dynamic_slice(total, where, (1, 1), allow_negative_indices=False) + number
+                where = (_number(place, channel),)
+                new = lax.dynamic_slice(total, where, (1,), allow_negative_indices=False) + number
                 total = lax.dynamic_update_slice(total, new, where, allow_negative_indices=False)
         return total
 
     return lax.fori_loop(first, len(change[0]), one, total)
 
 
-def _read_ahead(total: Float[Array, "M 3"], places: Sequence[Int[Array, " W"]]) -> Int[Array, ""]:
+def _number(place, channel):
+    """Where it stands in the list."""
+    return 3 * place.astype(jnp.uint32) + jnp.uint32(channel)
+
+
+def _read_ahead(total: Float[Array, " 3M"], places: Sequence[Int[Array, " W"]]) -> Int[Array, ""]:
     """0, when all places have been read, and so are in a near cache.
 
     Processors read far memory many places at a time, but add to few: each add holds the ones behind it up. The result
     depends on what was read, so that no compiler leaves the reading out.
     """
-    read = sum(total.at[place, 0].get(mode="promise_in_bounds") * 0 for place in places)
+    # Texels are neighbours in pairs: the ends of a pair lie on all lines of the cache that it does.
+    ends = [_number(place, 2 * (k % 2)) for k, place in enumerate(places)]
+    read = sum(total.at[end].get(mode="promise_in_bounds") * 0 for end in ends)
     return jnp.where(jnp.sum(read) > 0, 1, 0)
 
 
@@ -292,11 +300,11 @@ def pixel_sweep(
     return share * total, memory
 
 
-def finish(structure: Record, memory: Memory) -> Float[Array, "M 3"]:
+def finish(structure: Record, memory: Memory) -> Float[Array, " 3M"]:
     memory = sweep(structure, memory, jnp.bool_(True))
     total = memory.total
     if isinstance(total, list):
-        total = jnp.stack([jnp.sum(x) for x in total]).reshape(-1, 3)
+        total = jnp.stack([jnp.sum(x) for x in total])
     return jnp.where(memory.lost != 0, jnp.nan, total)
 
 
@@ -352,8 +360,8 @@ def pullback(
     total = native_fold(of_pixel, work, scene, choice, start=begin, finish=end, form=form, devices=devices)
 
     def of_array(path):
-        rows = total[first[path] : first[path] + places.count(scene, path)]
-        rows = rows if places.of_colors(scene, path) else rows.sum(1)
+        rows = total[3 * first[path] : 3 * (first[path] + places.count(scene, path))]
+        rows = rows if places.of_colors(scene, path) else rows.reshape(-1, 3).sum(1)
         return rows.reshape(named.get(scene, path).shape)
 
     return [of_array(path) for path in paths]

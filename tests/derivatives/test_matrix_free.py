@@ -205,8 +205,8 @@ def test_lanes_add_to_a_list_that_is_far_as_to_one_that_is_near(monkeypatch, nea
     for place, share in zip(places, shares, strict=True):
         np.add.at(expected, place, (share * change).T)
     slot = record.Slot(tuple(jnp.asarray(places)), tuple(jnp.asarray(shares)), None, None)
-    found = jax.jit(lambda *args: backward.add(*args))(jnp.asarray(total), slot, list(jnp.asarray(change)))
-    np.testing.assert_allclose(found, expected, rtol=1e-5)  # sums in another order
+    found = jax.jit(lambda *args: backward.add(*args))(jnp.asarray(total.ravel()), slot, list(jnp.asarray(change)))
+    np.testing.assert_allclose(found, expected.ravel(), rtol=1e-5)  # sums in another order
 
 
 @pytest.mark.slow
