@@ -195,9 +195,21 @@ def _by_parts(part: Callable, xs, shared, devices: int | None, most: int = MOST_
         # Parts that are not kept till all are done need far less memory.
         parted = jax.tree.map(lambda x: deal(x)[0], xs)
         return lax.scan(lambda total, xs: (added(total, part(xs, width, shared)), None), total, parted)[0]
-    results = _dealt(on_one_device, used, jax.tree.map(deal, xs), shared)
-    results = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:parts], results)
-    return results if total is None else jax.tree.map(lambda first, x: reduce(jnp.add, list(x), first), total, results)
+    xs = jax.tree.map(deal, xs)
+    if total is None:
+        results = _dealt(on_one_device, used, xs, shared)
+        return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:parts], results)
+
+    def share_of_sum(x):
+        """Of (rounds, ...) here and on the others the sums of a share of the numbers: each device adds up its own."""
+        x = x.reshape(rounds, -1)
+        share = -(-x.shape[1] // len(used))
+        x = jnp.pad(x, [(0, 0), (0, share * len(used) - x.shape[1])]).reshape(rounds, len(used), share)
+        x = lax.all_to_all(x.swapaxes(0, 1), "device", 0, 0).reshape(-1, share)[:parts]
+        return reduce(jnp.add, list(x), jnp.zeros_like(x[0]))
+
+    sums = _dealt(lambda *args: jax.tree.map(share_of_sum, on_one_device(*args)), used, xs, shared)
+    return jax.tree.map(lambda zero, x: x.reshape(-1)[: zero.size].reshape(zero.shape), total, sums)
 
 
 def cuts(count: int, form: str | None = None) -> int:
