@@ -58,9 +58,6 @@ class Dense(Search):
         damping = self.damping * np.einsum("cqq->qc", found.matrix).ravel()
         self.values = np.clip(self.values + self.solve(-gradient, damping), self.low, self.high)
 
-    def step_again(self) -> None:
-        """Do nothing: the step was exact."""
-
     def sums(self, scatter: bool = False) -> Equations:
         """Sum up the normal equations over the kept pixels, with as many samples of J as the image had."""
         products, count = self.products, len(self.values) // 3
@@ -93,9 +90,9 @@ class Dense(Search):
             solution[here, c] = linalg.solve(A, right[here, c], assume_a="pos")
         return solution.ravel()
 
-    def determined(self) -> float:
+    def determined(self) -> np.ndarray:
         parts = [linalg.solve(m + self.prior_matrix, m, assume_a="pos") for m in self.equations.matrix]
-        return float(np.trace(sum(parts)))
+        return np.stack([np.diag(part) for part in parts], -1).ravel()
 
     def draw(self) -> np.ndarray:
         e = self.random.normal(size=(len(self.values) // 3, 3))

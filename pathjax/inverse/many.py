@@ -32,8 +32,9 @@ from pathjax.system.interrupts import Interrupts
 
 # The samples of each level, as parts of those of the last.
 LEVELS = 16, 4, 1
-# Samples of the products of J: one with J' W J costs as much as two or three images of so many.
-PRODUCT_SPP = 8
+# Samples of the products of J: at least, and at most as a part of those of the image. Noise of J adds to J' W J what no
+# pixel knows, as if texels were known apart that share a pixel: it may pretend to know this part of what pixels do.
+PRODUCT_SPP, PRODUCT_PART, PRETENDED = 8, 4, 0.1
 MAX_STEPS, MAX_ITERATIONS, TOLERANCE = 4, 30, 0.03
 # A level is left when what the image misses is no more than this part of the variance of noise.
 SETTLED = 1.0
@@ -75,8 +76,9 @@ class Search:
         self.standard_errors = np.full(len(self.values), np.nan)
         self.halves: weights.Halves = []  # of all pixels, when they were surveyed last
         self.noise: weights.Noise | None = None
-        self.accepted: tuple[np.ndarray, float] | None = None  # values, and how much their image misses
+        self.accepted: tuple[np.ndarray, float, float] | None = None  # values, what their image misses, its error
         self.damping = 0.0
+        self.sharp = PRODUCT_SPP  # samples that J needs, as far as known
         self.history: list[dict] = []
         self.tell, self.interrupts, self.started = tell, interrupts, time.perf_counter()
 
@@ -100,11 +102,10 @@ class Search:
         for _ in range(MAX_STEPS):
             excess = self.look(samples)
             self.step()
-            if last:
-                self.step_again()
             self.record(samples)
             self.deviation = self.draw()
-            self.prior.estimate(self.values, self.deviation)
+            self.told = self.determined()
+            self.prior.estimate(self.values, self.told)
             if excess < SETTLED and (not last or self.renders > 1):
                 break
 
@@ -115,7 +116,7 @@ class Search:
         self.weights, self.render_part = equations
         # The expectation of this square is the number of parameters that the pixels determine: so many values are
         # fitted to noise, and the others miss the noise of the target.
-        left = max(((self.weights > 0) * self.trust).sum() - self.determined(), 1)
+        left = max(((self.weights > 0) * self.trust).sum() - self.told.sum(), 1)
         self.target_part = float(np.clip(self.missed / left, 0, 1))
         return self.render_part + self.target_part
 
@@ -186,19 +187,25 @@ class Search:
         self.weights = usable / (variance * (self.render_part + target_part) + rounding)
         missed = (usable * self.trust * a * b / variance).sum(-1)
         mean, error = missed.mean(), missed.std() / np.sqrt(len(missed))
-        if self.accepted is not None and mean > self.accepted[1] + GROWN * error:
+        if self.accepted is not None and mean - self.accepted[1] > GROWN * np.hypot(error, self.accepted[2]):
             self.values, self.damping = self.accepted[0], max(10 * self.damping, DAMPING)
             a, b = self.render(samples)
         else:
-            self.accepted, self.damping = (self.values, mean), self.damping / 10
+            self.accepted, self.damping = (self.values, mean, error), self.damping / 10
         self.residual = (a + b) / 2
         self.missed = float((usable * self.trust * a * b / variance).sum())
         self.loss = float((self.weights * self.trust * a * b).sum() / 2)
         return 2 * self.loss / max((usable * self.trust).sum(), 1)
 
-    def determined(self) -> float:
-        """The number of parameters that the pixels determine, up to chance."""
-        return float((self.weights * self.push(self.deviation) ** 2).sum())
+    def determined(self) -> np.ndarray:
+        """(n,) how much of each parameter the pixels determine, up to chance; and find how many samples J needs."""
+        products, spp, v = self.products, self.product_spp, self.deviation
+        other = products.next_draw()
+        a, b = products.push(self.values, v, spp, products.next_draw()), products.push(self.values, v, spp, other)
+        told = v * products.pull(self.values, self.weights * a, spp, other)
+        pretended = (self.weights * (a - b) ** 2).sum() / 2
+        self.sharp = int(np.ceil(spp * pretended / max(PRETENDED * told.sum(), 1)))
+        return told
 
     # ---- parameters -------------------------------------------------------------------------------------------------
 
@@ -206,62 +213,55 @@ class Search:
         """Gauss-Newton at the values, with what was looked at."""
         products, prior, values, w = self.products, self.prior, self.values, self.weights
         draw, n = products.next_draw(), len(values)
-        self.pull = lambda adjoint: products.pull(values, adjoint, PRODUCT_SPP, draw)
-        self.push = lambda change: products.push(values, change, PRODUCT_SPP, draw)
+        spp = self.product_spp = max(min(self.sharp, self.samples // PRODUCT_PART), PRODUCT_SPP)
+        self.pull = lambda adjoint: products.pull(values, adjoint, spp, draw)
+        self.push = lambda change: products.push(values, change, spp, draw)
         gradient = self.pull(w * self.residual) + prior.gradient(values)
         free = self.inside(gradient)
         # As J >= 0 for what light is multiplied by, sums of rows are bounds of the diagonal.
         self.rows = np.abs(self.pull(w * self.push(np.ones(n))))
         self.diagonal = self.rows + prior.diagonal()
-        damping = self.damping * self.diagonal
-
-        def matrix(x):
-            x = np.where(free, x, 0)
-            return np.where(free, self.pull(w * self.push(x)) + prior.times(x) + damping * x, 0)
-
-        shape = (n, n)
-        self.matrix = LinearOperator(shape, matrix, dtype=float)
-        self.preconditioner = LinearOperator(shape, lambda x: x / self.diagonal, dtype=float)
         self.free = free
-        self.values = np.clip(values + self.solve(-gradient), self.low, self.high)
+
+        def times(x):
+            x = np.where(free, x, 0)
+            return np.where(free, self.pull(w * self.push(x)) + prior.times(x), 0)
+
+        self.times = times
+        self.values = np.clip(values + self.solve(-gradient, self.damping * self.diagonal), self.low, self.high)
 
     def inside(self, gradient: np.ndarray) -> np.ndarray:
         """(n,) bool: False for values at a bound that a step would push beyond it; they stay there."""
         return ~((self.values <= self.low) & (gradient > 0) | (self.values >= self.high) & (gradient < 0))
 
-    def step_again(self) -> None:
-        """Another step, on the image as J has it after the last one.
+    def solve(self, right: np.ndarray, damping: np.ndarray | float = 0.0) -> np.ndarray:
+        """What solves the equations of the last step; 0 where values stay at a bound."""
+        shape = (len(right), len(right))
+        matrix = LinearOperator(shape, lambda x: self.times(x) + damping * x, dtype=float)
+        preconditioner = LinearOperator(shape, lambda x: x / (self.diagonal + damping), dtype=float)
+        how = dict(rtol=TOLERANCE, maxiter=MAX_ITERATIONS, M=preconditioner, callback=self.listen)
+        return cg(matrix, np.where(self.free, right, 0), **how)[0]
 
-        Noise makes J' W J of few samples too large, and steps too short. Other paths show what is left.
+    def draw(self, larger: float = 1.0) -> np.ndarray:
+        """(n,) a deviation from the values, as the posterior has it.
+
+        larger: noise of pixels over that in their weights.
         """
-        products, (before, _) = self.products, self.accepted
-        moved = products.push(before, self.values - before, 2 * PRODUCT_SPP, products.next_draw())
-        self.residual = self.residual + moved
-        self.step()
-
-    def solve(self, right: np.ndarray) -> np.ndarray:
-        """What solves the equations of the last step for another right-hand side."""
-        right = np.where(self.free, right, 0)
-        how = dict(rtol=TOLERANCE, maxiter=MAX_ITERATIONS, M=self.preconditioner, callback=self.listen)
-        return cg(self.matrix, right, **how)[0]
-
-    def draw(self) -> np.ndarray:
-        """(n,) a deviation from the values, as the posterior has it."""
-        noise = self.random.normal(size=self.weights.shape)
+        noise = larger * self.random.normal(size=self.weights.shape)
         return self.solve(self.pull(np.sqrt(self.weights) * noise) + self.prior.draw(self.random))
 
     def find_errors(self, larger: float) -> None:
         """Standard errors of all numbers, inf of those of which no pixel knows anything by itself.
 
-        larger: than in the equations of the last step, in which the target was taken to be as noisy as the image.
+        larger: noise of pixels over that in their weights, for which the target was taken to be as noisy as the image.
         """
         grids = all(is_grid(p) for _, p in self.vector.parameters)
         count = TEXEL_DRAWS if grids else OTHER_DRAWS
-        draws = [self.deviation, *(self.draw() for _ in range(count - 1))]
+        draws = [self.draw(larger) for _ in range(count)]
         known = [self.known() for _ in range(count)]
         # The diagonal says how they differ from texel to texel, and the draws how much larger they are than it says.
         ratio = self.local_mean(np.mean(np.square(draws), 0) * self.diagonal)
-        found = larger * np.sqrt(ratio / self.diagonal)
+        found = np.sqrt(ratio / self.diagonal)
         rows = np.where(self.rows > 0, self.rows, 1)
         known = self.local_mean(np.mean(known, 0) / rows) * self.rows
         unseen = known * (MAX_RELATIVE_ERROR * self.prior.scale) ** 2 < 1
@@ -271,7 +271,7 @@ class Search:
         """(n,) numbers whose mean is the diagonal of J' W J, from two independent J, whose noise adds nothing."""
         products = self.products
         noisy = np.sqrt(self.weights) * self.random.normal(size=self.weights.shape)
-        a, b = (products.pull(self.values, noisy, PRODUCT_SPP, products.next_draw()) for _ in range(2))
+        a, b = (products.pull(self.values, noisy, self.product_spp, products.next_draw()) for _ in range(2))
         return a * b
 
     def local_mean(self, x: np.ndarray) -> np.ndarray:

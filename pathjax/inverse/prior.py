@@ -97,22 +97,19 @@ class Prior:
                 total[name] += np.sqrt(link) * _transposed(random.normal(size=shape), axis)
         return self.vector.pack(total)
 
-    def estimate(self, values: np.ndarray, deviation: np.ndarray) -> None:
-        """Take the differences that are most likely, given the mean of the posterior and a deviation drawn from it.
+    def estimate(self, values: np.ndarray, told: np.ndarray) -> None:
+        """Take the differences that are most likely, given the mean of the posterior.
 
         As many of them as the images determine are as large, in the mean square, as they were taken for: the fixed
-        point of MacKay (1992), Neural Computation 4(3).
+        point of MacKay (1992), Neural Computation 4(3). told: (n,) how much of each number the images determine.
         """
-        deviations = self.vector.unpack(deviation)
+        tolds = self.vector.unpack(told)
         for name, value in self.vector.unpack(values).items():
             if name not in self.links or not self.estimated:
                 continue
-            energy, uncertain = (
-                self.links[name] * sum((np.diff(x, axis=axis) ** 2).sum() for axis in (0, 1))
-                for x in (value, deviations[name])
-            )
+            energy = self.links[name] * sum((np.diff(value, axis=axis) ** 2).sum() for axis in (0, 1))
             free = value.size - value.shape[-1]
-            determined = max(free - uncertain, LEAST_DETERMINED * free)
+            determined = np.clip(tolds[name].sum(), LEAST_DETERMINED * free, free)
             difference = self.difference[name] * float(np.sqrt(energy / determined))
             self.difference[name] = max(difference, LEAST_DIFFERENCE * self.scales[name])
         self._link()

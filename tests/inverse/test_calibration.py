@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from scipy import linalg, ndimage
+from scipy import fft, linalg, ndimage
 
 import pathjax as pj
 from pathjax.inverse.dense import Dense, Equations
@@ -81,6 +81,36 @@ def test_errors_of_the_colours_of_vertices_are_as_stated():
     assert fit.converged, fit.message
     assert len(ratios) > truth.size / 2
     assert_calibrated(ratios, 0.8, 1.25)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("smoothness", [0.03, "auto"])
+def test_errors_of_texels_smaller_than_pixels_are_as_stated(smoothness):
+    """Six to a pixel, of a texture that is drawn from the prior. Noise of J knows them apart, which no pixel does."""
+    side, random = 48, np.random.default_rng(7)
+    rate = 2 - 2 * np.cos(np.pi * np.arange(side) / side)  # squares of differences of the cosines that follow
+    links = 2 * side * (side - 1) / (side**2 - 1)
+    rate = (rate[:, None] + rate) / (links * 0.03**2)
+    waves = random.normal(size=(side, side, 3)) / np.sqrt(np.where(rate > 0, rate, np.inf))[..., None]
+    texels = (0.5 + fft.idctn(waves, axes=(0, 1), norm="ortho")).astype(np.float32)
+    assert 0.05 < texels.min() < texels.max() < 0.95
+    camera = pj.Transform().look_at(origin=[0, 0, 4], target=[0, 0, 0], up=[0, 1, 0])
+    film = {"type": "hdrfilm", "width": 20, "height": 20, "rfilter": {"type": "box"}}
+    picture = {"type": "bitmap", "data": texels, "raw": True}
+    scene = pj.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "path", "max_depth": 2},
+            "sensor": {"type": "perspective", "fov": 28, "to_world": camera, "film": film},
+            "lamp": {"type": "point", "position": [1, 1, 3], "intensity": {"type": "rgb", "value": [9, 9, 9]}},
+            "sky": {"type": "constant", "radiance": {"type": "rgb", "value": [0.3, 0.3, 0.3]}},
+            "wall": {"type": "rectangle", "bsdf": {"type": "diffuse", "id": "wall-bsdf", "reflectance": picture}},
+        }
+    )
+    fit, _, ratios = fitted(scene, "wall-bsdf.reflectance", 0.5, 64, smoothness=smoothness)
+    assert fit.converged, fit.message
+    assert len(ratios) > texels.size / 2
+    assert_calibrated(ratios, 0.8, 1.2)
 
 
 def test_errors_of_linear_equations_are_those_of_many_repetitions():

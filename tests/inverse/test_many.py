@@ -168,6 +168,6 @@ def test_differences_of_texels_are_as_large_as_was_supposed():
 def test_the_size_of_differences_is_found_where_values_are_known():
     vector, random = texture(24, 24), np.random.default_rng(3)
     prior = Prior(vector, np.full(1728, 0.5), "auto")
-    prior.estimate(0.5 + 0.03 * random.normal(size=1728), 1e-9 * random.normal(size=1728))
+    prior.estimate(0.5 + 0.03 * random.normal(size=1728), np.ones(1728))
     # Of independent texels: the root mean square of differences.
     assert abs(prior.difference["a"] / (0.03 * np.sqrt(2)) - 1) < 0.1
