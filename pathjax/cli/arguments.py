@@ -44,6 +44,8 @@ def parser() -> argparse.ArgumentParser:
     fit.add_argument("--spp", type=_positive, default=128, metavar="N", help="of each of the last two renders")
     smooth = "how much neighbouring texels of textures are expected to differ; auto: found out"
     fit.add_argument("--smoothness", type=_smoothness, metavar="S|auto", help=smooth)
+    prior = "laplacian: they differ alike everywhere; total variation: few differ much, as at edges"
+    fit.add_argument("--prior", default="laplacian", metavar="KIND", help=prior)
     fit.add_argument("--seed", type=_seed, default=0, metavar="K")
     wrote = "writes PREFIX.json and PREFIX.png; of a texture also PREFIX.NAME.exr and the scene, PREFIX.xml"
     fit.add_argument("-o", "--output", default="fit", metavar="PREFIX", help=wrote)

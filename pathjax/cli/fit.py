@@ -42,7 +42,7 @@ def run(options, output: Output) -> int:
             def show(entry):
                 status.update(escape(step_text(entry)))
 
-            how = dict(spp=options.spp, seed=options.seed, smoothness=options.smoothness)
+            how = dict(spp=options.spp, seed=options.seed, smoothness=options.smoothness, prior=options.prior)
             fit = inverse.fit(scene, target, names, start=start, progress=show, **how)
         if not first:
             return DONE if fit.converged else FAILED

@@ -32,7 +32,7 @@ from pathjax.inverse import problem, uncertainty, weights
 from pathjax.inverse.approach import approach
 from pathjax.inverse.dense import Dense, is_dense
 from pathjax.inverse.many import Search
-from pathjax.inverse.prior import Prior
+from pathjax.inverse.prior import KINDS, Prior
 from pathjax.inverse.problem import Problem
 from pathjax.inverse.refine import refine
 from pathjax.inverse.scan import scan as scanned
@@ -104,6 +104,7 @@ def fit(
     solver: object = None,
     scan: bool = True,
     smoothness: float | str | None = None,
+    prior: str = KINDS[0],
     progress: bool | Callable[[dict], None] = False,
 ) -> Fit:
     """Find parameters with which the scene looks like the target.
@@ -121,6 +122,8 @@ def fit(
         scan: try indices of refraction over their whole range first, since a local method finds the nearest minimum.
         smoothness: of textures, how much neighbouring texels are expected to differ, in the root mean square and in
             units of the parameter; "auto" finds it out; None: nothing is supposed of neighbours.
+        prior: "laplacian", of differences that are alike everywhere; or "total variation", of few large ones, as at
+            edges, whose mean is then `smoothness`: see `inverse.prior.Prior`.
         progress: True for a line on stderr at each step, or a function that is called with each entry of the history;
             of several processes, in the first.
     Returns:
@@ -149,9 +152,9 @@ def fit(
     if problem.is_many(views.vector):
         if chosen is not None:
             raise InputError("solver is of fits of few numbers; textures have one of their own, so leave it out")
-        return _fit_many(views, spp, seed, smoothness, tell)
-    if smoothness is not None:
-        raise InputError("smoothness is about the texels of textures, and none is fitted")
+        return _fit_many(views, spp, seed, Prior(views.vector, views.start, smoothness, prior), tell)
+    if smoothness is not None or prior != KINDS[0]:
+        raise InputError("smoothness and prior are about the texels of textures, and none is fitted")
     with Interrupts() as interrupts:
         state = State(views, spp, seed, solver, tell, interrupts)
         try:
@@ -162,8 +165,7 @@ def fit(
         return _result(state, converged, message)
 
 
-def _fit_many(problem: Problem, spp: int, seed: int, smoothness, tell) -> Fit:
-    prior = Prior(problem.vector, problem.start, smoothness)
+def _fit_many(problem: Problem, spp: int, seed: int, prior: Prior, tell) -> Fit:
     with Interrupts() as interrupts:
         search = (Dense if is_dense(problem) else Search)(problem, spp, seed, prior, tell, interrupts)
         try:

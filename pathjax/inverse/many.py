@@ -105,7 +105,7 @@ class Search:
             self.record(samples)
             self.deviation = self.draw()
             self.told = self.determined()
-            self.prior.estimate(self.values, self.told)
+            self.prior.estimate(self.values, self.deviation, self.told)
             if excess < SETTLED and (not last or self.renders > 1):
                 break
 

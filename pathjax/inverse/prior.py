@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy import ndimage
 
 from pathjax.errors import InputError
 from pathjax.inverse.parameter_vector import ParameterVector
@@ -14,28 +15,50 @@ WIDTH = 4
 FIRST_DIFFERENCE, LEAST_DIFFERENCE = 0.1, 1e-3
 # At least this part of the differences is taken for determined by the images.
 LEAST_DETERMINED = 0.01
+# What is supposed of differences, by name; and over so many texels a draw says how uncertain they are.
+KINDS, WINDOW = ("laplacian", "total variation"), 5
 
 
 class Prior:
-    """Independent normal distributions about the start, and of the differences between neighbouring texels.
+    """Independent normal distributions about the start, and one of two of the differences between neighbouring texels.
 
-    The second is the Laplacian prior: minus the logarithm of its density is q/2 times the sum of the squares of all
-    differences, down and right, where q is such that their root mean square is `difference`.
+    With d the differences of a texel from those below and to the right of it, in all C channels, minus the logarithm of
+    the density is
+
+        "laplacian"          q/2 sum |d|^2    where q is such that the root mean square of the differences,
+        "total variation"    q sum |d|        where q is such that the mean of |d| / sqrt(2 C)
+
+    is `difference`. The second lets few be large, as at edges. It is taken as the normal distribution of precision
+    q / r that touches it at r, the root mean square of |d| in the posterior: lagged diffusivity (Vogel and Oman 1996,
+    SIAM J. Sci. Comput. 17(1)), which knows that what is uncertain may be large.
     """
 
-    def __init__(self, vector: ParameterVector, start: np.ndarray, smoothness: float | str | None = None):
+    def __init__(
+        self,
+        vector: ParameterVector,
+        start: np.ndarray,
+        smoothness: float | str | None = None,
+        kind: str = KINDS[0],
+    ):
         self.vector, self.mean = vector, start
         values = vector.unpack(start)
         self.scales = {name: _scale(p, values[name]) for name, p in vector.parameters}
         self.scale = vector.pack(self.scales)  # (n,)
         self.precision = 1 / self.scale**2
         self.shapes = {name: p.shape for name, p in vector.parameters if is_grid(p)}
+        if kind not in KINDS:
+            raise InputError(f"prior = {kind!r}; use {' or '.join(map(repr, KINDS))}")
+        self.total_variation = kind == "total variation"
         self.estimated = smoothness == "auto"
         self.difference: dict[str, float] = {}
         if smoothness is not None:
             for name in self._smoothed(smoothness):
                 self.difference[name] = FIRST_DIFFERENCE * self.scales[name] if self.estimated else float(smoothness)
-        self.links: dict[str, float] = {}
+        elif self.total_variation:
+            raise InputError("prior is of fits with smoothness; give it too")
+        # Of |d| / sqrt(2 C), as it is in the posterior: (h, w, 1).
+        self.sizes = {name: np.full((*self.shapes[name][:2], 1), d) for name, d in self.difference.items()}
+        self.links: dict[str, np.ndarray] = {}
         self._link()
 
     def _smoothed(self, smoothness) -> list[str]:
@@ -50,11 +73,12 @@ class Prior:
         return list(self.shapes)
 
     def _link(self) -> None:
-        """Precisions of the differences. T texels have more of these than the T - 1 that are independent."""
+        """Precisions (h, w, 1) of each texel's differences: there are more of these than are independent."""
         for name, difference in self.difference.items():
             h, w = self.shapes[name][:2]
-            links = max(h * (w - 1) + (h - 1) * w, 1)
-            self.links[name] = (h * w - 1) / links / difference**2
+            count = max(h * (w - 1) + (h - 1) * w, 1)
+            size = self.sizes[name] if self.total_variation else difference
+            self.links[name] = np.broadcast_to((h * w - 1) / count / (difference * size), (h, w, 1))
 
     def times(self, x: np.ndarray) -> np.ndarray:
         """The precision matrix times x (n,)."""
@@ -71,7 +95,8 @@ class Prior:
         total = self.vector.unpack(np.zeros(len(x)))
         for name, value in self.vector.unpack(x).items():
             for axis in (0, 1) if name in self.links else ():
-                total[name] += self.links[name] * _transposed(np.diff(value, axis=axis), axis)
+                first, _ = _ends(axis)
+                total[name] += _transposed(self.links[name][first] * np.diff(value, axis=axis), axis)
         return self.vector.pack(total)
 
     def gradient(self, values: np.ndarray) -> np.ndarray:
@@ -84,8 +109,8 @@ class Prior:
         for name, link in self.links.items():
             for axis in (0, 1):
                 first, last = _ends(axis)
-                total[name][first] += link
-                total[name][last] += link
+                total[name][first] += link[first]
+                total[name][last] += link[first]
         return self.vector.pack(total)
 
     def draw(self, random: np.random.Generator) -> np.ndarray:
@@ -93,25 +118,30 @@ class Prior:
         total = self.vector.unpack(np.sqrt(self.precision) * random.normal(size=len(self.precision)))
         for name, link in self.links.items():
             for axis in (0, 1):
-                shape = np.diff(total[name], axis=axis).shape
-                total[name] += np.sqrt(link) * _transposed(random.normal(size=shape), axis)
+                first, _ = _ends(axis)
+                normal = random.normal(size=np.diff(total[name], axis=axis).shape)
+                total[name] += _transposed(np.sqrt(link[first]) * normal, axis)
         return self.vector.pack(total)
 
-    def estimate(self, values: np.ndarray, told: np.ndarray) -> None:
-        """Take the differences that are most likely, given the mean of the posterior.
+    def estimate(self, values: np.ndarray, deviation: np.ndarray, told: np.ndarray) -> None:
+        """Take the differences that are most likely, given the mean of the posterior and a deviation drawn from it.
 
         As many of them as the images determine are as large, in the mean square, as they were taken for: the fixed
         point of MacKay (1992), Neural Computation 4(3). told: (n,) how much of each number the images determine.
         """
-        tolds = self.vector.unpack(told)
+        deviations, tolds = self.vector.unpack(deviation), self.vector.unpack(told)
         for name, value in self.vector.unpack(values).items():
-            if name not in self.links or not self.estimated:
+            if name not in self.links:
                 continue
-            energy = self.links[name] * sum((np.diff(value, axis=axis) ** 2).sum() for axis in (0, 1))
-            free = value.size - value.shape[-1]
-            determined = np.clip(tolds[name].sum(), LEAST_DETERMINED * free, free)
-            difference = self.difference[name] * float(np.sqrt(energy / determined))
-            self.difference[name] = max(difference, LEAST_DIFFERENCE * self.scales[name])
+            known, uncertain = _squares(value), _squares(deviations[name])
+            if self.estimated:
+                link, free = self.links[name], value.size - value.shape[-1]
+                determined = np.clip(tolds[name].sum(), LEAST_DETERMINED * free, free)
+                times = (link * known).sum() / determined  # so many times smaller should precisions be
+                difference = self.difference[name] * float(times if self.total_variation else np.sqrt(times))
+                self.difference[name] = max(difference, LEAST_DIFFERENCE * self.scales[name])
+            square = (known + ndimage.uniform_filter(uncertain, (WINDOW, WINDOW, 1))) / (2 * value.shape[-1])
+            self.sizes[name] = np.sqrt(square + (LEAST_DIFFERENCE * self.scales[name]) ** 2)
         self._link()
 
 
@@ -123,6 +153,15 @@ def is_grid(parameter: Parameter) -> bool:
 def _scale(parameter: Parameter, start: np.ndarray) -> float:
     low, high = parameter.bounds
     return high - low if np.isfinite(high) else WIDTH * float(np.mean(np.abs(start))) or 1.0
+
+
+def _squares(value: np.ndarray) -> np.ndarray:
+    """(h, w, C) -> (h, w, 1) of the differences of each texel, summed."""
+    total = np.zeros((*value.shape[:2], 1))
+    for axis in (0, 1):
+        first, _ = _ends(axis)
+        total[first] += (np.diff(value, axis=axis) ** 2).sum(-1, keepdims=True)
+    return total
 
 
 def _ends(axis: int) -> tuple:
