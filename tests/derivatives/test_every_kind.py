@@ -266,12 +266,16 @@ def test_derivatives_are_those_of_differences(scene_of, case):
     assert all(check.passed and check.resolution < 2 * RESOLUTION for check in found.values()), told
 
 
+# Mitsuba covers spots by no colour, and its blends of mirrors lose light, where the sum of two images does not.
+ALIKE = [case for case in CASES if case not in ("spot, covered", "bitmap, in a weight")]
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("case", [case for case in CASES if case != "spot, covered"])  # by a colour: not in Mitsuba
+@pytest.mark.parametrize("case", ALIKE)
 def test_images_are_those_of_mitsuba(file_of, scene_of, mitsuba, estimate, agree, case):
     """Where both are right all cases pass, but for once in 1000 runs.
 
     Two programs tilt edges and contacts by the rounding that tests of whole images allow.
     """
     theirs = mitsuba(file_of(case), SPP, SEEDS)
-    agree(estimate(scene_of(case), SPP, SEEDS), theirs, rounding=1e-3, false_alarm=1e-3 / len(CASES))
+    agree(estimate(scene_of(case), SPP, SEEDS), theirs, rounding=1e-3, false_alarm=1e-3 / len(ALIKE))
