@@ -348,7 +348,7 @@ def check_phase(kind: type[Phase], samples: int = 200_000, false_alarm: float = 
         pdf = np.asarray(density(table, what), np.float64)
         assert np.isfinite(pdf).all() and (pdf >= 0).all(), f"`evaluate` is {np.min(pdf)} somewhere"
     _chi_square(wo[:samples], samples, pdf * share, false_alarm, kind.__name__)
-    middles, share = _midpoints(2 * POINTS)  # of a narrow lobe the derivative is narrower than the density
+    middles, share = _midpoints(2)  # of a narrow lobe the derivative is narrower than the density
     for name, tangent in _tangents(table).items():
         _, moved = jax.jvp(drawn, (table,), (tangent,))
         assert not np.asarray(moved).any(), f"directions carry a derivative in {name}; put lax.stop_gradient around it"
@@ -360,9 +360,9 @@ def check_phase(kind: type[Phase], samples: int = 200_000, false_alarm: float = 
 # ---- what they share ------------------------------------------------------------------------------------------------
 
 
-def _midpoints(points: int = POINTS):
-    """Directions (N, 3) at the midpoints of the cells' parts, points^2 a cell, and the solid angle of each."""
-    rows, columns = (cells * points for cells in CELLS)
+def _midpoints(finer: int = 1):
+    """Directions (N, 3) at the midpoints of the cells' parts, (finer POINTS)^2 a cell, and the solid angle of each."""
+    rows, columns = (cells * finer * POINTS for cells in CELLS)
     steps = np.pi / rows, 2 * np.pi / columns
     theta, phi = ((np.arange(n) + 0.5) * step for n, step in zip((rows, columns), steps, strict=True))
     theta, phi = (x.ravel() for x in np.meshgrid(theta, phi, indexing="ij"))
