@@ -198,9 +198,12 @@ def placed(file: File) -> Iterator[tuple[dict, np.ndarray]]:
 def _local(node: dict) -> np.ndarray:
     if "matrix" in node:
         return np.reshape(np.array(node["matrix"], np.float64), (4, 4)).T
-    from scipy.spatial.transform import Rotation  # takes a sixth of a second, for files that are glTF
-
-    turn = Rotation.from_quat(node.get("rotation", [0, 0, 0, 1])).as_matrix()
+    x, y, z, w = np.array(node.get("rotation", [0, 0, 0, 1])) / np.linalg.norm(node.get("rotation", 1))
+    turn = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
     matrix = np.eye(4)
     matrix[:3, :3] = turn * np.array(node.get("scale", [1, 1, 1]), np.float64)
     matrix[:3, 3] = node.get("translation", [0, 0, 0])
