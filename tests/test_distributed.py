@@ -125,10 +125,17 @@ def test_kernels_are_dealt_to_all_processes_and_what_differs_is_refused(found, h
 
 # What takes a scene, outside of jit and within a user's own.
 EVERYTHING = """
+from pathjax.inverse import normal as module
+
 scene = pj.load_scene("scenes/cornell_box.xml", res=12)
 names = ["white.reflectance", "light.radiance"]
 image, J = pj.jacobian(scene, names, spp=4, seed=1)
 normal = pj.normal_equations(scene, names, 1.1 * np.asarray(image), spp=4)
+module.ITEMS_OF_A_PART, module.LEAST_PARTS, usual = 36, 4, (module.ITEMS_OF_A_PART, module.LEAST_PARTS)
+module._compiled.clear_cache()
+dealt = pj.normal_equations(scene, names, 1.1 * np.asarray(image), spp=4)
+module.ITEMS_OF_A_PART, module.LEAST_PARTS = usual
+module._compiled.clear_cache()
 
 def loss(values):
     return jnp.mean((pj.render(pj.with_parameters(scene, values), 4, 1) - 0.5) ** 2)
@@ -141,6 +148,7 @@ everything = {
     "image": pj.render(scene, 4, 1), "jacobian": (image, J.derivatives), "J^T v of texels": pull(seen),
     "in jit": jax.jit(jax.grad(loss))({name: pj.parameters(scene)[name] for name in names}),
     "normal": (normal.matrix, normal.gradient, normal.loss, normal.scatter, normal.residuals),
+    "dealt normal": (dealt.matrix, dealt.gradient, dealt.loss, dealt.scatter, dealt.residuals),
 }
 leaves, _ = jax.tree_util.tree_flatten_with_path(everything)
 np.savez(out, **{jax.tree_util.keystr(path): np.asarray(x) for path, x in leaves})

@@ -17,7 +17,7 @@ from __future__ import annotations
 from pathjax.compile.cache import keep_kernels
 from pathjax.compile.jax_compat import is_symbolic_zero, is_traced, register_dataclass
 from pathjax.compile.linear import linear
-from pathjax.compile.mapping import MANY_ITEMS, cuts, native_fold, native_map, native_rows, split_map
+from pathjax.compile.mapping import MANY_ITEMS, cuts, native_fold, native_map, native_rows, split_map, sum_of_parts
 from pathjax.compile.primitives import Search, compute_once, interleaved, one_by_one, persistent_loop, together
 from pathjax.compile.promotion import usual_promotion
 from pathjax.compile.threads import calls_at_once, concurrently, devices_of_a_call
@@ -45,6 +45,7 @@ __all__ = [
     "register_dataclass",
     "setup",
     "split_map",
+    "sum_of_parts",
     "together",
     "usual_promotion",
 ]

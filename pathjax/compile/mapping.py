@@ -164,6 +164,49 @@ def native_rows(
     return run(xs, *shared)
 
 
+def sum_of_parts(f: Callable, xs, *shared, devices: int | None = None):
+    """The sum of f(x, *shared) over the x of `xs`, each of which is much work; and what else it gives of each.
+
+    Args:
+        f: pytrees of arrays x, *shared -> (what is added up, what is kept of each); its kernels have `devices=1`.
+        xs: pytree of arrays (parts, ...), dealt to the devices. Sums have their order, whatever the number of these.
+        devices: of `native_map`.
+    Returns:
+        pytrees of arrays (...), (parts, ...).
+    """
+    used = _used(devices)
+    xs, shared = jax.tree.map(jnp.asarray, (xs, shared))
+    parts = jax.tree.leaves(xs)[0].shape[0]
+    rounds = -(-parts // len(used))
+
+    def one(x, *shared):
+        return lax.optimization_barrier(f(*lax.optimization_barrier((x, *shared))))
+
+    def add(total, new):
+        return jax.tree.map(jnp.add, total, new)
+
+    first, _ = jax.eval_shape(one, jax.tree.map(lambda x: x[0], xs), *shared)
+    zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), first)
+
+    def step(total, x):
+        new, kept = one(x, *shared)
+        return add(total, new), kept
+
+    if len(used) == 1:
+        return lax.scan(step, zeros, xs)
+
+    def deal(x):
+        x = jnp.concatenate([x, jnp.broadcast_to(x[:1], (rounds * len(used) - parts, *x.shape[1:]))])
+        return x.reshape(rounds, len(used), *x.shape[1:]).swapaxes(0, 1)
+
+    def on_one_device(xs, *shared):
+        return lax.map(lambda x: one(x, *shared), xs)
+
+    results = _dealt(on_one_device, used, jax.tree.map(deal, xs), shared)
+    found, kept = jax.tree.map(lambda x: x.swapaxes(0, 1).reshape(-1, *x.shape[2:])[:parts], results)
+    return lax.scan(lambda total, new: (add(total, new), None), zeros, found)[0], kept
+
+
 def _by_parts(part: Callable, xs, shared, devices: int | None, most: int = MOST_PARTS, total=None):
     """part(items, lanes, shared) of all parts, one after another, added to the total: pytree of arrays.
 

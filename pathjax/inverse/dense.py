@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy import linalg
 
-from pathjax.compile.xla import native
+from pathjax import distributed
 from pathjax.derivatives.jacobian import has_rows
 from pathjax.inverse.many import Search
 from pathjax.inverse.problem import Problem
@@ -30,7 +30,7 @@ MOST_NUMBERS, MOST_PRODUCTS = 3072, 1 << 34
 def is_dense(problem: Problem) -> bool:
     """Whether the fit is of colours alone, few enough for `Dense`."""
     count, pixels = problem.vector.count, sum(target.image.size // 3 for target in problem.targets)
-    if count > MOST_NUMBERS or pixels * (count // 3) ** 2 > MOST_PRODUCTS or not native():
+    if count > MOST_NUMBERS or pixels * (count // 3) ** 2 > MOST_PRODUCTS:
         return False
     return all(has_rows(views.scene, views.wanted.values()) for views in problem.groups)
 
@@ -59,24 +59,41 @@ class Dense(Search):
         self.values = np.clip(self.values + self.solve(-gradient, damping), self.low, self.high)
 
     def sums(self, scatter: bool = False) -> Equations:
-        """Sum up the normal equations over the kept pixels, with as many samples of J as the image had."""
+        """Sum up the normal equations over the kept pixels, with as many samples of J as the image had.
+
+        Parts of the pixels are dealt to devices, and to processes, and added up in their order.
+        """
         products, count = self.products, len(self.values) // 3
-        shapes = (3, count, count), (count, 3), (count, 3), (3, count, count)
-        found = Equations(*map(np.zeros, shapes))
         samples, draws = max(self.samples // 2, 1), (products.next_draw(), products.next_draw())
-        for places, a, b in products.rows(self.values, samples, draws):
-            self.listen()
-            J, w = (a + b) / 2, self.weights[places]
+        shapes = (3, count, count), (count, 3), (count, 3), (3 * scatter, count, count)
+        found = Equations(*map(np.zeros, shapes))
+        ends = np.cumsum([x.size for x in found])
+
+        def of_part(part) -> np.ndarray:
+            """Equations of a part of the pixels, and their trust, as words of float64, which JAX would round."""
+            a, b = part.rows()
+            J, w = (a + b) / 2, self.weights[part.places]
             whole = (J * J).sum((0, 2))
             trust = np.clip((a * b).sum((0, 2)) / np.where(whole > 0, whole, 1), 0, 1)[:, None] ** 2
-            self.trust[places] = trust
+            mine, trusts = Equations(*map(np.zeros, shapes)), np.zeros(products.most_rows)
+            trusts[: len(trust)] = trust[:, 0]
             for c in range(3):
                 here, of_channel = (trust * w)[:, c, None] * J[c], w[:, c]
-                found.matrix[c] += here.T @ J[c]
-                found.gradient[:, c] += here.T @ self.residual[places, c]
-                found.known[:, c] += of_channel @ (a[c] * b[c])
+                mine.matrix[c] = here.T @ J[c]
+                mine.gradient[:, c] = here.T @ self.residual[part.places, c]
+                mine.known[:, c] = of_channel @ (a[c] * b[c])
                 if scatter:
-                    found.scatter[c] += here.T @ (trust * J[c])
+                    mine.scatter[c] = here.T @ (trust * J[c])
+            return np.concatenate([x.ravel() for x in (*mine, trusts)]).view(np.uint32)
+
+        parts = products.rows(self.values, samples, draws)
+        for part, words in distributed.dealt(of_part, parts, lambda: self.interrupts.heard):
+            if words is None:
+                raise KeyboardInterrupt
+            *sums, trusts = np.split(words.view(np.float64), ends)
+            for total, mine in zip(found, sums, strict=True):
+                total += mine.reshape(total.shape)
+            self.trust[part.places] = trusts[: len(part.places), None]
         return found
 
     def solve(self, right: np.ndarray, damping: np.ndarray | float = 0.0) -> np.ndarray:

@@ -11,7 +11,8 @@ channel knows of the same channel of colours alone: it has one entry for each co
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 
@@ -22,7 +23,8 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
-from pathjax.compile import register_dataclass, usual_promotion
+from pathjax.compile import register_dataclass, sum_of_parts, usual_promotion
+from pathjax.compile.mapping import ITEMS_OF_A_PART, MOST_BYTES
 from pathjax.derivatives.jacobian import pixel_jacobians
 from pathjax.errors import InputError
 from pathjax.integrators.options import Counts, Options, check_counts
@@ -41,6 +43,8 @@ GROUPS = 32
 MOST_BLOCKS = 4096
 # Of the rows of J of one chunk.
 CHUNK_BYTES = 1 << 25
+# Parts of a sum that are dealt to devices: enough of them that many devices do as much.
+LEAST_PARTS, MOST_PARTS = 64, 1024
 
 
 @register_dataclass
@@ -167,8 +171,8 @@ def sums(
         given = [views.targets, weights[here].reshape(shape)]
         given += [] if images is None else [images[here].reshape(*shape, -1)]
         seeds = jnp.stack([views.seeds(seed, draw, half) for half in range(halves)])
-        rows = partial(_rows, views, by_name, vector, by_column, spp, seeds, devices)
-        parts.append(_of_views(rows, given, vector, side, count, halves))
+        numbers = views, by_name, by_column, spp, seeds
+        parts.append(_of_views(numbers, given, vector, side, count, devices))
     residuals, totals = zip(*parts, strict=True)
     total = jax.tree.map(lambda *x: sum(x[1:], x[0]), *totals)
     column, seen = vector.entries
@@ -182,8 +186,9 @@ def sums(
     return NormalEquations(matrices.sum(0), gradient, total["loss"], scatter, matrices, residuals, pulled, labels)
 
 
-def _rows(views: Views, by_name, vector, scale, spp, seeds, devices, pixels, there):
+def _rows(numbers, vector, devices, pixels, there):
     """Images (R, V, n, 3) and rows of J (R, V, n, Q, 3) of n pixels, for seeds (R, V)."""
+    views, by_name, scale, spp, seeds = numbers
     counts = jnp.where(there, spp, 1)
 
     def of_view(scene, seed):
@@ -197,32 +202,42 @@ def _rows(views: Views, by_name, vector, scale, spp, seeds, devices, pixels, the
 
 
 def _of_views(
-    rows: Callable,
+    numbers: tuple,
     given: list[Float[Array, "V H W ..."]],
     vector: ParameterVector,
     side: int,
     groups: int,
-    halves: int,
+    devices: int | None,
 ) -> tuple[Float[Array, "R N 3"], dict]:
     """Residuals of the N pixels of views of one size, and sums over them.
 
-    rows: (pixels (n,), bool (n,), False where the row does not matter) -> images and rows of J.
+    numbers: the views, values by name, scale of the columns of J, spp and seeds (R, V).
     given: target, weights, and images if any, of each view. groups: of `_chunks`.
     """
     views, height, width, *_ = given[0].shape
     given = [x.reshape(views, height * width, *x.shape[3:]) for x in given]
     dtype, (column, _) = given[0].dtype, vector.entries
-    columns, components = int(column[-1]) + 1, len(column)
-    chunks = _chunks(_blocks(height, width, side), groups, 3 * columns * dtype.itemsize * halves * views)
+    columns, components, halves = int(column[-1]) + 1, len(column), len(numbers[-1])
+    shapes = {
+        "matrices": (groups, 3, columns, columns),
+        "gradient": (components,),
+        "squares": (components, components),
+        "loss": (),
+    }
+    if len(given) > 2:
+        shapes["pulled"] = 3, columns, given[2].shape[-1]
+    parts = _parts(height * width * views, sum(map(math.prod, shapes.values())) * dtype.itemsize)
+    blocks, bytes_of_pixel = _blocks(height, width, side), 3 * columns * dtype.itemsize * halves * views
+    chunks = _chunks(blocks, groups, bytes_of_pixel, parts)
     product = partial(jnp.einsum, precision=lax.Precision.HIGHEST)
 
-    def add(total, pixels):
+    def of_chunk(pixels, numbers, given, devices):
         there = pixels.ravel() >= 0
         each = jnp.maximum(pixels.ravel(), 0)
         target, w, *images = (x[:, each] for x in given)
         w = jnp.where(there[:, None], w, 0)
         # Apart from the kernel, sums are the same program whatever the number of devices.
-        r, J = lax.optimization_barrier(rows(each, there))
+        r, J = lax.optimization_barrier(_rows(numbers, vector, devices, each, there))
         r = r - target
         (ra, Ja), (rb, Jb) = (r[0], J[0]), (r[-1], J[-1])
         scores = (Ja * (w * rb)[..., None, :] + Jb * (w * ra)[..., None, :]) / 2
@@ -236,22 +251,35 @@ def _of_views(
         }
         if images:
             new["pulled"] = product("vnqc,vnck->cqk", (Ja + Jb) / 2 * w[..., None, :], images[0])
-        return jax.tree.map(jnp.add, total, new), r
+        return new, r
 
-    shapes = {
-        "matrices": (chunks.shape[2], 3, columns, columns),
-        "gradient": (components,),
-        "squares": (components, components),
-        "loss": (),
-    }
-    if len(given) > 2:
-        shapes["pulled"] = 3, columns, given[2].shape[-1]
-    zeros = {name: jnp.zeros(shape, dtype) for name, shape in shapes.items()}
-    total, residuals = lax.scan(add, zeros, jnp.asarray(chunks))
+    def of_chunks(chunks, numbers, given, devices):
+        def add(total, pixels):
+            new, r = of_chunk(pixels, numbers, given, devices)
+            return jax.tree.map(jnp.add, total, new), r
+
+        return lax.scan(add, {name: jnp.zeros(shape, dtype) for name, shape in shapes.items()}, chunks)
+
+    if parts == 1:
+        total, residuals = of_chunks(jnp.asarray(chunks), numbers, given, devices)
+    else:
+        dealt = jnp.asarray(chunks).reshape(parts, -1, *chunks.shape[1:])
+        of_part = partial(of_chunks, devices=1)
+        total, residuals = sum_of_parts(of_part, dealt, numbers, given, devices=devices)
+        residuals = residuals.reshape(-1, *residuals.shape[2:])
     # (chunks, R, V, n, 3), to the order of pixels.
     place = np.argsort(np.where(chunks < 0, chunks.size, chunks).ravel())[: height * width]
     residuals = jnp.moveaxis(residuals, 0, 2).reshape(*residuals.shape[1:3], -1, 3)[:, :, place]
-    return residuals.reshape(residuals.shape[0], -1, 3), {**total, "blocks": views * len(_blocks(height, width, side))}
+    return residuals.reshape(residuals.shape[0], -1, 3), {**total, "blocks": views * len(blocks)}
+
+
+def _parts(pixels: int, bytes_of_sums: int) -> int:
+    """In how many parts the sums over pixels are dealt to devices, and added up: as many for any number of devices.
+
+    1: too few for many devices, which rather share each kernel, and gather its rows to multiply them.
+    """
+    parts = min(pixels // ITEMS_OF_A_PART, MOST_BYTES // bytes_of_sums, MOST_PARTS)
+    return 1 << (parts.bit_length() - 1) if parts >= LEAST_PARTS else 1
 
 
 def _blocks(height: int, width: int, side: int) -> Int[np.ndarray, "B S"]:
@@ -267,9 +295,11 @@ def _blocks(height: int, width: int, side: int) -> Int[np.ndarray, "B S"]:
     return _padded(blocks, count * together).reshape(count, -1)
 
 
-def _chunks(blocks: Int[np.ndarray, "B S"], groups: int, bytes_of_pixel: int) -> Int[np.ndarray, "C each G S"]:
-    """The blocks of each group in each chunk."""
-    chunks = -(-blocks.size * bytes_of_pixel // CHUNK_BYTES)
+def _chunks(
+    blocks: Int[np.ndarray, "B S"], groups: int, bytes_of_pixel: int, parts: int = 1
+) -> Int[np.ndarray, "C each G S"]:
+    """The blocks of each group in each chunk; of each part of them as many."""
+    chunks = parts * -(-blocks.size * bytes_of_pixel // (parts * CHUNK_BYTES))
     each = -(-len(blocks) // (chunks * groups))
     return _padded(blocks, chunks * each * groups).reshape(chunks, each, groups, -1)
 

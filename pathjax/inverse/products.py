@@ -8,11 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from functools import partial
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from pathjax.compile import devices_of_a_call
 from pathjax.derivatives import backward
 from pathjax.derivatives import places as entries
 from pathjax.integrators import pixel
@@ -24,8 +26,21 @@ from pathjax.scene import parameters as named
 
 # Pixels are rendered in so many parts, but in parts that are worth a kernel's start.
 PARTS, LEAST_PART = 8, 4096
-# Rows of J are made for fewer pixels at once: so many bytes, but not too few pixels for a kernel.
-ROWS_BYTES, LEAST_ROWS = 1 << 26, 1024
+# Rows of J are made for fewer pixels at once, by each device for its own: for all in so many parts, or for so many
+# bytes, but not for too few pixels for a kernel.
+ROWS_PARTS, ROWS_BYTES, LEAST_ROWS = 64, 1 << 26, 1024
+
+
+class RowsPart(NamedTuple):
+    """Some pixels: their places (n,) in (N,), and for each draw a call that renders their rows, in any thread."""
+
+    places: np.ndarray
+    new: np.ndarray  # (V, part) bool: of the others another part gives rows
+    calls: list[Callable[[], np.ndarray]]
+
+    def rows(self) -> list[np.ndarray]:
+        """(3, n, Q) of J, for each draw."""
+        return [np.ascontiguousarray(np.moveaxis(call()[self.new], -1, 0)) for call in self.calls]
 
 
 class Products:
@@ -84,21 +99,27 @@ class Products:
             total += self._run(_pull, values, views, pixels, spp, draw, mine)
         return total
 
-    def rows(self, values: np.ndarray, spp: int, draws: tuple) -> Iterator[tuple[np.ndarray, ...]]:
-        """Yield parts of the pixels: their places (n,) in (N,), and for each draw their rows of J, (3, n, Q).
+    @property
+    def most_rows(self) -> int:
+        """The most pixels of a part of `rows`."""
+        fit = min(ROWS_BYTES // (self.vector.count * 4), self.count // ROWS_PARTS)
+        return max(fit, LEAST_ROWS, *(len(pixels) for _, pixels, _ in self.parts))
+
+    def rows(self, values: np.ndarray, spp: int, draws: tuple) -> Iterator[RowsPart]:
+        """Yield parts of the pixels, enough of them that many devices do as much, and small enough for memory.
 
         All parameters are colours, Q in all, and light keeps its channel: J[c] is that of channel c in channel c.
         """
         for views, pixels, places in self.parts:
-            most = max(ROWS_BYTES // (len(pixels) * len(values) * 4), LEAST_ROWS)
+            most = max(self.most_rows // len(pixels), 1)
             each = -(-pixels.shape[1] // -(-pixels.shape[1] // most))
             for first in range(0, pixels.shape[1], each):
                 begin = min(first, pixels.shape[1] - each)  # the last one as large as the others: one kernel
                 here = places[:, begin : begin + each]
                 new = here < self.count
                 new[:, : first - begin] = False
-                found = (self._run(_rows, values, views, pixels[:, begin : begin + each], spp, d)[new] for d in draws)
-                yield here[new], *(np.ascontiguousarray(np.moveaxis(rows, -1, 0)) for rows in found)
+                calls = [self._call(_rows, values, views, pixels[:, begin : begin + each], spp, d) for d in draws]
+                yield RowsPart(here[new], new, calls)
 
     def spread(self, kept: np.ndarray) -> list[np.ndarray]:
         """(N, C) of the kept pixels to (H, W, C) of each view, with 0 elsewhere."""
@@ -114,13 +135,17 @@ class Products:
         """The inverse of `spread`."""
         return np.concatenate([image[mask] for image, mask in zip(by_view, self.masks, strict=True)])
 
-    def _run(self, function: Callable, values, views: Views, pixels, spp: int, draw, *more):
+    def _run(self, *call):
+        return self._call(*call)()
+
+    def _call(self, function: Callable, values, views: Views, pixels, spp: int, draw, *more) -> Callable:
+        """Compile, in the thread that asks for it, and return what runs the kernel, in any."""
         values = jnp.asarray(values, self.dtype)
         arguments = values, views, pixels, jnp.uint32(spp), views.seeds(self.seed, draw, 0), *more
         bound = partial(function, vector=self.vector)
         program, seconds = compiled((function, self.vector), lambda *a: jax.jit(bound).lower(*a).compile(), *arguments)
         self.compile_seconds += seconds
-        return np.asarray(program(*arguments), float)
+        return lambda: np.asarray(program(*arguments), float)
 
 
 def _image(values, views: Views, pixels, spp, seeds, vector):
@@ -143,7 +168,7 @@ def _pull(values, views, pixels, spp, seeds, adjoint, vector):
 
 
 def _rows(values, views, pixels, spp, seeds, vector):
-    """(V, part, Q, 3)."""
+    """(V, part, Q, 3), by a kernel for `concurrently`."""
     by_name, options = vector.unpack(values), Options(derivative=True, by_vertex=True)
     paths = tuple(dict.fromkeys(parameter.path for parameter in views.wanted.values()))
 
@@ -151,7 +176,8 @@ def _rows(values, views, pixels, spp, seeds, vector):
         seed, pixels = work
         scene = named.nameless(named.attached(views.with_values(scene, by_name)))
         how = dict(paths=paths, options=options, ring=backward.longest_ring(scene))
-        _, found = backward.rows(scene, pixels, *pixel.numbers(pixels, 0, spp, seed), **how)
+        numbers = pixel.numbers(pixels, 0, spp, seed)
+        _, found = backward.rows(scene, pixels, *numbers, devices=devices_of_a_call(), **how)
         first, _ = entries.firsts(scene, paths)
 
         def of_pixel(row):

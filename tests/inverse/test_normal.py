@@ -57,10 +57,10 @@ def no_kernel(monkeypatch):
 
     def put(instead):
         monkeypatch.setattr(normal, "pixel_jacobians", instead)
-        jax.clear_caches()
+        normal._compiled.clear_cache()
 
     yield put
-    jax.clear_caches()
+    normal._compiled.clear_cache()
 
 
 @pytest.fixture
@@ -131,12 +131,17 @@ def arguments(views, extra):
 EXTRA = np.random.default_rng(1).normal(size=(RES * RES, 3, 2))
 
 
+@pytest.mark.parametrize("least_parts", [1, 64])
 def test_blocks_and_chunks_are_summed_up_alike_on_any_number_of_devices(
-    scene, target, dense, without_kernel, monkeypatch
+    scene, target, dense, without_kernel, monkeypatch, least_parts
 ):
-    """Blocks of 2 x 2 pixels, some of them beyond the image, in two chunks."""
+    """Blocks of 2 x 2 pixels, some of them beyond the image, in two chunks; whether or not sums are dealt in parts."""
     views = problem.build(scene, target, NAMES, {})
     monkeypatch.setattr(normal, "CHUNK_BYTES", 2 * 4 * 3 * 4 * 50)
+    monkeypatch.setattr(normal, "ITEMS_OF_A_PART", 20)
+    monkeypatch.setattr(normal, "LEAST_PARTS", least_parts)
+    assert normal._parts(RES * RES, 1000) == (4 if least_parts == 1 else 1)
+    normal._compiled.clear_cache()
     assert normal._chunks(normal._blocks(RES, RES, 2), 25, 2 * 4 * 3 * 4).shape == (2, 1, 25, 4)
     found, on_one = (
         normal._compiled(*arguments(views, EXTRA), vector=views.vector, side=2, devices=n) for n in (None, 1)
