@@ -36,7 +36,7 @@ from pathjax.bsdfs.roughplastic import RoughPlastic
 from pathjax.bsdfs.thindielectric import ThinDielectric
 from pathjax.bsdfs.twosided import TwoSided
 from pathjax.bsdfs.wrapper import Wrapper
-from pathjax.compile import register_dataclass
+from pathjax.compile import compute_once, register_dataclass
 from pathjax.core.math import at
 from pathjax.core.types import BSDFSample, Frame, Surface
 from pathjax.kinds import Column, Instance, Parameters, Row, Table, ordered
@@ -257,7 +257,7 @@ def colors(
     if not most:
         return None, None
     calls = [partial(codes, *each) for each in zip(materials.tables, textured, strict=True)]
-    found = calls[0]() if len(calls) == 1 else lax.switch(jnp.maximum(kind, 0), calls)
+    found = compute_once(calls[0]() if len(calls) == 1 else lax.switch(jnp.maximum(kind, 0), calls))
     if not materials.listed:
         return tuple(materials.textures.look_up(code, surface) for code in found), None
     pairs = [materials.textures.with_entries(code, surface, dict(materials.listed)) for code in found]

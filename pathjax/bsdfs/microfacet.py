@@ -18,6 +18,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
+from pathjax.compile import compute_once
 from pathjax.core.math import cos_sin_turns, dot, larger, normalize, safe_sqrt, smaller
 
 # Mitsuba's least roughness: what is smoother has this one.
@@ -164,7 +165,8 @@ class Beckmann(Distribution):
         for _ in range(2):
             y = jnp.clip(y, -tip, most)
             slope = lax.erf_inv(y)
-            y = y - (integral(y, slope) - target) / larger(cos - slope * sin, float(jnp.finfo(cos.dtype).tiny))
+            growth = larger(cos - slope * sin, float(jnp.finfo(cos.dtype).tiny))
+            y = compute_once(y - (integral(y, slope) - target) / growth)
         along = lax.erf_inv(jnp.clip(y, -tip, most))
         across = lax.erf_inv(jnp.clip(2 * u[1] - 1, -tip, tip))
         # Azimuth of wi; any where it has none.

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Integer, UInt
 
+from pathjax.compile import compute_once
 from pathjax.core.math import at
 from pathjax.core.types import Number
 
@@ -80,7 +81,8 @@ def lattice_point(stream: Word, sample: Word, vertex: Number) -> Float[Array, "4
     """
     vertex = _u32(vertex)
     generators = at(jnp.asarray(_GENERATORS), vertex % len(_GENERATORS))
-    return to_unit(reverse_bits(_u32(sample)) * generators + _hashes(stream, vertex * DIMENSIONS, DIMENSIONS))
+    place = compute_once(reverse_bits(_u32(sample)))  # which all four share
+    return to_unit(place * generators + _hashes(stream, vertex * DIMENSIONS, DIMENSIONS))
 
 
 def independent_point(stream: Word, sample: Word, vertex: Number) -> Float[Array, "4"]:

@@ -209,7 +209,7 @@ def _drawn(first: Float[Array, ""], last: Float[Array, ""], u: Float[Array, ""])
     a = jnp.where(total > 0, safe_divide(first, total), 0.5)
     b = 1 - a
     # The root of a x + (b - a) x^2 / 2 = u / 2, without a difference.
-    return jnp.minimum(safe_divide(u, a + safe_sqrt(a * a * (1 - u) + b * b * u)), 1 - STEP)
+    return compute_once(jnp.minimum(safe_divide(u, a + safe_sqrt(a * a * (1 - u) + b * b * u)), 1 - STEP))
 
 
 def _ends(p: Row, y: Int[Array, ""]) -> tuple[Float[Array, ""], Float[Array, ""]]:
