@@ -218,7 +218,7 @@ def highest(number: int) -> int:
 
 
 def total(number: float) -> float:
-    """Of the numbers that processes give."""
+    """Sum of the numbers that processes give."""
     return float(sum(exchanged(np.float32(number)))) if count() > 1 else number
 
 

@@ -81,7 +81,7 @@ class Distribution(ABC):
     # ---- of one roughness ---------------------------------------------------------------------------------------
 
     def _slope(self, v: Float[Array, "3"]) -> Float[Array, ""]:
-        """Of v.z and this the ratio decides what v sees: alpha sin(theta) where alpha_u = alpha_v."""
+        """The ratio of v.z to this decides what v sees: alpha sin(theta) where alpha_u = alpha_v."""
         x, y = self.alpha_u * v[0], self.alpha_v * v[1]
         return safe_sqrt(x * x + y * y)
 

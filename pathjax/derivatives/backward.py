@@ -244,7 +244,7 @@ def _read_ahead(total: Float[Array, " 3M"], places: Sequence[Int[Array, " W"]]) 
 
 
 def _part(change, share):
-    """Of three numbers the share, which is one, or one of each; None: all."""
+    """Three numbers times their share, which is one for all, or one of each; None: all of them."""
     if share is None:
         return change
     return [s * x for s, x in zip(share if isinstance(share, list) else [share] * 3, change, strict=True)]

@@ -89,7 +89,7 @@ def tables_of_textures(scene: Scene, path: tuple) -> list[tuple]:
 
 
 def paths(scene: Scene) -> set[tuple]:
-    """Of all arrays that may be differentiated. Textures and backgrounds that do not tell their entries may not."""
+    """Paths of all arrays that may be differentiated: not those of textures and backgrounds that tell no entries."""
     tables = [(*BSDFS, i) for i in range(len(scene.materials.tables))] + [(*WRAPPERS, i) for i in _choosing(scene)]
     covers = tables_of_textures(scene, TEXTURES)
     for i in range(len(scene.emitters)):
@@ -112,13 +112,13 @@ def _choosing(scene: Scene) -> list[int]:
 
 
 def _columns(scene: Scene, table: tuple) -> dict[tuple, int]:
-    """Of a table, where the values of its columns are -> place of the column."""
+    """Paths to the values of the columns of a table -> place of the column."""
     columns = named.get(scene, table).columns
     return {(*table, "columns", i, "values"): i for i, column in enumerate(columns) if column is not None}
 
 
 def _in_textures(scene: Scene, paths: Iterable[tuple], of_textures: tuple) -> dict[tuple[int, int | str], tuple]:
-    """Of those arrays that textures look up: by table, and column or name of what meshes carry."""
+    """The arrays that textures look up: by table, and column or name of what meshes carry."""
     found: dict[tuple[int, int | str], tuple] = {}
     for number, path in enumerate(tables_of_textures(scene, of_textures)):
         table = named.get(scene, path)
@@ -238,7 +238,7 @@ def _declared(scene: Scene, path: tuple) -> Declared:
 
 
 def of_bsdf(scene: Scene, paths: Paths, slots: Slots, slot: int, here: Vertex) -> Entries:
-    """Of the number that the bsdf of a vertex looks up for a slot; of any, where it looks up none."""
+    """Entries of the number that the bsdf of a vertex looks up for a slot; of any, where it looks up none."""
     first, _ = firsts(scene, paths)
     found = [
         partial(_of_row, scene, first, (*BSDFS, number), columns[slot], here.row, TEXTURES, here.surface, here.entries)
@@ -260,7 +260,7 @@ def by_choices(slots: Slots, here: Vertex) -> Float[Array, " slots"]:
 
 
 def of_choice(scene: Scene, paths: Paths, slots: Slots, slot: int, here: Vertex) -> Entries:
-    """Of a number of `by_choices`."""
+    """Entries of a number of `by_choices`."""
     first, _ = firsts(scene, paths)
     step, place, number = slots.choices[slot]
     column, row = slots.wrappers[place][number], here.chosen[step].row
@@ -269,7 +269,7 @@ def of_choice(scene: Scene, paths: Paths, slots: Slots, slot: int, here: Vertex)
 
 
 def of_passed(scene: Scene, paths: Paths, slots: Slots, slot: int, passed: Passed) -> Entries:
-    """Of a number that is looked up at a surface that a shadow ray passes."""
+    """Entries of a number that is looked up at a surface that a shadow ray passes."""
     place, number = divmod(slot, len(slots.wrappers[0]))
     kind, row = passed.held[place]
     first, _ = firsts(scene, paths)
@@ -285,7 +285,7 @@ def of_passed(scene: Scene, paths: Paths, slots: Slots, slot: int, passed: Passe
 
 
 def of_hit(scene: Scene, paths: Paths, slots: Slots, slot: int, ray: Ray, hit: Hit, here: Vertex | None) -> Entries:
-    """Of the number that the light looks up that a ray meets; of any, where it meets none."""
+    """Entries of the number that the light looks up that a ray meets; of any, where it meets none."""
     first, _ = firsts(scene, paths)
     found, starts, number = [partial(_of_background, scene, first, slots, slot, ray.d)], [], jnp.int32(0)
     if here is not None:
@@ -306,7 +306,7 @@ def of_hit(scene: Scene, paths: Paths, slots: Slots, slot: int, ray: Ray, hit: H
 def of_light_sample(
     scene: Scene, choice: Choice, paths: Paths, slots: Slots, slot: int, here: Vertex, u: Bounce
 ) -> Entries:
-    """Of the number that a sampled light looks up; of any, where it looks up none."""
+    """Entries of the number that a sampled light looks up; of any, where it looks up none."""
     first, _ = firsts(scene, paths)
     number, _, _ = emitters.choose(choice, here.surface.p, u.light)
     whole, behind = _whole(scene, paths), emitters.backgrounds(scene.emitters)
@@ -363,7 +363,7 @@ def _of_background(scene: Scene, first: dict, slots: Slots, slot: int, d) -> Pai
 
 
 def _of_row(scene: Scene, first: dict, path: tuple, column: int | None, row, of_textures, surface, known=None) -> Pairs:
-    """Of a column of the table at a path, and of the textures at another one, which are looked up on a surface.
+    """Pairs of a column of the table at a path, and of the textures at another one, looked up on a surface.
 
     known: what was found of the textures already, for each of `Table.textured`.
     """

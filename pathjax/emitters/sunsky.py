@@ -191,7 +191,7 @@ def _chance_of_sun(p: Row) -> Float[Array, ""]:
 
 @cache
 def _data() -> tuple[np.ndarray, np.ndarray]:
-    """Of the sky by turbidity, albedo, control point, colour and number; of the sun by turbidity, elevation, colour."""
+    """The sky by turbidity, albedo, control point, colour and number; the sun by turbidity, elevation, colour."""
     with np.load(Path(__file__).parent / "sunsky.npz") as data:
         return data["sky"].astype(float), data["sun"].astype(float)
 

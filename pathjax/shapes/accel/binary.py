@@ -106,7 +106,7 @@ def _alike(count):
 
 
 def _least_cost(order, rows, leaf_size, first, count, run=map):
-    """Of a batch of nodes: the best of some splits, then the best of those between its neighbours."""
+    """Splits of a batch of nodes: the best of some, then the best of those between its neighbours."""
     start = first + order.shape[1] * np.arange(3)[:, None]  # (3, M) of each axis in all of `order`
     costs = partial(_costs, order.ravel(), rows, leaf_size, start, count, run=run)
     nothing = np.full((6, *start.shape), -np.inf, np.float32)
@@ -216,7 +216,7 @@ def partition(order, first, count, axis, nl, side, run):
 
 
 def _partition(order, first, count, axis, nl, side, nodes, run=map):
-    """Of neighbouring nodes; stable."""
+    """Part neighbouring nodes by their splits; stable."""
     begin = first[nodes.start]
     part = order[:, begin : begin + count[nodes].sum()]
     at = np.arange(begin, begin + part.shape[1])
