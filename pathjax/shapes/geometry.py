@@ -169,7 +169,7 @@ def _along(surface, o, n):
 
     (p_s, uv_s), (p_t, uv_t) = compute_once(lax.stop_gradient((moved(across.s), moved(across.t))))
     scale = safe_divide(1, uv_s[0] * uv_t[1] - uv_s[1] * uv_t[0])
-    return compute_once(((uv_t[1] * p_s - uv_s[1] * p_t) * scale, (uv_s[0] * p_t - uv_t[0] * p_s) * scale))
+    return (uv_t[1] * p_s - uv_s[1] * p_t) * scale, (uv_s[0] * p_t - uv_t[0] * p_s) * scale
 
 
 def emits(geometry: Geometry, hit: Hit) -> Bool[Array, ""]:
