@@ -6,11 +6,13 @@ All but the times is the same in every run.
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 import pathjax
@@ -18,7 +20,10 @@ from pathjax import distributed
 from pathjax.bench import figures, peers, rays
 from pathjax.bench.figures import Reference
 from pathjax.bench.peers.mitsuba3 import SAMPLERS
-from pathjax.integrators.options import strategies
+from pathjax.derivatives import matrix_free
+from pathjax.integrators.options import Options, strategies
+from pathjax.rendering.render import render_pixels
+from pathjax.scene.parameters import nameless
 from pathjax.scene.scene import Scene
 from pathjax.sensors import film
 
@@ -96,8 +101,8 @@ def measure(file: str, defines: dict[str, str], plan: Plan) -> dict:
         },
         "failures": failures,
     }
-    unmeasured = dict.fromkeys(("sampler", "strategies", "precision", "peak_memory_bytes", "closest_hits", "rays"))
-    return facts | (unmeasured if plan.quick else _more(subject, rows, plan, failures))
+    unmeasured = "sampler strategies derivatives precision peak_memory_bytes closest_hits rays".split()
+    return facts | (dict.fromkeys(unmeasured) if plan.quick else _more(subject, rows, plan, failures))
 
 
 def _more(subject: Subject, rows, plan: Plan, failures) -> dict:
@@ -107,7 +112,8 @@ def _more(subject: Subject, rows, plan: Plan, failures) -> dict:
     sampler = _sampler(subject, rows)
     say(f"{file}: strategies")
     strategies = _strategies(subject, plan)
-    more = {"sampler": sampler, "strategies": strategies}
+    say(f"{file}: derivatives")
+    more = {"sampler": sampler, "strategies": strategies, "derivatives": _derivatives(subject.scene, plan)}
     if distributed.index() > 0:  # the rest is not shared
         return more
     say(f"{file}: float32 and float64")
@@ -209,6 +215,34 @@ def _strategies(subject: Subject, plan: Plan) -> list[dict]:
         jax.block_until_ready(pathjax.render(subject.scene, 1, strategy=strategy))
     done = _timed(subject.scene, {strategy: (spp, strategy) for strategy in possible}, range(plan.repeat))
     return [{"strategy": strategy, **subject.row(spp, spp, *done[strategy])} for strategy in possible]
+
+
+def _derivatives(scene: Scene, plan: Plan) -> dict | None:
+    """CPU seconds of J v and J^T v in all parameters that the recorded sweep finds, and of the image; in turns.
+
+    None where there is no such parameter.
+    """
+    spp, parameters = _middle(plan.spps), scene.described.parameters
+    wanted = {name: each for name, each in parameters.items() if matrix_free.is_swept(scene, each)}
+    if not wanted:
+        return None
+    v = {name: jnp.ones(each.shape, scene.camera.origin.dtype) for name, each in wanted.items()}
+    pixels = film.pixels(film.with_own_samples(scene.film))
+    adjoint, options, scene = jnp.ones((len(pixels), 3), scene.camera.origin.dtype), Options(), nameless(scene)
+    calls = {
+        "image": lambda seed: render_pixels(scene, pixels, 0, spp, seed),
+        "J v": lambda seed: matrix_free.push(scene, wanted, v, pixels, 0, spp, seed, options),
+        "J^T v": lambda seed: matrix_free.pull(scene, wanted, adjoint, pixels, 0, spp, seed, options),
+    }
+    seconds: dict[str, list[float]] = {name: [] for name in calls}
+    for seed in range(1 + plan.repeat):
+        for name, call in calls.items():
+            started = time.process_time()
+            jax.block_until_ready(call(seed))
+            seconds[name].append(distributed.total(time.process_time() - started))
+    # The first of each compiles.
+    numbers = sum(math.prod(each.shape) for each in wanted.values())
+    return {"spp": spp, "numbers": numbers, "cpu_seconds": {name: each[1:] for name, each in seconds.items()}}
 
 
 def _precision(subject: Subject, plan: Plan, failures) -> tuple[dict | None, int | None]:

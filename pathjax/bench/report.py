@@ -48,6 +48,8 @@ def _scene(scene: dict) -> list[str]:
     lines += _speed(scene)
     if scene["strategies"]:
         lines += _strategies(scene["strategies"])
+    if scene["derivatives"]:
+        lines += _derivatives(scene["derivatives"])
     if scene["sampler"]:
         lines += _sampler(scene["sampler"])
     if scene["precision"]:
@@ -127,6 +129,13 @@ def _sampler(sampler: dict) -> list[str]:
         "",
         *_table(["sampler, spp", "relMSE, shifted lattice", "relMSE, independent", "ratio"], cells),
     ]
+
+
+def _derivatives(derivatives: dict) -> list[str]:
+    numbers, seconds = derivatives["numbers"], derivatives["cpu_seconds"]
+    image, *others = ((name, statistics.median(each)) for name, each in seconds.items())
+    cells = [[name, f"{each:.3f}", f"{each / image[1]:.2f}"] for name, each in others]
+    return _table([f"derivatives in {numbers} numbers, {derivatives['spp']} spp", "CPU s", "over the image's"], cells)
 
 
 def _precision(precision: dict) -> list[str]:

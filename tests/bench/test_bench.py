@@ -92,6 +92,14 @@ def test_precision_and_memory(scene):
         assert 1 << 20 < scene["peak_memory_bytes"] < 1 << 32
 
 
+def test_derivatives(scene, folder):
+    """In three reflectances and a radiance, whatever else is a parameter."""
+    derivatives = scene["derivatives"]
+    assert derivatives["numbers"] == 12 and derivatives["spp"] == 32
+    assert all(len(each) == 2 and min(each) > 0 for each in derivatives["cpu_seconds"].values())
+    assert "| J^T v |" in (folder / "bench.md").read_text()
+
+
 def test_closest_hits(scene):
     assert scene["closest_hits"].keys() == {"camera", "scattered"}
     assert min(scene["closest_hits"].values()) > 0

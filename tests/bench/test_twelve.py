@@ -126,7 +126,7 @@ def quick(monkeypatch):
 
     def measure(file, defines, plan):
         done.append(file)
-        nothing = dict.fromkeys(("sampler", "strategies", "precision", "peak_memory_bytes", "closest_hits", "rays"))
+        nothing = dict.fromkeys("sampler strategies derivatives precision peak_memory_bytes closest_hits rays".split())
         scene = measured(file, 1, 0.1, 4, 0.2)
         rest = {"mpaths_per_second": 1.0, "reference_too_noisy": False, "bias": {"rel_mse": 0.0, "standard_error": 0.1}}
         for row in scene["pathjax"]:
