@@ -26,7 +26,7 @@ Work = tuple[Int[Array, ""], sampler.Word, sampler.Word, sampler.Word]
 
 def numbers(
     pixels: Integer[Array | np.ndarray, " N"], first_sample: Counts, spp: Counts, seed: Counts
-) -> tuple[UInt[Array, " N"], ...]:
+) -> tuple[UInt[Array | np.ndarray, " N"], ...]:
     """What to sample of each pixel, of what is one number or one of each."""
 
     def of_each(x):
