@@ -218,8 +218,10 @@ def _of_views(
     given = [x.reshape(views, height * width, *x.shape[3:]) for x in given]
     dtype, (column, _) = given[0].dtype, vector.entries
     columns, components, halves = int(column[-1]) + 1, len(column), len(numbers[-1])
+    # Noise of J is independent from pixel to pixel: where blocks are few, their pixels are groups of their own.
+    summed = groups * (side**2 if groups < GROUPS else 1)
     shapes = {
-        "matrices": (groups, 3, columns, columns),
+        "matrices": (summed, 3, columns, columns),
         "gradient": (components,),
         "squares": (components, components),
         "loss": (),
@@ -242,7 +244,7 @@ def _of_views(
         (ra, Ja), (rb, Jb) = (r[0], J[0]), (r[-1], J[-1])
         scores = (Ja * (w * rb)[..., None, :] + Jb * (w * ra)[..., None, :]) / 2
         scores = vector.by_component(scores).reshape(-1, pixels.shape[-1], components).sum(1)
-        a, b = (x.reshape(views, *pixels.shape, *x.shape[2:]) for x in (Ja, w[..., None, :] * Jb))
+        a, b = (x.reshape(views, len(pixels), summed, -1, *x.shape[2:]) for x in (Ja, w[..., None, :] * Jb))
         new = {
             "matrices": product("vbgsqc,vbgsrc->gcqr", a, b),
             "gradient": scores.sum(0),
