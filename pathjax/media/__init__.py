@@ -184,9 +184,9 @@ def distance(
     sigma, chances = extinction(media, medium), _chances(throughput)
     red, green = u[0] < chances[0], u[0] < chances[0] + chances[1]
     of_colour = lax.stop_gradient(jnp.where(red, sigma[0], jnp.where(green, sigma[1], sigma[2])))
-    dims = of_colour > 0
+    attenuates = of_colour > 0
     # In units of the values of a grid; else it is the distance.
-    wanted = jnp.where(dims, -jnp.log1p(-u[1]) / jnp.where(dims, of_colour, 1), jnp.inf)
+    wanted = jnp.where(attenuates, -jnp.log1p(-u[1]) / jnp.where(attenuates, of_colour, 1), jnp.inf)
     if media.extinctions is None:
         return wanted
     values, ray = lax.stop_gradient((media.extinctions, ray))
