@@ -275,6 +275,25 @@ def test_checkerboard_colours(shipped):
     np.testing.assert_allclose(J["sky.radiance"] @ pj.parameters(scene)["sky.radiance"], image, rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.slow
+def test_second_derivatives_of_some_colours(shipped):
+    """Samples are quadratic in the colours of the screen, as above, so that slopes differ by the second derivative."""
+    scene = without_roulette(shipped("glass_ball", res=8), 5)
+    names = ["pattern.color0", "pattern.color1", "sky.radiance"]
+    values = {name: pj.parameters(scene)[name] for name in names}
+
+    def brightness(values):
+        return pj.render(pj.with_parameters(scene, values), 16).sum()
+
+    slope = jax.grad(brightness)
+    change = {name: jnp.full(3, 0.5) for name in names[:2]} | {"sky.radiance": jnp.zeros(3)}
+    curved = jax.jvp(slope, (values,), (change,))[1]
+    up, down = (slope(jax.tree.map(lambda x, dx, h=h: x + h * dx, values, change)) for h in (0.1, -0.1))
+    assert curved["sky.radiance"].min() > 10
+    for name in names:
+        np.testing.assert_allclose(curved[name], (up[name] - down[name]) / 0.2, rtol=1e-3, atol=1e-3)
+
+
 # ---- glass: closed forms --------------------------------------------------------------------------------------------
 
 GRID = 12

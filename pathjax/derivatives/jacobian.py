@@ -36,8 +36,9 @@ from pathjax.system import memory
 
 Slopes = dict[str, Float[Array, "..."]]
 METHODS = ("difference", "attached")
-# Up to so many colours tangents are the cheaper way, and may be differentiated again.
-MOST_TANGENTS = 8
+# Up to so many colours tangents are the cheaper way: for 1, 2, 3 colours of the Cornell box, image and Jacobian took
+# 1.14, 1.24, 1.44 images of CPU time, and by a recorded sweep 1.23, 1.24, 1.26.
+MOST_TANGENTS = 2
 
 
 @register_dataclass
@@ -139,6 +140,7 @@ def pixel_jacobians(
     *,
     method: str = "difference",
     step: float | Float[Array, ""] | None = None,
+    again: bool = False,
     **how,
 ) -> tuple[Float[Array, "N 3"], Slopes, Slopes, Slopes]:
     """Means, and by name: derivatives (N, 3, *shape), biases (N, 3), steps ().
@@ -146,6 +148,7 @@ def pixel_jacobians(
     Args:
         scene: without names.
         first_sample, spp, seed: each one number, or one of each pixel.
+        again: whether derivatives in colours are to be differentiated again, which those of a recorded sweep cannot be.
         how: `form` and `devices` of `native_map`.
     """
     tangents.refuse_textures(wanted)
@@ -159,7 +162,7 @@ def pixel_jacobians(
         scene = choosing_by_present_iors(scene, rows)
     steps = ior_step.steps(scene, glass, step)
     numbers = pixel.numbers(pixels, first_sample, spp, seed)
-    if not rows and takes_sweep(scene, wanted.values(), options, **how):
+    if not rows and not again and takes_sweep(scene, wanted.values(), options, **how):
         return *_swept(scene, wanted, pixels, numbers, options, **how), {}, {}
     held = tangents.places(wanted[name] for name in colors)
 
@@ -185,7 +188,7 @@ def pixel_jacobians(
 
 
 def takes_sweep(scene: Scene, parameters, options: Options, form: str | None = None, devices: int | None = None):
-    """Whether a recorded sweep finds all derivatives, of more colours than it takes tangents to cost as much.
+    """Whether a recorded sweep finds all derivatives, of so many colours that tangents would cost more.
 
     It knows of pixels that draw their own samples alone, of colours, and of native kernels.
     """

@@ -82,7 +82,7 @@ def _estimate_jvp(static, primals, tangents):
     named.refuse_constant(scene, wanted)
     free = {name: wanted.pop(name) for name in sorted(estimator.matrix_free(scene, wanted))}
     if free:
-        scene = differentiated_once(scene, "an image in a texture, or in more colours than a Jacobian has,")
+        scene = differentiated_once(scene, "an image in a texture, or in many colours,")
     value, J = estimator.jacobian(scene, wanted, *work) if wanted else (estimator.value(scene, *work), {})
     tangent = jnp.zeros_like(value)
     for name in wanted:

@@ -14,7 +14,7 @@ from pathjax.compile import usual_promotion
 from pathjax.core.types import Number
 from pathjax.derivatives import matrix_free
 from pathjax.derivatives.backward import longest_ring
-from pathjax.derivatives.jacobian import MOST_TANGENTS, pixel_jacobians
+from pathjax.derivatives.jacobian import pixel_jacobians
 from pathjax.derivatives.rules import estimate
 from pathjax.errors import InputError
 from pathjax.integrators import pixel
@@ -23,6 +23,9 @@ from pathjax.integrators.reconstruction import map_pixels
 from pathjax.scene.alike import by_all
 from pathjax.scene.scene import Scene
 from pathjax.sensors import film
+
+# Derivatives in so many colours at once may be differentiated again; more would cost a tangent of the kernel each.
+MOST_TWICE = 8
 
 
 @by_all
@@ -111,14 +114,15 @@ class _PixelMeans:
 
     def jacobian(self, scene, wanted, control, pixels, *numbers):
         self.options.check_differentiable()
-        image, derivatives, *_ = pixel_jacobians(scene, wanted, pixels, *numbers, self.options, **dict(self.how))
+        how = dict(self.how)
+        image, derivatives, *_ = pixel_jacobians(scene, wanted, pixels, *numbers, self.options, again=True, **how)
         return image, derivatives
 
     def matrix_free(self, scene, wanted):
-        # More colours than a pass of the kernel bears tangents, and textures always.
+        # Many colours, and textures always.
         swept = {name for name, parameter in wanted.items() if matrix_free.is_swept(scene, parameter)}
         textures = {name for name, parameter in wanted.items() if parameter.is_texture}
-        return swept if len(swept) > MOST_TANGENTS else textures
+        return swept if len(swept) > MOST_TWICE else textures
 
     def push(self, scene, wanted, changes, control, pixels, *numbers):
         self.options.check_differentiable()
