@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -27,6 +28,21 @@ def test_annotations_hold_in_every_scene_and_in_a_fit(root, half):
     files = [*sorted(root.glob("scenes/*.xml")), *sorted(root.glob("tests/scenes/*.xml"))][half::2]
     done = run([CHECKED, *(["--no-fit"] if half else ["scenes/furnace.xml"]), *files], cwd=root)
     assert done.returncode == 0, done.stderr
+
+
+def test_shapes_in_annotations_can_be_read(root):
+    """jaxtyping reads them only when a value comes by, which may be in no quick test: "3M" is no number of anything."""
+    shapes = re.compile(r"\b(?:Array|ndarray)(?: \| \w+)*, \"([^\"]*)\"\]")
+    files = list((root / "pathjax").rglob("*.py"))
+    found = [(file.name, shape) for file in files for shape in shapes.findall(file.read_text())]
+    assert len(found) > 1000
+
+    def readable(dimension):
+        name = dimension.lstrip("*#?_")
+        parts = re.split(r"[-+*]", name.strip("{}"))
+        return name in ("", "...") or all(part.isidentifier() or part.isdigit() for part in parts)
+
+    assert not [(file, shape) for file, shape in found if not all(map(readable, shape.split()))]
 
 
 WRONG = """

@@ -63,7 +63,7 @@ def columns_of(record: Record) -> list:
 
 class Memory(NamedTuple):
     # Of few entries, a column for each number of theirs; or the list, of which whole vectors are added up.
-    total: list[Float[Array, " W"]] | Float[Array, " 3M"]
+    total: list[Float[Array, " W"]] | Float[Array, " numbers"]
     clock: Int[Array, ""]  # trips
     swept: Int[Array, ""]  # trips before the last sweep
     lost: Int[Array, ""]  # 1: a path was longer than the ring
@@ -79,7 +79,7 @@ class Sweep(NamedTuple):
     complete: Int[Array, " W"]  # 1: has met the end of a path, so that it knows what arrives
     stopped: Int[Array, " W"]  # 1: all that is older has been swept before
     R: list[Float[Array, " W"]]
-    total: list[Float[Array, " W"]] | Float[Array, " 3M"]
+    total: list[Float[Array, " W"]] | Float[Array, " numbers"]
 
 
 def start(scene: Scene, record: Record, entries: int, ring: int, lanes: int) -> Memory:
@@ -231,7 +231,7 @@ def _number(place, channel):
     return 3 * place.astype(jnp.uint32) + jnp.uint32(channel)
 
 
-def _read_ahead(total: Float[Array, " 3M"], places: Sequence[Int[Array, " W"]]) -> Int[Array, ""]:
+def _read_ahead(total: Float[Array, " numbers"], places: Sequence[Int[Array, " W"]]) -> Int[Array, ""]:
     """0, when all places have been read, and so are in a near cache.
 
     Processors read far memory many places at a time, but add to few: each add holds the ones behind it up. The result
@@ -300,7 +300,7 @@ def pixel_sweep(
     return share * total, memory
 
 
-def finish(structure: Record, memory: Memory) -> Float[Array, " 3M"]:
+def finish(structure: Record, memory: Memory) -> Float[Array, " numbers"]:
     memory = sweep(structure, memory, jnp.bool_(True))
     total = memory.total
     if isinstance(total, list):
