@@ -20,7 +20,7 @@ from jaxtyping import Array, Float, Int
 
 from pathjax import emitters
 from pathjax.bsdfs import dielectric
-from pathjax.compile import is_traced, native, register_dataclass, usual_promotion
+from pathjax.compile import is_symbolic_zero, is_traced, native, register_dataclass, usual_promotion
 from pathjax.core.types import Number
 from pathjax.derivatives import backward, ior, ior_difference, ior_step, places, rules, tangents
 from pathjax.errors import InputError
@@ -140,7 +140,7 @@ def pixel_jacobians(
     *,
     method: str = "difference",
     step: float | Float[Array, ""] | None = None,
-    again: bool = False,
+    ring: int | None = None,
     **how,
 ) -> tuple[Float[Array, "N 3"], Slopes, Slopes, Slopes]:
     """Means, and by name: derivatives (N, 3, *shape), biases (N, 3), steps ().
@@ -148,7 +148,7 @@ def pixel_jacobians(
     Args:
         scene: without names.
         first_sample, spp, seed: each one number, or one of each pixel.
-        again: whether derivatives in colours are to be differentiated again, which those of a recorded sweep cannot be.
+        ring: of `backward.longest_ring`; None: that of the scene.
         how: `form` and `devices` of `native_map`.
     """
     tangents.refuse_textures(wanted)
@@ -162,8 +162,9 @@ def pixel_jacobians(
         scene = choosing_by_present_iors(scene, rows)
     steps = ior_step.steps(scene, glass, step)
     numbers = pixel.numbers(pixels, first_sample, spp, seed)
-    if not rows and not again and takes_sweep(scene, wanted.values(), options, **how):
-        return *_swept(scene, wanted, pixels, numbers, options, **how), {}, {}
+    ring = ring or backward.longest_ring(scene)
+    if not rows and ring <= backward.MOST_RING and takes_sweep(scene, wanted.values(), options, **how):
+        return *_swept(wanted, options, ring, how, scene, pixels, *numbers), {}, {}
     held = tangents.places(wanted[name] for name in colors)
 
     def of(held, first):
@@ -208,16 +209,36 @@ def has_rows(scene: Scene, parameters) -> bool:
     return slots.of_bsdfs == slots.colors and not slots.of_choices and not slots.of_passed
 
 
-def _swept(scene, wanted, pixels, numbers, options, form=None, devices=None):
-    """Means and derivatives, by name."""
-    scene = rules.differentiated_once(scene, f"an image in more than {MOST_TANGENTS} colours at once")
+@partial(jax.custom_jvp, nondiff_argnums=(0, 1, 2, 3))
+def _swept(wanted, options, ring, how, scene, pixels, *numbers):
+    """Means and derivatives, by name. how: `form` and `devices`; lanes are the only form."""
     options = replace(options, derivative=True, by_vertex=True)
     paths = tuple(dict.fromkeys(parameter.path for parameter in wanted.values()))
     first, _ = places.firsts(scene, paths)
-    how = dict(paths=paths, options=options, ring=backward.longest_ring(scene), devices=devices)
-    image, found = backward.rows(scene, pixels, *numbers, **how)
+    devices = how.get("devices")
+    image, found = backward.rows(scene, pixels, *numbers, paths=paths, options=options, ring=ring, devices=devices)
     columns = {name: first[parameter.path] + parameter.index[0] for name, parameter in wanted.items()}
     return image, {name: tangents.by_channel(found[:, column]) for name, column in columns.items()}
+
+
+@partial(_swept.defjvp, symbolic_zeros=True)
+@usual_promotion
+def _swept_jvp(wanted, options, ring, how, primals, changes):
+    """No derivative goes through a sweep: second ones are those of the same Jacobian, made by tangents."""
+    scene, *work = primals
+    leaves, tree = jax.tree.flatten(scene)
+    changes = jax.tree.leaves(changes[0], is_leaf=is_symbolic_zero)
+    moved = [k for k, change in enumerate(changes) if not is_symbolic_zero(change)]
+    held = Wanted(tangents.places(wanted.values()), ())
+
+    def of(moving):
+        at_place = dict(enumerate(leaves)) | dict(zip(moved, moving, strict=True))
+        scene = tree.unflatten(at_place.values())
+        steps = ior_step.steps(scene, (), None)
+        image, slopes, *_ = _jacobians(scene, *work, steps, wanted=held, options=options, **how)
+        return image, {name: tangents.by_channel(slopes[:, k]) for k, name in enumerate(wanted)}
+
+    return jax.jvp(of, ([leaves[k] for k in moved],), ([changes[k] for k in moved],))
 
 
 def choosing_by_present_iors(scene: Scene, rows: tuple[int, ...]) -> Scene:

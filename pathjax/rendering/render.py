@@ -114,8 +114,8 @@ class _PixelMeans:
 
     def jacobian(self, scene, wanted, control, pixels, *numbers):
         self.options.check_differentiable()
-        how = dict(self.how)
-        image, derivatives, *_ = pixel_jacobians(scene, wanted, pixels, *numbers, self.options, again=True, **how)
+        how = dict(self.how, ring=self.ring)
+        image, derivatives, *_ = pixel_jacobians(scene, wanted, pixels, *numbers, self.options, **how)
         return image, derivatives
 
     def matrix_free(self, scene, wanted):

@@ -291,18 +291,26 @@ def test_a_path_longer_than_the_ring_is_told(screen, monkeypatch, ring, lost):
 
 
 @pytest.mark.slow
-def test_paths_of_any_length_are_recorded_whole(make_scene, picture):
-    """Within a closed sphere that shines, I = (1 - rho^d) / (1 - rho) of each sample."""
+@pytest.mark.parametrize("shape", [(2, 2, 3), (3,)])
+def test_paths_of_any_length_are_recorded_whole(make_scene, picture, shape):
+    """Within a closed sphere that shines, I = (1 - rho^d) / (1 - rho) of each sample.
+
+    Of a colour too, where there are more of them than get a tangent each.
+    """
     depth, rho = 3000, 0.999
-    wall = diffuse("wall", texture(picture(2, 2)))
+    wall = diffuse("wall", texture(picture(2, 2)) if len(shape) == 3 else rgb("reflectance", "0.5"))
     lamp = f'<boolean name="flip_normals" value="true"/><emitter type="area">{rgb("radiance", "1")}</emitter>'
-    scene = make_scene(f'<shape type="sphere">{lamp}{wall}</shape>', res=2, origin="0, 0, 0.1", fov=60)
+    there = diffuse("unseen", rgb("reflectance", "1"))
+    unseen = f'<shape type="sphere"><point name="center" value="9"/>{there}</shape>'
+    scene = make_scene(f'<shape type="sphere">{lamp}{wall}</shape>{unseen}', res=2, origin="0, 0, 0.1", fov=60)
     scene = limited(scene, depth, NO_LIMIT)
-    x = jnp.full((2, 2, 3), rho, jnp.float32)
-    found = jax.grad(lambda x: pj.render(pj.with_parameters(scene, {"wall.reflectance": x}), 1, 0, "bsdf").sum())(x)
+    values = pj.parameters(scene) if len(shape) == 1 else {}
+    values = values | {"wall.reflectance": jnp.full(shape, rho, jnp.float32)}
+    found = jax.grad(lambda x: pj.render(pj.with_parameters(scene, x), 1, 0, "bsdf").sum())(values)["wall.reflectance"]
+    assert len(values) in (1, jacobian.MOST_TANGENTS + 1)
     expected = (1 - rho**depth - depth * rho ** (depth - 1) * (1 - rho)) / (1 - rho) ** 2
     # Sums of thousands of float32 numbers of one sign.
-    np.testing.assert_allclose(found.sum((0, 1)), 4 * expected, rtol=1e-3)
+    np.testing.assert_allclose(found.reshape(-1, 3).sum(0), 4 * expected, rtol=1e-3)
 
 
 def test_paths_too_long_to_be_recorded_are_refused(screen):
