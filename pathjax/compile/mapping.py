@@ -116,15 +116,16 @@ def native_fold(
 def native_rows(
     f: Callable, xs, *shared, start: Callable, finish: Callable, form: str | None = None, devices: int | None = None
 ):
-    """What every item leaves in rows of memory that are its own, as `native_fold` has it, and what it gives.
+    """What every item leaves in a row of memory that is its own, as `native_fold` has it, and what it gives.
 
     Args:
         f: (x, number of the item, *shared, memory) -> (y, memory); items of a part are numbered from 0.
         start: (number of lanes, number of items, *shared) -> memory before the first item.
-        finish: memory after the last item of a part -> pytree of arrays (items, ...).
+        finish: memory after the last item of a part -> pytree of arrays (M, items, ...).
         xs, shared, form, devices: of `native_fold`.
     Returns:
-        y and the rows of all items, pytrees of arrays (N, ...). Under `jax.vmap` one call follows another.
+        y and the rows of all items, pytrees of arrays (N, ...) and (M, N, ...), as what takes one number of many items
+        finds them side by side. Under `jax.vmap` one call follows another.
     """
     count = jax.tree.leaves(xs)[0].shape[0]
     form = _form(form)
@@ -133,10 +134,16 @@ def native_rows(
 
     def alone(x, *shared):
         y, memory = f(x, jnp.int32(0), *shared, start(1, 1, *shared))
-        return y, jax.tree.map(lambda row: row[0], finish(memory))
+        return y, jax.tree.map(lambda row: row[:, 0], finish(memory))
 
     if form == "vmap":
-        return native_map(alone, xs, *shared, form=form, devices=devices)
+        ys, rows = native_map(alone, xs, *shared, form=form, devices=devices)
+        return ys, jax.tree.map(lambda x: x.swapaxes(0, 1), rows)
+
+    def gathered(x, axis):
+        """(parts, ..., items, ...) -> (..., N, ...)"""
+        x = jnp.moveaxis(x, 0, axis + 1)
+        return lax.slice_in_dim(x.reshape(*x.shape[:axis], -1, *x.shape[axis + 2 :]), 0, count, axis=axis)
 
     @custom_vmap
     def run(xs, *shared):
@@ -146,8 +153,8 @@ def native_rows(
             ys, memory = of_part((xs, jnp.arange(items, dtype=jnp.int32)), *shared)
             return ys, finish(memory)
 
-        results = _by_parts(part, xs, shared, devices)
-        return jax.tree.map(lambda x: x.swapaxes(0, 1).reshape(-1, *x.shape[2:])[:count], results)
+        ys, rows = _by_parts(part, xs, shared, devices)
+        return jax.tree.map(partial(gathered, axis=0), ys), jax.tree.map(partial(gathered, axis=1), rows)
 
     @run.def_vmap
     @usual_promotion

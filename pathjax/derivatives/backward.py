@@ -262,7 +262,7 @@ def pixel_sweep(
     scene: Scene,
     choice: Choice | None,
     scale: Float[Array, "3"],
-    first: Int[Array, ""] | int,
+    place_of: Callable,
     memory: Memory,
     *,
     options: Options,
@@ -272,7 +272,7 @@ def pixel_sweep(
 ) -> tuple[Float[Array, "3"], Memory]:
     """Add what the samples of a pixel give, and their mean.
 
-    scale: of the derivatives of the mean; first: where the list begins in the total.
+    scale: of the derivatives of the mean; place_of: from the list of entries to the total.
     """
     pixel_number, first_sample, spp, seed = work
     stream = sampler.pixel_stream(seed, pixel_number)
@@ -285,7 +285,7 @@ def pixel_sweep(
         u = bounce_numbers(scene, stream, number, path.vertices(now), options.sampler)
         of_sample = weight * (share * scale)
         on, record, itself = extend(scene, choice, now, u, options, slots, paths, of_sample, passed)
-        there = [replace(slot, places=tuple(first + place for place in slot.places)) for slot in record.slots]
+        there = [replace(slot, places=tuple(map(place_of, slot.places))) for slot in record.slots]
         record = record._replace(begins=begins, slots=there)
         memory = together(partial(remember, structure))(memory, columns_of(record))
         gain = weight * now.throughput * record.gathered
@@ -353,7 +353,7 @@ def pullback(
 
     def of_pixel(work, scene, choice, memory):
         adjoint, work = work
-        return sweep_of(work, scene, choice, adjoint, 0, memory)[1]
+        return sweep_of(work, scene, choice, adjoint, lambda place: place, memory)[1]
 
     begin, end = partial(start, scene, structure, entries, ring), partial(finish, structure)
     work = adjoint, (pixels, first_sample, spp, seed)
@@ -370,7 +370,7 @@ def pullback(
 @partial(jax.jit, static_argnames=("paths", "options", "ring", "form", "devices"))
 def rows(
     scene: Scene, pixels, first_sample, spp, seed, *, paths, options: Options, ring, form=None, devices=None
-) -> tuple[Float[Array, "N 3"], Float[Array, "N M 3"]]:
+) -> tuple[Float[Array, "N 3"], Float[Array, "M N 3"]]:
     """Means of pixels, and their derivatives in each of the list of colours: of each channel in its own.
 
     Arguments as for `pullback`; the arrays hold colours alone.
@@ -378,13 +378,16 @@ def rows(
     scene, choice, structure, entries, sweep_of = _kernel(scene, paths, options)
 
     def of_pixel(work, number, scene, choice, memory):
-        return sweep_of(work, scene, choice, jnp.ones_like(scene.camera.origin), number * entries, memory)
+        size = len(memory.total) if isinstance(memory.total, list) else memory.total.size
+        pixels = size // (3 * entries)
+        ones = jnp.ones_like(scene.camera.origin)
+        return sweep_of(work, scene, choice, ones, lambda place: pixels * place + number, memory)
 
     def begin(lanes, pixels, scene, choice):
         return start(scene, structure, pixels * entries, ring, lanes)
 
     def end(memory):
-        return finish(structure, memory).reshape(-1, entries, 3)
+        return finish(structure, memory).reshape(entries, -1, 3)
 
     work = pixels, first_sample, spp, seed
     return native_rows(of_pixel, work, scene, choice, start=begin, finish=end, form=form, devices=devices)

@@ -120,12 +120,13 @@ def jacobian(
     image, derivatives, bias, used = pixel_jacobians(
         scene, wanted, pixels, 0, spp, seed, options, method=method, step=step
     )
-    shape = (*film.image_shape(scene.film), 3)
+    image, derivatives, bias = _as_images((image, derivatives, bias), film.image_shape(scene.film))
+    return image, Jacobian(derivatives, bias, used)
 
-    def as_image(x):
-        return x.reshape(*shape, *x.shape[2:])
 
-    return as_image(image), Jacobian(*jax.tree.map(as_image, (derivatives, bias)), used)
+@partial(jax.jit, static_argnums=1, donate_argnums=0)
+def _as_images(of_pixels, shape):
+    return jax.tree.map(lambda x: x.reshape(*shape, *x.shape[1:]), of_pixels)
 
 
 @usual_promotion
@@ -212,13 +213,20 @@ def has_rows(scene: Scene, parameters) -> bool:
 @partial(jax.custom_jvp, nondiff_argnums=(0, 1, 2, 3))
 def _swept(wanted, options, ring, how, scene, pixels, *numbers):
     """Means and derivatives, by name. how: `form` and `devices`; lanes are the only form."""
-    options = replace(options, derivative=True, by_vertex=True)
     paths = tuple(dict.fromkeys(parameter.path for parameter in wanted.values()))
     first, _ = places.firsts(scene, paths)
-    devices = how.get("devices")
-    image, found = backward.rows(scene, pixels, *numbers, paths=paths, options=options, ring=ring, devices=devices)
-    columns = {name: first[parameter.path] + parameter.index[0] for name, parameter in wanted.items()}
-    return image, {name: tangents.by_channel(found[:, column]) for name, column in columns.items()}
+    columns = tuple(first[parameter.path] + parameter.index[0] for parameter in wanted.values())
+    options = replace(options, derivative=True, by_vertex=True)
+    static = dict(columns=columns, paths=paths, options=options, ring=ring, devices=how.get("devices"))
+    image, slopes = _columns(scene, pixels, *numbers, **static)
+    return image, dict(zip(wanted, slopes, strict=True))
+
+
+@partial(jax.jit, static_argnames=("columns", "paths", "options", "ring", "devices"))
+def _columns(*work, columns, **how):
+    """One program for all: of hundreds, calls one by one took longer than the kernel."""
+    image, found = backward.rows(*work, **how)
+    return image, [tangents.by_channel(found[column]) for column in columns]
 
 
 @partial(_swept.defjvp, symbolic_zeros=True)

@@ -133,9 +133,9 @@ def test_items_keep_rows_of_their_own(form):
     def start(lanes, items, scale):
         return jnp.zeros((items + 1, 4))
 
-    twice, rows = native_rows(f, xs, jnp.float32(0.5), start=start, finish=lambda memory: memory[:-1], form=form)
+    twice, rows = native_rows(f, xs, jnp.float32(0.5), start=start, finish=lambda memory: memory[:-1].T, form=form)
     np.testing.assert_array_equal(twice, 2 * xs)
-    np.testing.assert_array_equal(rows, 0.5 * (np.arange(4) < xs[:, None]))
+    np.testing.assert_array_equal(rows, 0.5 * (np.arange(4)[:, None] < xs))
 
 
 def test_map_passes_tangents():
