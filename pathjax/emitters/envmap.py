@@ -170,7 +170,7 @@ def _around(p: Row, patch: Int[Array, "2"]) -> list[list[Int[Array, ""]]]:
 
 def _radiance(p: Row, patch: Int[Array, "2"], inside: Float[Array, "2"]) -> Float[Array, "3"]:
     def texel(number):
-        return jnp.stack([at(p.texels, 3 * number + channel) for channel in range(3)])
+        return lax.dynamic_slice(p.texels, (3 * number,), (3,), allow_negative_indices=False)
 
     radiance = _bilinear([[texel(number) for number in row] for row in _around(p, patch)], *inside)
     if (nudge := p.nudge("texels")) is not None:
