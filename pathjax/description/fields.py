@@ -20,8 +20,9 @@ VALUES = ("float", "integer", "boolean", "string", "rgb", "spectrum", "point", "
 NAMED = ("texture", "volume")
 OBJECTS = ("integrator", "sensor", "sampler", "film", "rfilter", "shape", "bsdf", "emitter", "medium", "phase", *NAMED)
 
-# Spectra that are plugins of their own.
-TYPED = ("uniform", "d65", "srgb")
+# Spectra that are plugins of their own, and so are textures, too: of one colour. (`uniform` is a kind of texture here.)
+TYPED = ("uniform", "d65", "srgb", "rawconstant")
+ONE_COLOR = TYPED[1:]
 REQUIRED = object()
 
 
@@ -129,6 +130,8 @@ class Fields:
 
         radiance: of a light; else it is a reflectance, or an index of refraction, as seen under white light.
         """
+        if self._one_color(name):
+            return self._typed_spectrum(self.document.resolve(self._take(name, default, ("texture", "ref"))), at_most)
         element = self._take(name, default, ("rgb", "spectrum", "float", "integer"))
         if element is None:
             return default
@@ -156,9 +159,11 @@ class Fields:
             case "uniform":
                 color = np.full(3, fields.float("value", at_least=0, at_most=at_most))
             case "srgb":
-                color = fields.color("color", at_most=at_most)
+                color = fields.triple_or_color("color", at_most=at_most)
+            case "rawconstant":
+                color = fields.triple_or_color("value", at_most=at_most)
             case "d65":
-                color = fields.color("color", np.ones(3)) * fields.float("scale", 1.0, at_least=0)
+                color = fields.triple_or_color("color", np.ones(3)) * fields.float("scale", 1.0, at_least=0)
                 if color.max() > at_most:
                     raise element.error(f"{element} must lie between 0 and {at_most:g}, is {color.max():g}")
             case "blackbody" | "regular" | "irregular":
@@ -168,6 +173,22 @@ class Fields:
                 raise element.error(f"{element} is not supported; use one of {', '.join(TYPED)}")
         fields.finish()
         return color
+
+    def triple_or_color(self, name: str, default=REQUIRED, *, at_most: float = math.inf):
+        """`color`, which may also be given as a vector."""
+        if self.where(name).tag not in ("vector", "point"):
+            return self.color(name, default, at_most=at_most)
+        given = self.point(name)
+        if given.min() < 0 or given.max() > at_most:
+            raise self.error(name, f"must lie between 0 and {at_most:g}, is {', '.join(f'{c:g}' for c in given)}")
+        return given
+
+    def gives_color(self, name: str) -> bool:
+        """Whether what sets a parameter is a colour, rather than a number or a texture."""
+        return self.where(name).tag in ("rgb", "spectrum") or self._one_color(name)
+
+    def _one_color(self, name: str) -> bool:
+        return self.has(name) and is_one_color(self.document.resolve(self._values[name]))
 
     def _listed_spectrum(self, element: Element, at_most: float, radiance: bool) -> np.ndarray:
         """The colour of values by wavelength, which stand in the scene file or in a file that it names."""
@@ -198,7 +219,7 @@ class Fields:
     def texture(self, name: str, tag: str = "texture") -> Element | None:
         """The <texture>, or other object of NAMED, that sets `name`; None where it is something else, to be read by
         `color`."""
-        if not self.has(name) or self.document.resolve(self._values[name]).tag != tag:
+        if not self.has(name) or self.document.resolve(self._values[name]).tag != tag or self._one_color(name):
             return None
         self._take(name, None, (tag, "ref"))
         return self.document.resolve(self._values[name])
@@ -282,6 +303,11 @@ class Fields:
         if element.children and element.tag not in ("transform", *NAMED) and "type" not in element.attributes:
             raise element.children[0].error(f"{element.children[0]} has no place inside {element}")
         return element
+
+
+def is_one_color(element: Element) -> bool:
+    """Whether a <texture> is a spectrum, which has one colour everywhere."""
+    return element.tag == "texture" and element.attributes.get("type") in ONE_COLOR
 
 
 def _pairs_of_file(path: Path, element: Element) -> list[list[float]]:

@@ -40,7 +40,7 @@ class Number(Declared):
         if self.textured and (made := loader.texture(fields, name, owner)) is not None:
             return _in_range(fields, name, made, self.bounds)
         low, high = self.bounds
-        if self.textured and fields.where(name).tag in ("rgb", "spectrum"):
+        if self.textured and fields.gives_color(name):
             return float(fields.color(name, at_most=high).mean())
         return fields.float(name, self.default, at_least=low, at_most=high)
 

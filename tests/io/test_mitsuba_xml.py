@@ -382,7 +382,7 @@ def test_conductor_is_an_ideal_mirror_unless_told_otherwise(read):
     [
         ("hair", "", "is not supported: it stands on curves, which no ray is tested against; use one of diffuse, "),
         ("polarizer", "", "is not supported: polarisation is not modelled; use one of diffuse, conductor, "),
-        ("circular", "", "is not supported yet; use one of diffuse, conductor, "),
+        ("circular", "", "is not supported: polarisation is not modelled; use one of diffuse, conductor, "),
         ("difuse", "", 'did you mean "diffuse"?'),
         ("diffuse", '<rgb name="reflectence" value="1"/>', 'it has: reflectance; did you mean "reflectance"?'),
         ("diffuse", '<rgb name="reflectance" value="1.1"/>', "between 0 and 1"),
@@ -662,7 +662,7 @@ def test_sensors_that_are_not_modelled_are_refused(refused, inside, words):
 @pytest.mark.parametrize(
     ("body", "words"),
     [
-        ('<integrator type="depth"/>', "is not supported yet; use one of path, direct"),
+        ('<integrator type="depth"/>', "is not supported: it shows distances, which `pathjax render --aov depth` writes"),
         ('<integrator type="pth"/>', 'did you mean "path"'),
         ('<integrator type="moment"/>', "needs an <integrator> inside"),
         (f'<integrator type="moment">{2 * PATH}</integrator>', "takes at most 1"),
@@ -862,6 +862,11 @@ def test_mitsuba_takes_what_has_no_effect(mitsuba, picture, tmp_path, place, nam
         ('<integrator type="volpath">{}</integrator>', "without media is the same as path"),
         ('<integrator type="volpathmis">{}</integrator>', "without media is the same as path"),
         ('<integrator type="prb">{}</integrator>', "its image is that of path"),
+        ('<integrator type="prb_basic">{}</integrator>', "which finds lights of no size, too"),
+        (
+            '<integrator type="prb_projective"><string name="guiding" value="grid"/>{}</integrator>',
+            "its image is that of path",
+        ),
         ('<integrator type="ptracer">{}</integrator>', "traces from the lights; path is used"),
         (
             '<integrator type="aov"><string name="aovs" value="a:depth"/>'
@@ -883,6 +888,20 @@ def test_integrators_that_estimate_the_same_are_path_and_noted(read, integrator,
 def test_output_variables_alone_go_with_path(read):
     scene = read('<integrator type="aov"><string name="aovs" value="a:depth"/></integrator>')
     assert scene.integrator == d.Integrator() and any("holds no integrator, so path is used" in x for x in scene.notes)
+
+
+def test_a_scene_may_have_an_id(write_scene):
+    path = write_scene('<emitter type="constant"/>')
+    path.write_text(path.read_text().replace("<scene ", '<scene id="all" ', 1))
+    pj.load_scene(path)
+
+
+def test_direct_light_with_derivatives_of_edges_is_direct(read):
+    inside = '<integer name="max_depth" value="-1"/><integer name="sppi" value="9"/>'
+    inside += '<boolean name="hide_emitters" value="true"/>'
+    scene = read(f'<integrator type="direct_projective">{inside}</integrator>')
+    assert scene.integrator == d.Integrator(max_depth=2, hide_emitters=True)
+    assert any("its image is that of direct" in note for note in scene.notes)
 
 
 def test_prb_ends_at_its_own_depth(read):

@@ -29,6 +29,10 @@ SPECTRA = [
     '<spectrum name="NAME" type="d65"><float name="scale" value="0.25"/></spectrum>',
     '<spectrum name="NAME" type="d65"><rgb name="color" value=".1 .2 .3"/><float name="scale" value="2"/></spectrum>',
     '<spectrum name="NAME" type="srgb"><rgb name="color" value=".1 .2 .3"/></spectrum>',
+    '<spectrum name="NAME" type="rawconstant"><float name="value" value="0.5"/></spectrum>',
+    '<texture name="NAME" type="rawconstant"><vector name="value" value=".1, .2, .3"/></texture>',
+    '<texture name="NAME" type="srgb"><rgb name="color" value=".1 .2 .3"/></texture>',
+    '<texture name="NAME" type="d65"><float name="scale" value="0.25"/></texture>',
     '<float name="NAME" value="0.5"/>',
     '<integer name="NAME" value="1"/>',
     '<rgb name="NAME" value="0.5"/>',
@@ -72,6 +76,34 @@ def test_spectra_are_converted_as_mitsubas(colour, name, tmp_path):
         mi.set_log_level(level)
 
 
+def test_textures_of_one_colour_may_stand_elsewhere_and_in_dictionaries():
+    """By reference, in the place of a number, and as Mitsuba's dictionaries name them."""
+    raw = {"type": "rawconstant", "value": [0.1, 0.2, 0.3]}
+    scene = {
+        "type": "scene",
+        "sky": {"type": "constant", "radiance": {"type": "d65", "scale": 2.0}},
+        "paint": raw,
+        "ball": {"type": "sphere", "bsdf": {"type": "diffuse", "reflectance": {"type": "ref", "id": "paint"}}},
+        "metal": {
+            "type": "cube",
+            "bsdf": {
+                "type": "roughconductor",
+                "id": "gold",
+                "alpha": {"type": "rawconstant", "value": 0.3},
+                "specular_reflectance": {"type": "srgb", "color": [0.4, 0.5, 0.6]},
+            },
+        },
+    }
+    found = pj.parameters(pj.load_dict(scene))
+    np.testing.assert_allclose(found["sky.radiance"], [2, 2, 2])
+    np.testing.assert_allclose(found["ball.reflectance"], [0.1, 0.2, 0.3])
+    np.testing.assert_allclose(found["gold.alpha"], 0.3)
+    np.testing.assert_allclose(found["gold.specular_reflectance"], [0.4, 0.5, 0.6])
+    for value in ([0.1, 0.2, 1.3], [-0.1, 0.2, 0.3], 1.5):
+        with pytest.raises(InputError, match=r"paint.value"):
+            pj.load_dict(scene | {"paint": raw | {"value": value}})
+
+
 def test_the_tables_have_the_white_points_of_cie():
     """x, y of illuminants E and D65 (CIE 15:2018)."""
     grid, observer, white = spectra._observer()
@@ -103,7 +135,7 @@ def test_a_colour_outside_of_the_gamut_is_clipped_with_a_note(colour):
         ('filename="BAD"', "bad.spd:2: '500 0.2 0.3' must be a wavelength in nm and a value"),
         ('type="blackbody"', "has no colour in Mitsuba's RGB mode"),
         ('type="irregular"', "has no colour in Mitsuba's RGB mode"),
-        ('type="blue"', "use one of uniform, d65, srgb"),
+        ('type="blue"', "use one of uniform, d65, srgb, rawconstant"),
         ('type="uniform"', 'needs <float name="value"'),
         ("", 'lacks the attribute "value"'),
     ],

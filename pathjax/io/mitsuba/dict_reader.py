@@ -16,7 +16,7 @@ import numpy as np
 from pathjax import bsdfs, emitters, media, sensors, shapes, textures
 from pathjax.compile import is_traced
 from pathjax.description.elements import Document, Element, find_file, nearest
-from pathjax.description.fields import TYPED
+from pathjax.description.fields import ONE_COLOR
 from pathjax.errors import InputError
 from pathjax.io.mitsuba import integrators, samplers
 from pathjax.io.mitsuba.plugins import PLUGINS
@@ -24,7 +24,7 @@ from pathjax.io.mitsuba.xml_reader import MAX_DEPTH, by_id
 from pathjax.sensors import film, filters
 
 VERSION = "3.0.0"
-SPECTRA = (*TYPED, "blackbody", "regular", "irregular")
+SPECTRA = ("blackbody", "regular", "irregular")
 _MATRICES = ((3, 3), (4, 4))
 VALUE_TYPES = ("rgb", "spectrum", "ref", "resources")
 
@@ -158,7 +158,7 @@ class _Reader:
         found = [tag for tag, kinds in self.kinds.items() if kind in kinds]
         if len(found) > 1:
             raise InputError(f'{place}: "{kind}" is the name of kinds of {" and ".join(found)}; register other names')
-        found += ["spectrum"] if kind in SPECTRA else []
+        found += ["spectrum"] if kind in SPECTRA else ["texture"] if kind in ONE_COLOR else []
         found += [tag for tag, names in PLUGINS.items() if kind in names]
         if not found:
             known = [name for kinds in self.kinds.values() for name in kinds] + list(VALUE_TYPES)

@@ -47,18 +47,38 @@ class PRB(Path):
     """Mitsuba's differentiable path tracer; its default is another depth."""
 
     default_depth = 6
-    same = "path"
+    same = "path, which is used"
 
     @classmethod
     def read(cls, loader, fields):
-        loader.note(fields.element, f"is for derivatives; its image is that of {cls.same}, which is used")
+        loader.note(fields.element, f"is for derivatives; its image is that of {cls.same}")
         return super().read(loader, fields)
+
+
+class PRBBasic(PRB):
+    """The same without light samples."""
+
+    same = "path, which is used, and which finds lights of no size, too"
+
+
+# How derivatives of edges of shadows and shapes are sampled.
+_PROJECTIVE = (
+    dict.fromkeys(("sppc", "sppp", "sppi", "guiding_rounds"), Unused("integer"))
+    | {"guiding": Unused("string", choices=("none", "grid", "octree")), "guiding_proj": Unused("boolean")}
+    | {"project_seed": Unused("string", choices=("both", "bsdf", "emitter"))}
+)
+
+
+class PRBProjective(PRB):
+    """The same with derivatives of edges."""
+
+    unused = PRB.unused | _PROJECTIVE
 
 
 class PRBVolPath(PRB, VolPath):
     """Mitsuba's differentiable tracer of paths through participating media."""
 
-    same = "volpath"
+    same = "volpath, which is used"
 
 
 class PTracer(Path):
@@ -80,6 +100,18 @@ class Direct:
     @classmethod
     def read(cls, loader, fields: Fields) -> d.Integrator:
         return d.Integrator(max_depth=2, hide_emitters=fields.boolean("hide_emitters", False))
+
+
+class DirectProjective(Direct):
+    """The same for derivatives, those of edges among them."""
+
+    unused = Path.unused | _PROJECTIVE | {"rr_depth": Unused("integer")}
+
+    @classmethod
+    def read(cls, loader, fields):
+        fields.integer("max_depth", None, at_least=-1)
+        loader.note(fields.element, "is for derivatives; its image is that of direct, which is used")
+        return super().read(loader, fields)
 
 
 class Wrapper:
@@ -127,6 +159,9 @@ KINDS = {
     "volpath": VolPath,
     "volpathmis": VolPathMIS,
     "prb": PRB,
+    "prb_basic": PRBBasic,
+    "prb_projective": PRBProjective,
+    "direct_projective": DirectProjective,
     "prbvolpath": PRBVolPath,
     "ptracer": PTracer,
     "aov": AOV,

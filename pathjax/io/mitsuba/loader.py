@@ -14,7 +14,7 @@ from pathlib import Path
 from pathjax import description as d
 from pathjax import emitters, sensors
 from pathjax.description.elements import Document, Element, nearest
-from pathjax.description.fields import VALUES, Fields
+from pathjax.description.fields import VALUES, Fields, is_one_color
 from pathjax.errors import InputError
 from pathjax.io import bare, mesh
 from pathjax.io.mitsuba import dict_reader, instances, integrators, samplers
@@ -125,7 +125,7 @@ class _Loader:
             if _kind_of_light(element).on_surfaces and element not in self.on_shapes:
                 self.note(element, "is used by nothing; put it, or a <ref> to it, inside the <shape> that shines")
                 self.emitter(element, element.id, inside=True)
-        for element in (each for tag in SHARED for each in scene[tag] if each not in self.made):
+        for element in (each for tag in SHARED for each in scene[tag] if each not in self.made and not is_one_color(each)):
             self.note(element, "is used by nothing")
             if element.tag in ("film", "sampler", "rfilter"):
                 self.make(element, dict_reader.rooms()[element.tag])

@@ -7,7 +7,7 @@ PLUGINS = {
     tag: frozenset(names.split())
     for tag, names in {
         "integrator": "aov depth direct direct_projective moment path prb prb_basic prb_projective prbvolpath ptracer "
-        "stokes volpath volpathmis",
+        "stokes volpath volpathmis volprim_rf_basic",
         "sensor": "batch circular distant irradiancemeter orthographic perspective radiancemeter thinlens",
         "sampler": "independent ldsampler multijitter orthogonal stratified",
         "film": "hdrfilm specfilm",
@@ -28,11 +28,15 @@ PLUGINS = {
 _POLARISED = "polarisation is not modelled"
 # Why some of these are not modelled; the others may come.
 REASONS = {
+    "circular": _POLARISED,
     "measured_polarized": _POLARISED,
     "polarizer": _POLARISED,
     "pplastic": _POLARISED,
     "retarder": _POLARISED,
     "specfilm": "images are linear RGB",
+    "depth": "it shows distances, which `pathjax render --aov depth` writes",
+    "volprim_rf_basic": "ellipsoids that emit are not modelled",
+    "batch": "sensors that stand directly in <scene> are views of it, and one of them is chosen",
     "hair": "it stands on curves, which no ray is tested against",
     "bsplinecurve": "rays are not tested against curves",
     "linearcurve": "rays are not tested against curves",

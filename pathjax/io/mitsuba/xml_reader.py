@@ -79,7 +79,7 @@ class _Reader:
     def expand(self, root: Element, chain: tuple[Path, ...]) -> Element:
         if root.tag != "scene":
             raise root.error(f'the outermost element is {root}; a scene file starts with <scene version="3.0.0">')
-        require_attributes(root, required=("version",))
+        require_attributes(root, required=("version",), optional=("id",))
         version = root.attributes["version"]
         if not re.fullmatch(r"[0-3]\.\d+\.\d+", version):
             raise root.error(f'scene version "{version}" is not supported; use Mitsuba 3\'s format, version="3.0.0"')
