@@ -662,7 +662,7 @@ def test_sensors_that_are_not_modelled_are_refused(refused, inside, words):
 @pytest.mark.parametrize(
     ("body", "words"),
     [
-        ('<integrator type="depth"/>', "is not supported: it shows distances, which `pathjax render --aov depth` writes"),
+        ('<integrator type="depth"/>', "is not supported: it shows distances, which `pathjax render --aov depth`"),
         ('<integrator type="pth"/>', 'did you mean "path"'),
         ('<integrator type="moment"/>', "needs an <integrator> inside"),
         (f'<integrator type="moment">{2 * PATH}</integrator>', "takes at most 1"),

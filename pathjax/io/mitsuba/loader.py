@@ -125,7 +125,8 @@ class _Loader:
             if _kind_of_light(element).on_surfaces and element not in self.on_shapes:
                 self.note(element, "is used by nothing; put it, or a <ref> to it, inside the <shape> that shines")
                 self.emitter(element, element.id, inside=True)
-        for element in (each for tag in SHARED for each in scene[tag] if each not in self.made and not is_one_color(each)):
+        unread = (each for tag in SHARED for each in scene[tag] if each not in self.made)
+        for element in (each for each in unread if not is_one_color(each)):
             self.note(element, "is used by nothing")
             if element.tag in ("film", "sampler", "rfilter"):
                 self.make(element, dict_reader.rooms()[element.tag])
