@@ -372,6 +372,10 @@ def test_arrays_are_pictures_too():
         assert list(pj.parameters(scene)) == ["sky.radiance", "sky.scale"]
     with pytest.raises(pj.InputError, match=r"must have the shape \(H, W\)"):
         pj.load_dict({"type": "scene", "view": camera, "sky": {"type": "envmap", "data": np.ones((2, 2, 5))}})
+    # Of a bitmap Mitsuba leaves alpha out.
+    with_alpha = np.concatenate([texels, texels[..., :1]], -1)
+    scene = pj.load_dict({"type": "scene", "view": camera, "sky": {"type": "envmap", "bitmap": with_alpha}})
+    np.testing.assert_array_equal(scene.emitters[0].table.column("texels").values, texels.ravel())
 
 
 # ---- beside Mitsuba -------------------------------------------------------------------------------------------------

@@ -136,6 +136,8 @@ class _Reader:
         if array.ndim == 1:
             raise InputError(f"{place}: must be one number or three, has {len(array)}")
         name = "data" if key in ("bitmap", "grid") else key  # the same, where Mitsuba takes one of its own objects
+        if key == "bitmap" and array.ndim == 3 and array.shape[2] == 4:
+            array = array[..., :3]  # Mitsuba leaves alpha out, too
         return Element("array", {"name": name}, place, 0, data=array)
 
     def object(self, key: str, value: Mapping, place: str, top: bool) -> Element:
