@@ -6,6 +6,7 @@
   its results, only what is computed when. `together` changes the memory of a `native_fold`.
 - `linear` is a linear function with a transpose of its own.
 - `register_dataclass` makes a dataclass a pytree, where JAX's own may give it the kernel of another.
+- `on_all_devices` keeps large arrays from being copied at each call.
 - `concurrently` calls one kernel several times at once.
 - `setup` prepares XLA. It runs here, so that importing pathjax is enough; `keep_kernels` is for programs.
 
@@ -20,6 +21,7 @@ from pathjax.compile.linear import linear
 from pathjax.compile.mapping import MANY_ITEMS, cuts, native_fold, native_map, native_rows, split_map, sum_of_parts
 from pathjax.compile.primitives import Search, compute_once, interleaved, one_by_one, persistent_loop, together
 from pathjax.compile.promotion import usual_promotion
+from pathjax.compile.replicas import on_all_devices
 from pathjax.compile.threads import calls_at_once, concurrently, devices_of_a_call
 from pathjax.compile.xla import native, setup
 
@@ -40,6 +42,7 @@ __all__ = [
     "native_fold",
     "native_map",
     "native_rows",
+    "on_all_devices",
     "one_by_one",
     "persistent_loop",
     "register_dataclass",

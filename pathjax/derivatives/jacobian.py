@@ -20,7 +20,7 @@ from jaxtyping import Array, Float, Int
 
 from pathjax import emitters
 from pathjax.bsdfs import dielectric
-from pathjax.compile import is_symbolic_zero, is_traced, native, register_dataclass, usual_promotion
+from pathjax.compile import is_symbolic_zero, is_traced, native, on_all_devices, register_dataclass, usual_promotion
 from pathjax.core.types import Number
 from pathjax.derivatives import backward, ior, ior_difference, ior_step, places, rules, tangents
 from pathjax.errors import InputError
@@ -153,6 +153,7 @@ def pixel_jacobians(
         how: `form` and `devices` of `native_map`.
     """
     tangents.refuse_textures(wanted)
+    scene = on_all_devices(scene, how.get("devices"))
     attached = method == "attached"
     colors = [name for name, p in wanted.items() if attached or not p.moves_paths]
     rows = tuple(sorted({p.index[0] for p in wanted.values() if p.moves_paths}))

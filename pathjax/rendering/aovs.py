@@ -8,7 +8,7 @@ from functools import partial
 import jax
 import numpy as np
 
-from pathjax.compile import usual_promotion
+from pathjax.compile import on_all_devices, usual_promotion
 from pathjax.errors import InputError
 from pathjax.integrators import aov, pixel
 from pathjax.integrators.options import DEFAULTS, Options, check_counts
@@ -53,12 +53,13 @@ def render_aovs(scene: Scene, names: Sequence[str], spp: int = MAX_SPP, seed: in
     sampled = film.pixel_count(film.of_samples(scene.film))
     chunk = sampled if options.shared else min(CHUNK_PIXELS, count)
     images = [np.empty((count, width), np.float32) for width in (1, 3, 3)]
+    seen = on_all_devices(nameless(scene))
     for first in range(0, count, chunk):
         # The last call repeats the last pixel up to full length.
         pixels = np.minimum(np.arange(first, first + chunk, dtype=np.int32), sampled - 1)
         tiled = np.tile(pixels, replicates.COUNT)
         numbers = pixel.numbers(tiled, 0, *(np.repeat(x, chunk) for x in (np.maximum(shares, 1), seeds)))
-        for image, means in zip(images, _render_aovs(nameless(scene), tiled, *numbers, options=options), strict=True):
+        for image, means in zip(images, _render_aovs(seen, tiled, *numbers, options=options), strict=True):
             means = np.asarray(means, np.float32).reshape(replicates.COUNT, -1, image.shape[1])
             mean = (means * (shares / np.float32(spp))[..., None]).sum(0, dtype=np.float32)
             image[first : first + chunk] = mean[: count - first]

@@ -12,7 +12,7 @@ from jax import lax
 from jaxtyping import Array, Integer
 
 from pathjax import emitters
-from pathjax.compile import is_traced, register_dataclass, usual_promotion
+from pathjax.compile import is_traced, on_all_devices, register_dataclass, usual_promotion
 from pathjax.core.types import Number
 from pathjax.derivatives import rules, tangents
 from pathjax.errors import InputError
@@ -133,7 +133,7 @@ def _bounces(scene, depth, pixels, samples, seed, options, errors) -> Bounces:
     seeds = replicates.seeds(seed) if errors else jnp.asarray(seed, jnp.uint32)[None]
     most = None if is_traced(shares) else int(shares.max())
     estimator = _TermSums(depth, replace(options, by_vertex=True))
-    scene = replace(scene, max_depth=jnp.int32(depth))
+    scene = on_all_devices(replace(scene, max_depth=jnp.int32(depth)))
     if most is None or most <= _PORTION:
         sums = rules.estimate(estimator, scene, pixels, 0, shares, seeds)
     else:

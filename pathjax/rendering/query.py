@@ -10,7 +10,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Real
 
-from pathjax.compile import native_map, usual_promotion
+from pathjax.compile import native_map, on_all_devices, usual_promotion
 from pathjax.core.math import normalize, rescale
 from pathjax.core.types import Hit, Ray
 from pathjax.errors import InputError
@@ -33,7 +33,7 @@ def closest_hit(scene: Scene, origins: Vectors, directions: Vectors) -> Hit:
     Raises:
         InputError: origins and directions do not have one shape (N, 3).
     """
-    return _closest_hit(scene.geometry, *_rays(scene, origins, directions))
+    return _closest_hit(on_all_devices(scene.geometry), *_rays(scene, origins, directions))
 
 
 @by_all
@@ -53,7 +53,7 @@ def any_hit(
     if np.shape(distances) not in ((), origins.shape[:1]):
         raise InputError(f"distances have the shape {np.shape(distances)}; give one, or one for each of the rays")
     distances = jnp.broadcast_to(jnp.asarray(distances, origins.dtype), origins.shape[:1])
-    return _any_hit(scene.geometry, origins, directions, distances)
+    return _any_hit(on_all_devices(scene.geometry), origins, directions, distances)
 
 
 def _rays(scene: Scene, origins: Vectors, directions: Vectors) -> tuple[Float[Array, "N 3"], Float[Array, "N 3"]]:

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from pathjax import emitters
-from pathjax.compile import usual_promotion
+from pathjax.compile import on_all_devices, usual_promotion
 from pathjax.core.types import Number
 from pathjax.derivatives import matrix_free
 from pathjax.derivatives.backward import longest_ring
@@ -100,6 +100,7 @@ def render_pixels(scene: Scene, pixels, first_sample, spp, seed, options: Option
     how: `form` and `devices` of `native_map`.
     """
     numbers = pixel.numbers(pixels, first_sample, spp, seed)
+    scene = on_all_devices(scene, how.get("devices"))
     return estimate(_PixelMeans(options, tuple(how.items()), longest_ring(scene)), scene, control, pixels, *numbers)
 
 

@@ -1,0 +1,50 @@
+"""Large arrays on all devices: JAX copies an array of one device to the others at each call that needs it there."""
+
+from __future__ import annotations
+
+import weakref
+from typing import TypeVar
+
+import jax
+import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+from pathjax.compile.jax_compat import is_traced
+
+Tree = TypeVar("Tree")
+# Bytes of an array that is worth it: less is copied in some ten microseconds, which keeping it takes, too.
+_LARGE = 1 << 18
+# By the address of an array: a reference to it, and the same numbers on all devices, for as long as it lives.
+_kept: dict[int, tuple[weakref.ref, jax.Array]] = {}
+
+
+def on_all_devices(tree: Tree, devices: int | None = None) -> Tree:
+    """The tree, whose large arrays are those on all devices, for kernels that run there.
+
+    CPU devices share one memory, so nothing is copied there. Traced values, and arrays that someone placed, stay.
+
+    Args:
+        devices: of `native_map`; if given, the tree stays.
+    """
+    if devices is not None or len(jax.devices()) == 1:
+        return tree
+    return jax.tree.map(lambda x: _replica(x) if _is_copied(x) else x, tree)
+
+
+def _is_copied(x) -> bool:
+    return isinstance(x, jax.Array) and not is_traced(x) and x.nbytes >= _LARGE and not x.committed
+
+
+def _replica(x: jax.Array) -> jax.Array:
+    kept = _kept.get(id(x))
+    if kept is not None and kept[0]() is x:
+        return kept[1]
+    here, used = jax.local_devices(), jax.devices()
+    # A view of a CPU device's memory, which other CPU devices take as it is. It keeps the memory, and not x.
+    source = np.from_dlpack(x) if here[0].platform == "cpu" else x
+    copies = [x if {device} == x.devices() else jax.device_put(source, device) for device in here]
+    everywhere = NamedSharding(Mesh(np.array(used), ("device",)), PartitionSpec())
+    replica = jax.make_array_from_single_device_arrays(x.shape, everywhere, copies)
+    key = id(x)
+    _kept[key] = weakref.ref(x, lambda _: _kept.pop(key, None)), replica
+    return replica

@@ -1,0 +1,89 @@
+"""Large arrays on all devices: the same memory, for as long as the array lives, and in every kernel that all run."""
+
+import gc
+import weakref
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import trimesh
+
+import pathjax as pj
+from pathjax.compile import on_all_devices
+from pathjax.derivatives import jacobian
+from pathjax.rendering import aovs, bounces, query, render
+
+pytestmark = pytest.mark.skipif(
+    len(jax.devices()) < 2 or jax.default_backend() != "cpu", reason="needs two devices that share their memory"
+)
+LARGE = np.arange(1 << 17, dtype=np.float32)
+
+
+def addresses(x):
+    return {shard.data.unsafe_buffer_pointer() for shard in x.addressable_shards}
+
+
+def test_large_arrays_are_on_all_devices_without_a_copy():
+    given = {"large": jax.device_put(LARGE), "flags": jax.device_put(np.tile(LARGE > 5, 4)), "small": jnp.zeros(3), "none": None}
+    found = on_all_devices(given)
+    for name in ("large", "flags"):
+        assert found[name].is_fully_replicated and found[name].devices() == set(jax.devices())
+        np.testing.assert_array_equal(found[name], given[name])
+    assert addresses(found["large"]) == addresses(given["large"])
+    assert found["small"] is given["small"] and found["none"] is None
+    assert on_all_devices(given)["large"] is found["large"], "it is made once"
+
+
+def test_what_was_placed_or_is_traced_stays_and_so_does_all_for_one_device():
+    placed, free = jax.device_put(LARGE, jax.devices()[1]), jax.device_put(LARGE)
+    assert on_all_devices(placed) is placed
+    assert on_all_devices(free, 1) is free
+    np.testing.assert_array_equal(jax.jit(lambda x: on_all_devices(x) + 1)(free), LARGE + 1)
+
+
+def test_memory_is_freed_with_the_array():
+    x = jax.device_put(LARGE.copy())
+    replica = weakref.ref(on_all_devices(x))
+    gc.collect()
+    assert replica() is not None
+    del x
+    gc.collect()
+    assert replica() is None
+
+
+class Reached(Exception):
+    pass
+
+
+@pytest.mark.parametrize(
+    ("module", "kernel", "call"),
+    [
+        (render, "pixel_means", lambda scene: pj.render(scene, 1)),
+        (jacobian, "_jacobians", lambda scene: pj.jacobian(scene, ["paint.reflectance"], 1)),
+        (bounces, "_kernel", lambda scene: pj.render_bounces(scene, 2, 1)),
+        (aovs, "_render_aovs", lambda scene: pj.render_aovs(scene, ["depth"], 1)),
+        (query, "_closest_hit", lambda scene: pj.closest_hit(scene, np.zeros((1, 3)), np.ones((1, 3)))),
+        (query, "_any_hit", lambda scene: pj.any_hit(scene, np.zeros((1, 3)), np.ones((1, 3)))),
+    ],
+)
+def test_every_kernel_of_all_devices_finds_the_scene_there(module, kernel, call, monkeypatch):
+    paint = {"type": "diffuse", "id": "paint"}
+    description = {
+        "type": "scene",
+        "integrator": {"type": "path", "max_depth": 2},
+        "sensor": {"type": "perspective", "film": {"type": "hdrfilm", "width": 4, "height": 4}},
+        "light": {"type": "constant"},
+        "ball": {"type": "mesh", "mesh": trimesh.creation.icosphere(5), "bsdf": paint},
+    }
+    scene = pj.load_dict(description)
+    seen = []
+
+    def spy(*args, **_):
+        seen.extend(x for x in jax.tree.leaves(args) if getattr(x, "nbytes", 0) >= 1 << 18)
+        raise Reached
+
+    monkeypatch.setattr(module, kernel, spy)
+    with pytest.raises(Reached):
+        call(scene)
+    assert seen and all(x.devices() == set(jax.devices()) for x in seen)
