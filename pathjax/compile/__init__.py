@@ -8,14 +8,15 @@
 - `register_dataclass` makes a dataclass a pytree, where JAX's own may give it the kernel of another.
 - `on_all_devices` keeps large arrays from being copied at each call.
 - `concurrently` calls one kernel several times at once.
-- `setup` prepares XLA. It runs here, so that importing pathjax is enough; `keep_kernels` is for programs.
+- `setup` prepares XLA. It runs here, so that importing pathjax is enough; `keep_kernels` is for programs,
+  and `compiled` then finds on disk what they would trace.
 
 Whatever of JAX is not public is imported by `jax_compat` alone.
 """
 
 from __future__ import annotations
 
-from pathjax.compile.cache import keep_kernels
+from pathjax.compile.cache import compiled, keep_kernels
 from pathjax.compile.jax_compat import is_symbolic_zero, is_traced, register_dataclass
 from pathjax.compile.linear import linear
 from pathjax.compile.mapping import MANY_ITEMS, cuts, native_fold, native_map, native_rows, split_map, sum_of_parts
@@ -29,6 +30,7 @@ __all__ = [
     "MANY_ITEMS",
     "Search",
     "calls_at_once",
+    "compiled",
     "compute_once",
     "concurrently",
     "cuts",

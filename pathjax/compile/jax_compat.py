@@ -24,6 +24,7 @@ __all__ = [
     "Primitive",
     "ad",
     "batching",
+    "bytes_of_program",
     "call_of_identity",
     "called_program",
     "found_cluster",
@@ -33,6 +34,7 @@ __all__ = [
     "jaxpr_as_fun",
     "mlir",
     "program_of",
+    "program_of_bytes",
     "register_dataclass",
     "scan_parts",
     "source_info_util",
@@ -124,6 +126,21 @@ def call_of_identity(context: mlir.LoweringRuleContext, value: ir.Value) -> list
     call = func.CallOp(types, ir.FlatSymbolRefAttr.get(function.name.value), [value])
     call.attributes["mhlo.frontend_attributes"] = ir.DictAttr.get({"inlineable": ir.StringAttr.get("false")})
     return list(call.results)
+
+
+def bytes_of_program(compiled) -> bytes:
+    """A compiled function of one device as bytes."""
+    from jax.experimental.serialize_executable import serialize
+
+    return serialize(compiled)[0]
+
+
+def program_of_bytes(content: bytes, arguments, result):
+    """The compiled function of such bytes, as it was called: a tuple of arguments, and something like its result."""
+    from jax.experimental.serialize_executable import deserialize_and_load
+
+    trees = jax.tree.structure((arguments, {})), jax.tree.structure(result)
+    return deserialize_and_load(content, *trees, execution_devices=jax.local_devices()[:1])
 
 
 def while_parts(eqn, values) -> tuple[list, list, list]:

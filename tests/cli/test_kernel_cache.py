@@ -14,28 +14,30 @@ PIPES = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
 BYTE = "\udcff"
 
 
-# The same command line; then says how many programs were wanted of the cache, and how many it held.
+# The same command line; then says how many programs were wanted of JAX's cache, how many it held, and how often the
+# kernel of the image was traced.
 COUNTED = """
 import sys
 from pathjax import cli
 import jax
 
-events = []
+events, traced = [], []
 jax.monitoring.register_event_listener(lambda event, **_: events.append(event.rpartition("/")[2]))
+jax.monitoring.register_event_duration_secs_listener(lambda event, _, **what: traced.append(what.get("fun_name")))
 status = cli.main(sys.argv[1:])
-print(events.count("compile_requests_use_cache"), events.count("cache_hits"))
+print(events.count("compile_requests_use_cache"), events.count("cache_hits"), traced.count("_replicate_means"))
 sys.exit(status)
 """
 
 
 @pytest.fixture
 def counted(root, environment, tmp_path):
-    """(**environment) -> a process that renders the furnace to a file of its own, and that file."""
+    """(*options, **environment) -> a process that renders the furnace to a file of its own, and that file."""
     numbers = iter(range(100))
 
-    def start(**variables):
+    def start(*more, **variables):
         output = tmp_path / f"{next(numbers)}.exr"
-        arguments = ("render", FURNACE, *SMALL, "-o", output, "--spp", 4)
+        arguments = ("render", FURNACE, *SMALL, "-o", output, "--spp", 4, *more)
         command = [sys.executable, "-c", COUNTED, *map(str, arguments)]
         plain = {name: value for name, value in environment.items() if not name.startswith(("JAX_", "PATHJAX_"))}
         variables = {name: str(value) for name, value in variables.items()}
@@ -45,7 +47,10 @@ def counted(root, environment, tmp_path):
 
 
 def end(started):
-    """Programs wanted of the cache, those found, and the image's bytes; nothing may be said on stderr."""
+    """Programs wanted of JAX's cache, those found, traces of the kernel of the image, and this one's bytes.
+
+    Nothing may be said on stderr.
+    """
     process, output = started
     out, err = process.communicate(timeout=120)
     assert process.returncode == 0, err
@@ -54,7 +59,7 @@ def end(started):
 
 
 def entries(folder):
-    return sorted(path.name for path in folder.rglob("*-cache"))
+    return sorted(path.name for path in folder.rglob("*") if path.suffix == ".program" or path.name.endswith("-cache"))
 
 
 linux = pytest.mark.skipif(sys.platform != "linux", reason="kernels are kept on Linux only")
@@ -62,18 +67,32 @@ linux = pytest.mark.skipif(sys.platform != "linux", reason="kernels are kept on 
 
 @linux
 def test_the_second_run_compiles_nothing_and_gives_the_same_image(counted, tmp_path):
-    cache = tmp_path / "cache"
-    both = [counted(XDG_CACHE_HOME=cache) for _ in range(2)]  # at once, on an empty cache
+    cache, depth = tmp_path / "cache", ("--aov", "depth")
+    both = [counted(*depth, XDG_CACHE_HOME=cache) for _ in range(2)]  # at once, on an empty cache
     first, other = map(end, both)
     kept = entries(cache)
-    assert any(name.startswith("jit__replicate_means") for name in kept)
-    assert all(path.relative_to(cache).parts[0] == "pathjax" for path in cache.rglob("*-cache"))
-    wanted, found, image = end(counted(XDG_CACHE_HOME=cache))
+    assert sum(name.endswith(".program") for name in kept) == 1
+    assert any(name.startswith("jit__render_aovs") for name in kept)
+    assert not any(name.startswith("jit__replicate_means") for name in kept), "it is kept twice"
+    assert all(path.relative_to(cache).parts[0] == "pathjax" for path in cache.rglob("*") if path.is_file())
+    wanted, found, traced, image = end(counted(*depth, XDG_CACHE_HOME=cache))
     assert wanted == found > 0
+    assert traced == 0 < first[2]
     assert entries(cache) == kept
     without = end(counted(PATHJAX_CACHE=0, XDG_CACHE_HOME=tmp_path / "none"))
-    assert image == first[2] == other[2] == without[2]
-    assert without[1] == 0 and not (tmp_path / "none").exists()
+    assert image == first[3] == other[3] == without[3]
+    assert without[1] == 0 < without[2] and not (tmp_path / "none").exists()
+
+
+@linux
+def test_a_program_that_cannot_be_read_is_made_anew(counted, tmp_path):
+    first = end(counted(XDG_CACHE_HOME=tmp_path / "cache"))
+    (program,) = (tmp_path / "cache").rglob("*.program")
+    program.write_bytes(b"nothing of XLA's")
+    again = end(counted(XDG_CACHE_HOME=tmp_path / "cache"))
+    last = end(counted(XDG_CACHE_HOME=tmp_path / "cache"))
+    assert again[2] > 0 == last[2]
+    assert first[3] == again[3] == last[3]
 
 
 @linux
@@ -102,13 +121,14 @@ def test_a_full_cache_disk_stops_no_render_and_keeps_no_halves(counted, tmp_path
     cache, limits = tmp_path / "cache", resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 15, limits[1]))  # of the child; its kernel is larger
     try:
-        started = counted(XDG_CACHE_HOME=cache)
+        started = counted("--aov", "depth", XDG_CACHE_HOME=cache)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-    _, found, image = end(started)
-    assert found == 0
+    _, found, traced, image = end(started)
+    assert found == 0 < traced
     assert any(path.stat().st_size == 1 << 15 for path in cache.rglob("*-cache"))
-    end(counted(XDG_CACHE_HOME=cache))
-    wanted, found, again = end(counted(XDG_CACHE_HOME=cache))
-    assert wanted == found > 0
+    assert not [path for path in cache.rglob("*") if path.suffix in (".program", ".part")]
+    end(counted("--aov", "depth", XDG_CACHE_HOME=cache))
+    wanted, found, traced, again = end(counted("--aov", "depth", XDG_CACHE_HOME=cache))
+    assert wanted == found > 0 == traced
     assert again == image

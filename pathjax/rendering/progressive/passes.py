@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pathjax import distributed, emitters
-from pathjax.compile import MANY_ITEMS, calls_at_once, devices_of_a_call
+from pathjax.compile import MANY_ITEMS, calls_at_once, compiled, devices_of_a_call
 from pathjax.integrators import pixel, reconstruction
 from pathjax.integrators.options import DEFAULTS, Options
 from pathjax.rendering.progressive import replicates
@@ -231,12 +231,12 @@ def compile(scene: Scene, options: Options = DEFAULTS) -> Callable:
     arguments = scene, jax.ShapeDtypeStruct((3, chunk), np.int32), np.uint32(0)
     if scene.film.shared:
         scale = jax.ShapeDtypeStruct((chunk,), np.float32)
-        lowered = _replicate_sums.lower(*arguments, scale, options=replace(options, shared=True))
+        kernel = compiled(_replicate_sums, *arguments, scale, options=replace(options, shared=True))
     else:
-        lowered = _replicate_means.lower(*arguments, options=options)
-    # JAX keeps what it has compiled. A compiled kernel, unlike a jitted function, does not ask for the calling thread's
-    # contexts, such as `jax.enable_x64`.
-    return partial(lowered.compile(), scene)
+        kernel = compiled(_replicate_means, *arguments, options=options)
+    # A compiled kernel, unlike a jitted function, does not ask for the calling thread's contexts, such as
+    # `jax.enable_x64`.
+    return partial(kernel, scene)
 
 
 @partial(jax.jit, static_argnames="options")
