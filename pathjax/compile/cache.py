@@ -17,6 +17,7 @@ import jax
 import jaxlib
 
 from pathjax.compile.jax_compat import bytes_of_program, program_of_bytes
+from pathjax.compile.lanes import without_collections
 from pathjax.system.files import write_whole
 
 # Most bytes of compiled kernels on disk, some 100 kB each; those used longest ago go first.
@@ -74,17 +75,16 @@ def _keep_programs(folder: Path) -> None:
 
 
 def compiled(function, *arguments, **static) -> Callable:
-    """`function.lower(*arguments, **static).compile()` of a jitted function that runs on one device and gives one array.
+    """`function.lower(*arguments, **static).compile()`, of a jitted function of one device that gives one array.
 
-    With `keep_kernels`, a program is found by what it is traced from, which takes half as long as to trace it and to
-    find it by what that gives.
+    With `keep_kernels`, a program is found by what it is traced from, without tracing it.
     """
     try:
         if _programs is None or jax.default_backend() != "cpu" or jax.process_count() > 1:
             raise _Unknown
         key = _key(function, arguments, static)
     except _Unknown:
-        return function.lower(*arguments, **static).compile()
+        return _lowered(function, arguments, static).compile()
     if key not in _known:
         file = _programs / f"{key}.program"
         _known[key] = _read(file, arguments) or _made(file, function, arguments, static)
@@ -101,8 +101,13 @@ def _read(file: Path, arguments) -> Callable | None:
         return None
 
 
+def _lowered(function, arguments, static):
+    with without_collections():
+        return function.lower(*arguments, **static)
+
+
 def _made(file: Path, function, arguments, static) -> Callable:
-    lowered, hits = function.lower(*arguments, **static), len(_hits)
+    lowered, hits = _lowered(function, arguments, static), len(_hits)
     # JAX is not to keep the program too: XLA writes one that it has read without some of its functions.
     least = jax.config.jax_persistent_cache_min_compile_time_secs
     jax.config.update("jax_persistent_cache_min_compile_time_secs", float("inf"))

@@ -39,7 +39,7 @@ def lanes(f: Callable, width: int, memory=None) -> Callable:
     """
     memories = len(jax.tree.leaves(memory))
 
-    @_without_collections()
+    @without_collections()
     def run(xs, *shared):
         shared = shared if memory is None else (*shared, memory)
         one = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), xs)
@@ -62,7 +62,7 @@ def lanes(f: Callable, width: int, memory=None) -> Callable:
 
 
 @contextlib.contextmanager
-def _without_collections() -> Iterator[None]:
+def without_collections() -> Iterator[None]:
     """Tracing makes many objects that stay, through all of which Python's collector would go time and again."""
     enabled = gc.isenabled()
     gc.disable()
