@@ -25,7 +25,8 @@ def addresses(x):
 
 
 def test_large_arrays_are_on_all_devices_without_a_copy():
-    given = {"large": jax.device_put(LARGE), "flags": jax.device_put(np.tile(LARGE > 5, 4)), "small": jnp.zeros(3), "none": None}
+    flags = jax.device_put(np.tile(LARGE > 5, 4))
+    given = {"large": jax.device_put(LARGE), "flags": flags, "small": jnp.zeros(3), "none": None}
     found = on_all_devices(given)
     for name in ("large", "flags"):
         assert found[name].is_fully_replicated and found[name].devices() == set(jax.devices())

@@ -194,7 +194,9 @@ def _check(path: str | Path, raw: Raw) -> None:
 def _transformed(path: str | Path, vertices: np.ndarray, to_world: np.ndarray) -> np.ndarray:
     """(V, 3) float64; finite also when rounded to float32, as everything downstream does."""
     with np.errstate(over="ignore", invalid="ignore"):
-        world = vertices @ to_world[:3, :3].T + to_world[:3, 3]
+        # Where nothing moves, as zero is added, -0 becomes 0 all the same.
+        still = np.array_equal(to_world, np.eye(4))
+        world = vertices + 0.0 if still else vertices @ to_world[:3, :3].T + to_world[:3, 3]
         finite = np.isfinite(world.astype(np.float32)).all() and np.isfinite(vertices).all()
         if not finite:
             bad = _first_bad(world.astype(np.float32) + vertices)
