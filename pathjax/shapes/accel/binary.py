@@ -23,6 +23,7 @@ PLACES = 128  # with twice or half as many, rays visit the same number of nodes 
 BATCH = 1 << 16  # primitives whose nodes are split together: their arrays stay in the cache
 SPREAD = 1.15  # of counts in a batch, in which all nodes are filled up to the largest
 FEW = 1 << 12  # primitives that are not worth a batch of their own
+LONG_ROW = 1 << 15  # bytes from which on a NumPy operation takes longer than it takes to begin
 
 
 def binary_tree(unit, rule, leaf_size):
@@ -151,9 +152,8 @@ def _costs(order, rows, leaf_size, start, count, low, high, before, after, run):
     left, right = np.empty((2, 6, len(ends), *start.shape), np.float32)
     left[:, 1:] = right[:, :-1] = np.moveaxis(reduce(np.maximum, parts), 3, 0)[:6]
     left[:, 0], right[:, -1] = before, after
-    for k in range(1, len(ends)):
-        np.maximum(left[:, k], left[:, k - 1], out=left[:, k])
-        np.maximum(right[:, -k - 1], right[:, -k], out=right[:, -k - 1])
+    _accumulate(left)
+    _accumulate(right[:, ::-1])
 
     nl = ends[1:-1]
     nr = count - nl
@@ -164,6 +164,17 @@ def _costs(order, rows, leaf_size, start, count, low, high, before, after, run):
     # The bits of positive floats order as these do. Of costs equal but for rounding, the most even.
     keys = (cost.view(np.int32) & ~7).astype(np.int64) << 32 | (np.abs(nl - nr) << 1 | (nl > nr))
     return keys, ends, left, right
+
+
+def _accumulate(bounds):
+    """Let rows (6, rows, 3, M) become, in place, the bounds of all rows before them too."""
+    rows = bounds.shape[1]
+    if bounds[:, 0].size * bounds.itemsize > LONG_ROW:
+        for k in range(1, rows):
+            np.maximum(bounds[:, k], bounds[:, k - 1], out=bounds[:, k])
+    else:  # more is computed, by fewer operations
+        for step in 2 ** np.arange((rows - 1).bit_length()):
+            bounds[:, step:] = np.maximum(bounds[:, step:], bounds[:, :-step])
 
 
 def half_area(x, y, z):
