@@ -224,15 +224,21 @@ def test_rounds_of_samples_spread_unevenly_leave_the_mean(ball):
 
 
 @pytest.mark.slow
-def test_a_kept_state_goes_on_to_the_same_bits(ball, tmp_path):
+@pytest.mark.parametrize("devices", [3, 5])
+def test_a_kept_state_goes_on_to_the_same_bits(ball, tmp_path, monkeypatch, devices):
+    """With another number of devices too, for which the image would have been cut into other runs."""
     from pathjax.rendering.progressive.checkpoint import Checkpoint
 
+    monkeypatch.setattr(passes, "_LEAST_CHUNK", 1)
+    monkeypatch.setattr(passes, "calls_at_once", lambda: 3)
     ended, kept = passes.start(ball), passes.start(ball)
     for state in (ended, kept):
         extended(ball, state, 16)
         state.spread(np.linspace(0.5, 1.5, 64, dtype=np.float32).reshape(8, 8))
         passes.plan(state, 1000)
     next(passes.extend(ball, kept, 5, DEFAULTS))
+    assert 0 < (kept.count == ended.count).sum() < kept.count.size
+    monkeypatch.setattr(passes, "calls_at_once", lambda: devices)
     store = Checkpoint(tmp_path / "run.npz", {})
     store.save(kept)
     loaded = store.load(passes.start(ball))

@@ -67,6 +67,7 @@ class Checkpoint:
             with np.load(self.path, allow_pickle=False) as file:
                 facts = json.loads(str(file["facts"]))
                 identity, spp, seconds = facts["identity"], int(facts["spp"]), float(facts["seconds"])
+                chunk = min(max(int(facts["chunk"]), 1), len(fresh.count))
                 arrays = {name: file[name] for name in ("means", *fresh.of_pixels)} if file.files != ["facts"] else {}
         except Exception as error:  # zipfile, zlib, NumPy and json raise what they like, as the file's bytes have it
             raise self._refusal(f"is not a checkpoint, or is damaged ({error})") from None
@@ -83,7 +84,7 @@ class Checkpoint:
             if array.dtype != wanted.dtype or array.shape not in shapes:
                 raise self._refusal(f"is damaged: {name} is {array.dtype}{list(array.shape)}")
             setattr(state, name, np.broadcast_to(array, wanted.shape).copy())
-        state.resume(spp)
+        state.resume(spp, chunk)
         return state
 
     def save(self, state: State) -> None:
@@ -99,7 +100,7 @@ class Checkpoint:
         arrays = {}
         if state.count.any():
             arrays = {"means": state.means} | {name: one_if_equal(getattr(state, name)) for name in state.of_pixels}
-        facts = json_text({"identity": self.identity, "spp": state.spp, "seconds": state.seconds})
+        facts = json_text({"identity": self.identity, "spp": state.spp, "chunk": state.chunk, "seconds": state.seconds})
 
         try:
             write_whole(self.path, lambda file: np.savez(file, facts=np.array(facts), **arrays))

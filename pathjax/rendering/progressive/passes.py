@@ -14,7 +14,7 @@ import numpy as np
 from pathjax import distributed, emitters
 from pathjax.compile import MANY_ITEMS, calls_at_once, compiled, devices_of_a_call
 from pathjax.integrators import pixel, reconstruction
-from pathjax.integrators.options import DEFAULTS, Options
+from pathjax.integrators.options import Options
 from pathjax.rendering.progressive import replicates
 from pathjax.rendering.render import pixel_means
 from pathjax.scene.parameters import nameless
@@ -42,6 +42,7 @@ class State:
     count: np.ndarray  # (N,) int32 samples so far, of all replicates together
     goal: np.ndarray  # (N,) int32 samples at the end of this round
     weights: np.ndarray  # (N,) float32 of mean 1, how samples are spread over the pixels
+    chunk: int  # pixels of a call
     spp: int = 0  # mean samples of a pixel that the round was planned for
     seconds: float = 0.0  # spent rendering
 
@@ -76,15 +77,15 @@ class State:
         self.goal = np.maximum(self.count, np.minimum(goal, np.iinfo(np.int32).max).astype(np.int32))
         self.spp = spp
 
-    def resume(self, spp: int) -> None:
-        """Go on with a round that a checkpoint has kept."""
+    def resume(self, spp: int, chunk: int) -> None:
+        """Go on with a round that a checkpoint has kept, of calls of so many pixels: any number gives the same bits."""
         self.plan(spp)
 
-    def runs(self, missing: np.ndarray, chunk: int) -> Iterator[np.ndarray]:
+    def runs(self, missing: np.ndarray) -> Iterator[np.ndarray]:
         """Pixels of each call of the kernel, of those (n,) that miss samples: at most `chunk`."""
-        return (missing[first : first + chunk] for first in range(0, missing.size, chunk))
+        return (missing[first : first + self.chunk] for first in range(0, missing.size, self.chunk))
 
-    def more(self, pixels: np.ndarray, chunk: int) -> tuple[np.ndarray, ...]:
+    def more(self, pixels: np.ndarray) -> tuple[np.ndarray, ...]:
         """What the kernel takes beside the numbers of samples."""
         return ()
 
@@ -146,16 +147,17 @@ class SharedState(State):
         self.scale = (np.maximum(missing, 0) / np.maximum(wanted, 1)).astype(np.float32)
         self.spp = spp
 
-    def resume(self, spp: int) -> None:
-        self.spp = spp  # the rest is as it was kept
+    def resume(self, spp: int, chunk: int) -> None:
+        # In the same runs: of others some would be half done, and sums would have another order.
+        self.spp, self.chunk = spp, chunk  # the rest is as it was kept
 
-    def runs(self, missing: np.ndarray, chunk: int) -> Iterator[np.ndarray]:
+    def runs(self, missing: np.ndarray) -> Iterator[np.ndarray]:
         """Runs of pixels; some of them may have all their samples."""
-        for number in np.unique(missing // chunk):
-            yield np.arange(number * chunk, min((number + 1) * chunk, len(self.count)), dtype=np.int32)
+        for number in np.unique(missing // self.chunk):
+            yield np.arange(number * self.chunk, min((number + 1) * self.chunk, len(self.count)), dtype=np.int32)
 
-    def more(self, pixels: np.ndarray, chunk: int) -> tuple[np.ndarray, ...]:
-        return (np.pad(self.scale[pixels], (0, chunk - len(pixels))),)
+    def more(self, pixels: np.ndarray) -> tuple[np.ndarray, ...]:
+        return (np.pad(self.scale[pixels], (0, self.chunk - len(pixels))),)
 
     def add(self, pixels: np.ndarray, before: np.ndarray, after: np.ndarray, means: np.ndarray) -> None:
         """Sums (R, chunk + 2 halo, 4), of which the first pixels lie before."""
@@ -168,10 +170,11 @@ class SharedState(State):
 def start(scene: Scene) -> State:
     count = film.pixel_count(film.of_samples(scene.film))
     none, one = np.zeros(count, np.int32), np.ones(count, np.float32)
+    beside = none, none.copy(), one, _chunk(count)
     if not scene.film.shared:
-        return State(np.zeros((replicates.COUNT, count, 3), np.float32), none, none.copy(), one)
+        return State(np.zeros((replicates.COUNT, count, 3), np.float32), *beside)
     sums = np.zeros((replicates.COUNT, count, 4), np.float32)
-    return SharedState(sums, none, none.copy(), one, scale=one.copy(), begun=none.copy(), film=scene.film)
+    return SharedState(sums, *beside, scale=one.copy(), begun=none.copy(), film=scene.film)
 
 
 def plan(state: State, spp: int) -> None:
@@ -192,14 +195,14 @@ def extend(
     Args:
         stopped: asked before each call. Once it is true none begins; those that run are waited for.
     """
-    kernel, chunk = compile(scene, options), _chunk(scene)
+    kernel = compile(scene, options, state.chunk)
 
     def rendered(portion):
-        numbers = np.zeros((3, chunk), np.int32)
+        numbers = np.zeros((3, state.chunk), np.int32)
         numbers[:, : len(portion[0])] = portion
-        return np.asarray(kernel(numbers, np.uint32(seed), *state.more(portion[0], chunk)))
+        return np.asarray(kernel(numbers, np.uint32(seed), *state.more(portion[0])))
 
-    for portion, means in distributed.dealt(rendered, _portions(state, chunk), stopped):
+    for portion, means in distributed.dealt(rendered, _portions(state), stopped):
         if means is None:
             yield False
             return
@@ -207,14 +210,14 @@ def extend(
         yield True
 
 
-def _portions(state: State, chunk: int) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+def _portions(state: State) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """What lies between the state and its goal, portion by portion: pixels and their numbers of samples before and
-    after, (n,) int32 each, n <= chunk."""
+    after, (n,) int32 each, n <= `state.chunk`."""
     # From where the round began, for sums of neighbouring runs depend on their order; what is there is left out.
     there = state.count.copy()
     planned = (state.begun if isinstance(state, SharedState) else state.count).copy()
     while (missing := np.flatnonzero(planned < state.goal).astype(np.int32)).size:
-        for pixels in state.runs(missing, chunk):
+        for pixels in state.runs(missing):
             before, goal = planned[pixels], state.goal[pixels]
             least = _FIRST_SPP[np.searchsorted(_GOALS, replicates.one_if_equal(goal), side="right")]
             planned[pixels] = after = np.minimum(before + np.clip(3 * before, least, MAX_PASS_SPP), goal)
@@ -222,12 +225,12 @@ def _portions(state: State, chunk: int) -> Iterator[tuple[np.ndarray, np.ndarray
                 yield pixels, before, after
 
 
-def compile(scene: Scene, options: Options = DEFAULTS) -> Callable:
+def compile(scene: Scene, options: Options, chunk: int) -> Callable:
     """The kernel of `extend`: (3, n) int32 of a chunk, the pixels and their numbers of samples before and after, and a
     seed -> means of each replicate over the samples between, 0 of none, (R, n, 3) float32. Of a film that shares
     samples: also what each weighs, (n,) float32 -> A and W of `reconstruction.sums`, (R, m, 4)."""
     # Without the derivatives of `render_pixels`, whose machinery takes longer than a call of few samples.
-    scene, chunk = nameless(scene), _chunk(scene)
+    scene = nameless(scene)
     arguments = scene, jax.ShapeDtypeStruct((3, chunk), np.int32), np.uint32(0)
     if scene.film.shared:
         scale = jax.ShapeDtypeStruct((chunk,), np.float32)
@@ -265,8 +268,8 @@ def _replicate_sums(scene, numbers, seed, scale, *, options):
     return jnp.concatenate([sums, weights[..., None]], -1).astype(jnp.float32)
 
 
-def _chunk(scene: Scene) -> int:
+def _chunk(count: int) -> int:
     """Pixels of a call: all calls have one shape, so one kernel, and each of those that run at once gets as many."""
-    count, at_once = film.pixel_count(film.of_samples(scene.film)), calls_at_once() * distributed.count()
+    at_once = calls_at_once() * distributed.count()
     calls = at_once * -(-count // (at_once * CHUNK_PIXELS))
     return min(count, max(-(-count // calls), _LEAST_CHUNK))

@@ -128,14 +128,14 @@ class Render:
     def _agree(self) -> None:
         """Begin where the first process does, who alone needs to see the checkpoint."""
         state = self.state
-        facts = np.int32(state.spp), np.float32(state.seconds)
-        (spp, seconds), state.means = distributed.of_first((facts, state.means))
+        facts = np.int32(state.spp), np.int32(state.chunk), np.float32(state.seconds)
+        (spp, chunk, seconds), state.means = distributed.of_first((facts, state.means))
         state.take(distributed.of_first(state.arrays()))
-        state.spp, state.seconds = int(spp), float(seconds)
+        state.spp, state.chunk, state.seconds = int(spp), int(chunk), float(seconds)
 
     def compile(self) -> None:
         started = time.perf_counter()
-        passes.compile(self.scene, self.options)
+        passes.compile(self.scene, self.options, self.state.chunk)
         self.compile_seconds += time.perf_counter() - started
 
     def run(self, progress: bool = False) -> RenderResult:
