@@ -11,6 +11,7 @@ from __future__ import annotations
 import atexit
 import hashlib
 import os
+import pickle
 import re
 import sys
 import time
@@ -37,6 +38,8 @@ MEETING = 60
 # Calls of each device between two exchanges: all wait for the slowest, so the fewer exchanges the better; but signals
 # are heard then.
 _CALLS = 2
+# Bytes that are sent at once, by each process, of what one has read.
+_PART = 1 << 22
 # Words of what the transport raises when it has lost a process.
 TRANSPORT = re.compile("gloo|nccl|peer|connection|socket|heartbeat|coordination|deadline", re.IGNORECASE)
 
@@ -111,6 +114,22 @@ def exchanged(tree: T) -> list[T]:
 def of_first(tree: T) -> T:
     """What the first process gives."""
     return exchanged(tree)[0] if count() > 1 else tree
+
+
+def of_file(path: str | os.PathLike, read: Callable[[], T]) -> T:
+    """What `read` gives of a file; a process that has no such file gets what the first one has read.
+
+    Raises:
+        InputError: of `read`.
+    """
+    lacking = not Path(path).exists()
+    if not highest(lacking):
+        return read()
+    content = read() if not index() or not lacking else None
+    sent = b"" if index() else pickle.dumps(content)
+    parts = (sent[first : first + _PART].ljust(_PART, b"\0") for first in range(0, highest(len(sent)), _PART))
+    came = b"".join(of_first(np.frombuffer(part, np.uint8)).tobytes() for part in parts)
+    return pickle.loads(came) if lacking else content
 
 
 def same(digests: Mapping[str, str]) -> None:

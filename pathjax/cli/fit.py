@@ -32,7 +32,7 @@ def run(options, output: Output) -> int:
         names.append(name)
         if equals:
             start[name] = numbers("--param", name, value)
-    target = inverse.read_target(options.target)
+    target = distributed.of_file(options.target, lambda: inverse.read_target(options.target))
     scene = load(options)
     if first and any(np.ndim(value) == 3 for name, value in parameters(scene).items() if name in names):
         check_writable(Path(f"{options.output}.xml"), [options.target, options.scene])

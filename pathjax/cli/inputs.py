@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from functools import partial
+
+from pathjax import distributed
 from pathjax.compile import keep_kernels
 from pathjax.errors import InputError
 from pathjax.io.mitsuba import loader
@@ -18,7 +21,8 @@ def load(options) -> Scene:
 
 def _load(options) -> Scene:
     keep_kernels()
-    scene = build(loader.load(options.scene, options.sensor, **dict(options.defines)))
+    read = partial(loader.load, options.scene, options.sensor, **dict(options.defines))
+    scene = build(distributed.of_file(options.scene, read))
     return with_parameters(scene, {name: numbers("--set", name, text) for name, text in options.settings})
 
 

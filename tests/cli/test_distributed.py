@@ -127,12 +127,27 @@ def test_scenes_that_differ_are_refused(together, tmp_path):
 
 @pytest.mark.slow
 def test_a_scene_that_one_process_cannot_load_ends_all(together, tmp_path):
-    (tmp_path / "0.xml").write_text('<scene version="3.0.0"/>')
+    for number, text in enumerate(('<scene version="3.0.0"/>', "<scene")):
+        (tmp_path / f"{number}.xml").write_text(text)
     running = together(2, "-o", tmp_path / "a.exr", each=[tmp_path.as_posix() + "/{}.xml"])
     told = [process.communicate(timeout=60)[1] for process in running]
     assert [process.returncode for process in running] == [1, 2]
     assert "process 0 ends, as process 1 has ended: " in told[0]
     assert all("1.xml" in each for each in told)
+
+
+@pytest.mark.slow
+def test_a_scene_and_a_target_that_the_first_process_alone_sees_are_sent(together, tmp_path, root, run):
+    (tmp_path / "scene0.xml").write_text((root / SCENE).read_text())
+    image = tmp_path / "target0.exr"
+    assert run("render", SCENE, "-D", "res=12", "--spp", 16, "-o", image)[0] == 0
+    scene = tmp_path.as_posix() + "/scene{}.xml"
+    given = "-D", "res=12", "--spp", 16, "--json", "-o", tmp_path / "a.exr"
+    outcome(together(3, *given, each=[scene]))
+    np.testing.assert_array_equal(read_rgb(tmp_path / "a.exr"), read_rgb(image))
+    given = "-D", "res=12", "--param", "white.reflectance=0.5", "--spp", 8, "--json", "-o", tmp_path / "fit"
+    each = [scene, tmp_path.as_posix() + "/target{}.exr"]
+    assert outcome(together(2, *given, each=each, command="fit"))["values"]
 
 
 @pytest.mark.slow
