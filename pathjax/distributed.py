@@ -15,6 +15,7 @@ import pickle
 import re
 import sys
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from itertools import islice
@@ -58,8 +59,8 @@ def start(coordinator: str | None = None, processes: int | None = None, process:
             JAX finds the cluster by itself (SLURM, Open MPI, Kubernetes).
         processes: how many there are; process: which of them this is, from 0.
     Raises:
-        InputError: the others were not found, two have one number, their code differs, or JAX's backend has started
-            already.
+        InputError: the others were not found, two have one number, their code or numbers of devices differ, or JAX's
+            backend has started already.
     """
     facts = {"code of pathjax": _package(), "version of JAX": jax.__version__}
     try:
@@ -86,7 +87,14 @@ def start(coordinator: str | None = None, processes: int | None = None, process:
         raise InputError(f"this process could not join the others ({said}); start each of them anew") from None
     atexit.register(_leave)
     _end_at_once_after_errors()
-    with _stdout_as_stderr():
+    devices = Counter(device.process_index for device in jax.devices())
+    for other, number in sorted(devices.items()):
+        if number != devices[0]:
+            raise InputError(
+                f"process {other} has {number} devices and process 0 has {devices[0]}; give all as many, of CPUs by "
+                "JAX_NUM_CPU_DEVICES in the environment"
+            )
+    with _without_stdout():
         exchanged(np.int32(0))
 
 
@@ -267,13 +275,14 @@ def dealt(f: Callable[[T], np.ndarray], items: Iterable[T], stopped: Callable[[]
 
 
 @contextmanager
-def _stdout_as_stderr() -> Iterator[None]:
-    """Send to stderr what the transport prints on stdout, past Python's own, of the processes that it has found."""
+def _without_stdout() -> Iterator[None]:
+    """Leave out what the transport prints on stdout, past Python's own, of the processes that it has found."""
     sys.stdout.flush()
-    kept = os.dup(1)
-    os.dup2(2, 1)
+    kept, nowhere = os.dup(1), os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 1)
     try:
         yield
     finally:
         os.dup2(kept, 1)
         os.close(kept)
+        os.close(nowhere)

@@ -50,7 +50,8 @@ def _welcome(port: int, address: str, own: dict, until: float) -> dict[int, sock
         server = socket.create_server(("", port), family=family, dualstack_ipv6=dual, backlog=512)
     except OSError as error:
         raise InputError(
-            f"process 0 cannot be found at {address}: {error.strerror}; stop what uses the port, or name another"
+            f"process 0 cannot be found at {address}: {error.strerror}; if no other process has the number 0 too, stop "
+            "what uses the port, or name another"
         ) from None
     with server, ExitStack() as opened:
         came, calls, problem = {0: own}, [], ""

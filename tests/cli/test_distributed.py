@@ -35,7 +35,7 @@ def test_wrong_numbers_are_refused(refused, tmp_path, arguments, says):
 def together(root, environment, tmp_path):
     """(processes, *arguments) -> running processes of one command.
 
-    devices: of each; each: further arguments, with the number of the process for {}.
+    devices: of each, or a tuple; each: further arguments, with the number of the process for {}.
     """
     running = []
 
@@ -43,14 +43,15 @@ def together(root, environment, tmp_path):
         with socket.socket() as free:
             free.bind(("127.0.0.1", 0))
             address = f"127.0.0.1:{free.getsockname()[1]}"
-        own = environment | {"JAX_NUM_CPU_DEVICES": str(devices)}
-        own |= {"PATHJAX_CACHE": "1", "XDG_CACHE_HOME": str(tmp_path / "cache")}
+        devices = devices if isinstance(devices, tuple) else (devices,) * processes
+        own = environment | {"PATHJAX_CACHE": "1", "XDG_CACHE_HOME": str(tmp_path / "cache")}
         command = [sys.executable, "-m", "pathjax", command, *map(str, arguments)]
         numbers = ["--coordinator", address, "--processes", str(processes), "--process"]
         started = [
             subprocess.Popen(
                 command + [word.format(i) for word in each] + [*numbers, str(i)] * (processes > 1),
-                **{"cwd": root, "env": own, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True},
+                env=own | {"JAX_NUM_CPU_DEVICES": str(devices[i])},
+                **{"cwd": root, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True},
             )
             for i in range(processes)
         ]
@@ -123,6 +124,15 @@ def test_scenes_that_differ_are_refused(together, tmp_path):
         _, err = process.communicate(timeout=60)
         assert process.returncode == 2
         assert "another scene than process" in err
+
+
+@pytest.mark.slow
+def test_processes_with_other_numbers_of_devices_are_refused(together, tmp_path):
+    running = together(2, SCENE, "-D", "res=8", "--spp", 4, "-o", tmp_path / "a.exr", devices=(1, 2))
+    for process in running:
+        _, err = process.communicate(timeout=60)
+        assert process.returncode == 2
+        assert err.startswith("pathjax: process 1 has 2 devices and process 0 has 1; give all as many")
 
 
 @pytest.mark.slow
