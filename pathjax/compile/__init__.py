@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from pathjax.compile.cache import compiled, keep_kernels
 from pathjax.compile.jax_compat import is_symbolic_zero, is_traced, register_dataclass
+from pathjax.compile.lanes.interpreter import SELECTED_ROWS
 from pathjax.compile.linear import linear
 from pathjax.compile.mapping import MANY_ITEMS, cuts, native_fold, native_map, native_rows, split_map, sum_of_parts
 from pathjax.compile.primitives import Search, compute_once, interleaved, one_by_one, persistent_loop, together
@@ -28,6 +29,7 @@ from pathjax.compile.xla import native, setup
 
 __all__ = [
     "MANY_ITEMS",
+    "SELECTED_ROWS",
     "Search",
     "calls_at_once",
     "compiled",

@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Int, Shaped
 
+from pathjax.compile import SELECTED_ROWS
 from pathjax.emitters import Lights, light_tree
 from pathjax.kinds import Color, Table
 from pathjax.scene.scene import Scene
@@ -194,8 +195,11 @@ def _many(rows: int, row_bytes: int) -> int:
 
 
 def _few(rows: int) -> int:
-    """A table of one row stays so, where XLA leaves out the look-up: that is another program, with other last bits."""
-    return rows if rows == 1 else _rung(rows, FEW_ROWS)
+    """A table of one row stays so, where XLA leaves out the look-up: that is another program, with other last bits.
+
+    One from which lanes select does not become one from which they gather, which takes longer.
+    """
+    return rows if rows == 1 else SELECTED_ROWS if rows <= SELECTED_ROWS else _rung(rows, FEW_ROWS)
 
 
 def _rung(rows: int, lowest: int) -> int:

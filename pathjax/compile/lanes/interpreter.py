@@ -35,7 +35,7 @@ from pathjax.compile.lanes.primitive_rules import COMPONENTWISE, RULES
 from pathjax.compile.primitives import column_p, compute_once_p, one_by_one_p, together_p
 
 # Rows of a table from which lanes select what they want; gathering is faster from more.
-_FEW_ROWS = 8
+SELECTED_ROWS = 8
 
 
 class Interpreter:
@@ -135,7 +135,7 @@ class Interpreter:
 
     def rows_of_column(self, column, numbers):
         """(W,) of a column (N,) that lanes share: selected from a few, which stay in registers, gathered from many."""
-        if len(column) > _FEW_ROWS:
+        if len(column) > SELECTED_ROWS:
             return gathered(column, numbers)
         found = jnp.broadcast_to(column[0], numbers.shape)
         for k in range(1, len(column)):
