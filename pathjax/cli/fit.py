@@ -56,7 +56,7 @@ def run(options, output: Output) -> int:
             layers = {f"{layer}{c}": x[..., i] for layer, x in of_layers.items() for i, c in enumerate("RGB")}
             path = Path(f"{options.output}.{name}.exr")
             output.file(path, lambda path, layers=layers: images.write_exr(path, layers, {}))
-        if report.textures(fit):
+        if report.summed_up(fit):
             output.file(Path(f"{options.output}.xml"), lambda path: save_scene(fit.scene, path))
         output.text(json_text(facts) if options.json else report.text(fit))
     return DONE if fit.converged else FAILED

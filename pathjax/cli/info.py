@@ -75,10 +75,11 @@ def scene_facts(scene: Scene) -> dict:
 
 
 def _parameter_facts(parameter: Parameter, value: np.ndarray) -> dict:
-    """What is told of a parameter; of a texture, the mean stands for all numbers."""
+    """What is told of a parameter; of a texture or a grid, the mean stands for all numbers."""
     known = {"value": value}
     if parameter.is_texture:
-        known = {"mean": value.mean((0, 1) if parameter.corners is None else 0)}
+        entries = (0, 1) if value.ndim < 3 and parameter.corners is None else tuple(range(value.ndim - 1))
+        known = {"mean": value.mean(entries)}
     return known | {"shape": value.shape, "bounds": parameter.bounds}
 
 

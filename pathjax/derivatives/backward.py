@@ -282,7 +282,7 @@ def pixel_sweep(
         number, passed, now, weight, sums, memory = state
         begins = ~now.alive
         now, weight = pixel.begun(scene, pixel_number, stream, number, now, weight, options)
-        u = bounce_numbers(scene, stream, number, path.vertices(now), options.sampler)
+        u = bounce_numbers(scene, stream, number, path.vertices(now), options.sampler, bool(slots.grids))
         of_sample = weight * (share * scale)
         on, record, itself = extend(scene, choice, now, u, options, slots, paths, of_sample, passed)
         there = [replace(slot, places=tuple(map(place_of, slot.places))) for slot in record.slots]
@@ -326,7 +326,7 @@ def _kernel(scene: Scene, paths: places.Paths, options: Options) -> _Kernel:
 
     def record(scene, choice, x):
         now, _ = pixel.camera_path(scene, jnp.int32(0), x, x, options)
-        u = bounce_numbers(scene, x, x, path.vertices(now), options.sampler)
+        u = bounce_numbers(scene, x, x, path.vertices(now), options.sampler, bool(slots.grids))
         return extend(scene, choice, now, u, options, slots, paths, now.throughput, jnp.int32(0))[1]
 
     structure = jax.eval_shape(record, scene, choice, jnp.uint32(0))

@@ -61,7 +61,7 @@ def pixel_change(
         number, passed, now, weight, b, sums = state
         b = jnp.where(now.alive, b, 0)
         now, weight = pixel.begun(scene, pixel_number, stream, number, now, weight, options)
-        u = bounce_numbers(scene, stream, number, path.vertices(now), options.sampler)
+        u = bounce_numbers(scene, stream, number, path.vertices(now), options.sampler, bool(slots.grids))
         on, record, itself = extend(scene, choice, now, u, options, slots, paths, jnp.ones_like(zero), passed)
         gain, later = changes(record, v)
         sums = pixel.add_compensated(sums, compute_once(weight * (b * record.gathered + gain)))

@@ -208,7 +208,7 @@ def has_rows(scene: Scene, parameters) -> bool:
         return False
     slots = places.slots(scene, tuple(paths))
     # What also stands for a number has a derivative across channels.
-    return slots.of_bsdfs == slots.colors and not slots.of_choices and not slots.of_passed
+    return slots.of_bsdfs == slots.colors and not (slots.of_choices or slots.of_passed or slots.grids)
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0, 1, 2, 3))

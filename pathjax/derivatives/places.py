@@ -20,15 +20,16 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from pathjax import emitters
+from pathjax import emitters, media
 from pathjax.bsdfs import tree
 from pathjax.core.math import at
 from pathjax.core.types import EmitterSample, Hit, Ray
 from pathjax.emitters import Choice
 from pathjax.integrators.random_numbers import Bounce
-from pathjax.integrators.shadow import Passed
+from pathjax.integrators.shadow import Dimmed, Passed
 from pathjax.integrators.vertex import Vertex
 from pathjax.kinds import Declared
+from pathjax.media import Nudges
 from pathjax.scene import parameters as named
 from pathjax.scene.scene import Scene
 from pathjax.shapes import geometry
@@ -41,6 +42,11 @@ Entries = tuple[tuple[Int[Array, ""], ...], tuple[Float[Array, "..."], ...] | No
 # By slot, the column that is looked up; None: none.
 Columns = tuple[int | None, ...]
 
+# Values of grids of media -> where they count: see `media.Nudges`.
+GRIDS = {
+    ("media", "extinctions", "values"): ("extinction", "depth", "shadow"),
+    ("media", "albedos", "values"): ("albedo",),
+}
 BSDFS, WRAPPERS, TEXTURES = (("materials", each) for each in ("tables", "wrappers", "textures"))
 
 
@@ -56,6 +62,7 @@ class Slots:
     choices: tuple[tuple[int, int, int], ...]  # of `tree.steps`: the step, its wrapper, and which of its columns
     on_the_way: int  # wrappers that `tree.on_the_way` tells; each has a slot for each column
     corners: bool  # whether what meshes carry is differentiated
+    grids: tuple[str, ...]  # of `media.Nudges`: what is nudged of media
 
     @property
     def of_bsdfs(self) -> int:
@@ -74,8 +81,8 @@ class Slots:
         return max([len(self.backgrounds), *map(len, self.lights)])
 
     def numbered(self) -> list[range]:
-        """Slots of bsdfs, of lights, of choices among bsdfs and of what is passed, counted through all of these."""
-        counts = self.of_bsdfs, self.of_lights, self.of_choices, self.of_passed
+        """Slots of bsdfs, lights, choices among bsdfs, what is passed and grids, counted through all of these."""
+        counts = self.of_bsdfs, self.of_lights, self.of_choices, self.of_passed, len(self.grids)
         return [range(*each) for each in pairwise(accumulate(counts, initial=0))]
 
 
@@ -103,6 +110,7 @@ def paths(scene: Scene) -> set[tuple]:
     for table in tables:
         found |= {p for p in _columns(scene, table) if not _declared(scene, p).shared or tells_entries(table)}
     shapes = enumerate(scene.geometry.tables)
+    found |= {path for path in GRIDS if scene.media is not None and named.get(scene, path[:-1]) is not None}
     return found | {("geometry", "tables", i, "attributes", name) for i, each in shapes for name in each.attributes}
 
 
@@ -166,7 +174,9 @@ def slots(scene: Scene, paths: Paths) -> Slots:
     passed = any(column is not None for place in met for column in wrappers[place])
     on_the_way = tree.most_on_the_way(scene.materials) if passed else 0
     corners = any(path[0] == "geometry" for path in paths)
-    return Slots(bsdfs, lights, tuple(backgrounds), colors, wrappers, choices, on_the_way, corners)
+    of_scattering = () if scene.scatters else ("extinction", "albedo")
+    grids = tuple(n for path, nudges in GRIDS.items() if path in paths for n in nudges if n not in of_scattering)
+    return Slots(bsdfs, lights, tuple(backgrounds), colors, wrappers, choices, on_the_way, corners, grids)
 
 
 def prepared(scene: Scene, paths: Paths, slots: Slots, number: Int[Array, ""]) -> Scene:
@@ -177,7 +187,8 @@ def prepared(scene: Scene, paths: Paths, slots: Slots, number: Int[Array, ""]) -
     if slots.on_the_way:
         none = jnp.zeros((slots.on_the_way, len(slots.wrappers[0])), scene.camera.origin.dtype)
         materials = replace(materials, nudged=(number, none))
-    return replace(scene, materials=materials, geometry=replace(scene.geometry, corners=slots.corners))
+    scene = replace(scene, materials=materials, geometry=replace(scene.geometry, corners=slots.corners))
+    return _with_grids_nudged(scene, slots, [jnp.zeros_like(scene.camera.origin[0])] * len(slots.grids))
 
 
 def nudged(scene: Scene, slots: Slots, nudges: Float[Array, " slots"]) -> Scene:
@@ -185,7 +196,7 @@ def nudged(scene: Scene, slots: Slots, nudges: Float[Array, " slots"]) -> Scene:
 
     Those of choices are left as they are: see `by_choices`.
     """
-    of_bsdfs, of_lights, _, of_passed = slots.numbered()
+    of_bsdfs, of_lights, _, of_passed, of_grids = slots.numbered()
 
     def of(table, columns, nudges):
         return table.nudged({column: nudges[s] for s, column in enumerate(columns) if column is not None})
@@ -202,7 +213,14 @@ def nudged(scene: Scene, slots: Slots, nudges: Float[Array, " slots"]) -> Scene:
         nudge = jnp.zeros((scene.emitters[i].count,), beyond.dtype) if nudge is None else nudge
         tables[i] = tables[i].nudged({column: nudge.at[row].set(beyond[s])})
     lights = tuple(replace(each, table=table) for each, table in zip(scene.emitters, tables, strict=True))
-    return replace(scene, materials=materials, emitters=lights)
+    scene = replace(scene, materials=materials, emitters=lights)
+    return _with_grids_nudged(scene, slots, [nudges[k] for k in of_grids])
+
+
+def _with_grids_nudged(scene, slots, nudges):
+    if not slots.grids:
+        return scene
+    return replace(scene, media=replace(scene.media, nudges=Nudges(**dict(zip(slots.grids, nudges, strict=True)))))
 
 
 # ---- the list -------------------------------------------------------------------------------------------------------
@@ -220,10 +238,16 @@ def count(scene: Scene, path: tuple) -> int:
     return array.size // 3 if of_colors(scene, path) else array.size
 
 
+def path_of_grid(nudge: str) -> tuple:
+    """Path to the values that a nudge stands for."""
+    return next(path for path, nudges in GRIDS.items() if nudge in nudges)
+
+
 def of_colors(scene: Scene, path: tuple) -> bool:
     """Whether an array holds colours; else it holds numbers."""
-    if named.get(scene, path).ndim > 1:
-        return True
+    array = named.get(scene, path)
+    if array.ndim > 1:
+        return array.shape[-1] == 3
     declared = _declared(scene, path)
     return declared.shared and declared.colors
 
@@ -282,6 +306,34 @@ def of_passed(scene: Scene, paths: Paths, slots: Slots, slot: int, passed: Passe
     calls = alike([of(*each) for each in enumerate(slots.wrappers)], passed.surface.p.dtype)
     pairs = calls[0]() if len(calls) == 1 else lax.switch(jnp.maximum(place, 0), calls)
     return _entries(pairs, whole=not _in_textures(scene, paths, TEXTURES))
+
+
+def of_grid(
+    scene: Scene,
+    paths: Paths,
+    nudge: str,
+    medium: Int[Array, ""],
+    ray: Ray,
+    end: Float[Array, ""],
+    u: Bounce,
+    shadow: Dimmed,
+) -> Entries:
+    """Entries of what is looked up in a grid for a nudge, times the length that a point stands for.
+
+    Args:
+        medium: of the flight along the ray to its end.
+        shadow: on the way of the light sample.
+    """
+    path = path_of_grid(nudge)
+    values, first, length = named.get(scene, path[:-1]), firsts(scene, paths)[0][path], 1
+    if nudge == "depth":
+        p, length = media.on_the_way(scene.media, medium, ray, end, u.along[0])
+    elif nudge == "shadow":
+        medium, p, length = shadow.medium, shadow.p, shadow.length
+    else:
+        p = ray.o + jnp.where(end < jnp.inf, end, 0) * ray.d  # where there is no particle, nothing changes with it
+    places, shares = zip(*media.entries(values, medium, p), strict=True)
+    return tuple(first + place for place in places), tuple(length * share for share in shares)
 
 
 def of_hit(scene: Scene, paths: Paths, slots: Slots, slot: int, ray: Ray, hit: Hit, here: Vertex | None) -> Entries:

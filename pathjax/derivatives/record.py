@@ -21,12 +21,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from pathjax.compile import register_dataclass
+from pathjax.core.math import smaller
 from pathjax.derivatives import places
 from pathjax.emitters import Choice
 from pathjax.integrators import path
 from pathjax.integrators.options import Options
 from pathjax.integrators.random_numbers import Bounce
-from pathjax.integrators.shadow import none_passed
+from pathjax.integrators.shadow import none_dimmed, none_passed
 from pathjax.scene.scene import Scene
 
 
@@ -75,9 +76,9 @@ def extend(
     """
     scene = places.prepared(scene, paths, slots, number)
     hit, here, u = path.meet(scene, now, u, options)
-    if slots.of_passed:
-        now = now._replace(L=now.L._replace(nudged=none_passed(scene)))
-    of_bsdfs, of_lights, of_choices, of_passed = slots.numbered()
+    if slots.of_passed or slots.grids:
+        now = now._replace(L=now.L._replace(nudged=none_passed(scene), dimmed=none_dimmed(scene, u.along)))
+    of_bsdfs, of_lights, of_choices, of_passed, of_grids = slots.numbered()
 
     def varied(changes):
         changed = places.nudged(scene, slots, changes)
@@ -88,7 +89,7 @@ def extend(
         on = path.onward(changed, choice, now, hit, there, u, options)
         return (on.L.emission, on.L.light, on.L.weight), on
 
-    count = of_passed.stop
+    count = of_grids.stop
     push = partial(jax.jvp, varied, (jnp.zeros((count,), scale.dtype),), has_aux=True)
     (Le, n, w), changes, on = jax.vmap(lambda change: push((change,)), out_axes=(None, 0, None))(jnp.eye(count))
     scale = scale * now.throughput
@@ -107,6 +108,15 @@ def extend(
     for s, k in enumerate(of_choices):
         entries = places.of_choice(scene, paths, slots, s, here)
         found.append(Slot(*entries, scale * dn[k], scale * dw[k], is_number=True))
+    end, shadow = smaller(hit.t, now.ray.t_max), on.L.dimmed
+    on = on._replace(L=on.L._replace(dimmed=None))
+    for nudge, k in zip(slots.grids, of_grids, strict=True):
+        entries = places.of_grid(scene, paths, nudge, now.medium, now.ray, end, u, shadow)
+        is_number = not places.of_colors(scene, places.path_of_grid(nudge))
+        if nudge == "shadow":
+            found.append(Slot(*entries, scale * dn[k], None, is_number))
+        else:
+            found.append(Slot(*entries, scale * (dLe[k] + dn[k]), scale * dw[k], is_number))
     record = Record(jnp.bool_(False), ~on.alive, Le + n, w, found)
     if not of_passed:
         return on, record, jnp.bool_(True)

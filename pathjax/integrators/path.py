@@ -30,7 +30,7 @@ from pathjax.emitters import Choice
 from pathjax.integrators import next_event, roulette, splitting
 from pathjax.integrators.options import Options
 from pathjax.integrators.random_numbers import Bounce
-from pathjax.integrators.shadow import Passed
+from pathjax.integrators.shadow import Dimmed, Passed
 from pathjax.integrators.vertex import Vertex, leaving, sample, vertex, within
 from pathjax.scene.scene import Scene
 from pathjax.shapes import geometry
@@ -44,6 +44,7 @@ class Gain(NamedTuple):
     weight: Float[Array, "3"]  # what the throughput is multiplied by
     passed: Int[Array, ""] | None = None  # and of so many further ones; None: nothing lets light pass
     nudged: Passed | None = None  # on the way of the light sample; None: nothing asks for it
+    dimmed: Dimmed | None = None  # likewise
 
 
 class Path(NamedTuple):
@@ -283,5 +284,6 @@ def _with_emission(L, emitted):
     return L._replace(emission=emitted, light=jnp.zeros_like(emitted)) if isinstance(L, Gain) else L + emitted
 
 
-def _with_light(L, light, passed, nudged):
-    return L._replace(light=light, passed=passed, nudged=nudged) if isinstance(L, Gain) else L + light
+def _with_light(L, light, passed, nudged, dimmed):
+    more = dict(light=light, passed=passed, nudged=nudged, dimmed=dimmed)
+    return L._replace(**more) if isinstance(L, Gain) else L + light

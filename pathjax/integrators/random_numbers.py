@@ -28,6 +28,8 @@ class Bounce(NamedTuple):
     roulette: Float[Array, ""]
     leaf: Float[Array, ""] | None = None  # chooses among bsdfs that hold others; None: there are none
     flight: Float[Array, "2"] | None = None  # how far light goes; None: it meets nothing on the way
+    # For derivatives in grids: a point of the flight, a part of a shadow ray, a point of that; None: there are none.
+    along: Float[Array, "3"] | None = None
 
 
 def camera_numbers(
@@ -39,9 +41,14 @@ def camera_numbers(
 
 
 def bounce_numbers(
-    scene: Scene, stream: sampler.Word, sample: sampler.Word, depth: Int[Array, ""], points: str = "lattice"
+    scene: Scene,
+    stream: sampler.Word,
+    sample: sampler.Word,
+    depth: Int[Array, ""],
+    points: str = "lattice",
+    along: bool = False,
 ) -> Bounce:
-    """Random numbers of the vertex number depth."""
+    """Random numbers of the vertex number depth. along: whether `Bounce.along` is asked for."""
     dtype = scene.camera.origin.dtype
     u = sampler.POINTS[points](stream, sample, depth + 1).astype(dtype)
     key = sampler.path_key(stream, sample)
@@ -56,7 +63,8 @@ def bounce_numbers(
     flight = None
     if scene.scatters:
         flight = sampler.hashed(sampler.hash_u32(key), 2 * depth, 2).astype(dtype)
-    return Bounce(u[:2], bsdf, rest[0], rest[1], leaf, flight)
+    points_of_ways = sampler.hashed(sampler.hash_u32(~key), 3 * depth, 3).astype(dtype) if along else None
+    return Bounce(u[:2], bsdf, rest[0], rest[1], leaf, flight, points_of_ways)
 
 
 def bsdf_dimensions(materials: bsdfs.Materials) -> int:

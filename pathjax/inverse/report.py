@@ -22,10 +22,15 @@ def textures(fit: Fit) -> list[str]:
     return [name for name, value in fit.values.items() if value.ndim == 3]
 
 
+def summed_up(fit: Fit) -> list[str]:
+    """Names of the parameters of which a summary is told: images, and grids of volumes."""
+    return [name for name, value in fit.values.items() if value.ndim > 2]
+
+
 def facts(fit: Fit) -> dict:
-    """What `json_text` writes of a fit. Of textures it is a summary: their texels belong into image files."""
+    """What `json_text` writes of a fit. Of textures and grids it is a summary: their numbers belong into files."""
     found = {name: getattr(fit, name) for name in _FACTS}
-    images = textures(fit)
+    images = summed_up(fit)
     if images:
         for each in ("values", "standard_errors"):
             found[each] = {name: value for name, value in found[each].items() if name not in images}
@@ -39,14 +44,14 @@ def _summary(fit: Fit, name: str) -> dict:
     value, error, seen = fit.values[name], fit.standard_errors[name], fit.seen[name]
     return {
         "shape": value.shape,
-        "mean": value.mean((0, 1)),
+        "mean": value.mean(tuple(range(value.ndim - 1))),
         "seen": float(seen.mean()),
         "median_standard_error": float(np.median(error[seen])) if seen.any() else math.inf,
     }
 
 
 def text(fit: Fit) -> str:
-    images = textures(fit)
+    images = summed_up(fit)
     listed = [label for label in fit.components if label.partition("[")[0] not in images]
     values, errors = (
         [x for name, array in arrays.items() if name not in images for x in np.ravel(array)]
@@ -55,9 +60,10 @@ def text(fit: Fit) -> str:
     width, lines = max(map(len, [*listed, *images])), []
     for name in images:
         known = _summary(fit, name)
-        size = " x ".join(map(str, known["shape"][:2]))
+        size = " x ".join(map(str, known["shape"][:-1]))
         typical = f"+- {known['median_standard_error']:.3g} in the median" if known["seen"] else "not determined"
-        lines.append(f"{name:<{width}}  {size} texels, {known['seen']:.0%} of them seen, {typical}")
+        parts = "texels" if len(known["shape"]) == 3 else "cells"
+        lines.append(f"{name:<{width}}  {size} {parts}, {known['seen']:.0%} of them seen, {typical}")
     for label, value, error in zip(listed, values, errors, strict=True):
         digits = 6 if not 0 < error < math.inf else min(max(1 - math.floor(math.log10(error)), 0), 8)
         stated = f"+- {error:.{digits}f}" if math.isfinite(error) else "not determined" if error > 0 else "unknown"

@@ -28,7 +28,7 @@ from pathjax.kinds.declared import (
     Transform2,
     Unused,
 )
-from pathjax.kinds.kind import Instance, Kind, ordered, register
+from pathjax.kinds.kind import Instance, Kind, Stored, ordered, register
 from pathjax.kinds.parameter import Fixed, Parameter, Parameters
 from pathjax.kinds.table import Column, Row, Table
 
@@ -53,6 +53,7 @@ __all__ = [
     "Row",
     "Setting",
     "Shared",
+    "Stored",
     "Table",
     "Transform2",
     "Unused",

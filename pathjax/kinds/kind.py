@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
@@ -21,6 +23,16 @@ class Instance:
     kind: type[Kind]
     name: str  # id that its parameters are looked up by
     values: Mapping[str, object]  # of declared parameters: numbers, arrays, instances of textures, None
+
+
+class Stored(ABC):
+    """A value that is an array in a file of its own."""
+
+    data: np.ndarray
+
+    @abstractmethod
+    def write(self, path: Path, data: np.ndarray) -> None:
+        """Write a file like the value's own, with these numbers."""
 
 
 class Kind:

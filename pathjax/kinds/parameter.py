@@ -87,8 +87,8 @@ class Parameter:
 
     @property
     def table(self) -> tuple[str | int, ...] | None:
-        """Path to the table of its kind, which holds `columns[place].values`; None of a mesh."""
-        return self.path[:-3] if self.corners is None else None
+        """Path to the table of its kind, which holds `columns[place].values`; None: it is of a mesh or of a grid."""
+        return self.path[:-3] if "columns" in self.path else None
 
 
 @dataclass(frozen=True, eq=False)

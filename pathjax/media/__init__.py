@@ -13,6 +13,7 @@ extinction of what is heterogeneous, each by a grid: see `grids`.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -23,7 +24,7 @@ from pathjax.compile import register_dataclass
 from pathjax.core.math import at, dot, safe_divide
 from pathjax.core.types import BSDFSample, Ray
 from pathjax.core.warp import chosen
-from pathjax.kinds import Instance, Parameters, Row, Table, ordered
+from pathjax.kinds import Instance, Parameter, Parameters, Row, Table, ordered
 from pathjax.kinds import register as register_kind
 from pathjax.media import grids
 from pathjax.media.blendphase import BlendPhase
@@ -34,6 +35,7 @@ from pathjax.media.homogeneous import VOLUMES, Heterogeneous, Homogeneous
 from pathjax.media.isotropic import Isotropic
 from pathjax.media.phase import Phase
 from pathjax.media.rayleigh import Rayleigh
+from pathjax.textures import Pairs
 
 __all__ = [
     "HG",
@@ -47,6 +49,7 @@ __all__ = [
     "Homogeneous",
     "Isotropic",
     "Media",
+    "Nudges",
     "Phase",
     "Rayleigh",
     "register",
@@ -66,6 +69,15 @@ def register(name: str):
     return register_kind(PHASES, Phase, name, "media")
 
 
+class Nudges(NamedTuple):
+    """For derivatives: what is added to what grids say; None: nothing."""
+
+    extinction: Float[Array, ""] | None = None  # where a flight ends at a particle
+    albedo: Float[Array, ""] | None = None  # there
+    depth: Float[Array, ""] | None = None  # of the flight
+    shadow: Float[Array, ""] | None = None  # to the depth of a shadow ray: see `integrators.shadow`
+
+
 @register_dataclass
 @dataclass(frozen=True)
 class Media:
@@ -77,6 +89,7 @@ class Media:
     # What the extinctions and albedos of the table are multiplied by; None: none varies in space.
     extinctions: Grids | None = None
     albedos: Grids | None = None
+    nudges: Nudges | None = None
 
     @property
     def scatters(self) -> bool:
@@ -103,7 +116,10 @@ def build(
     scatters = any(np.any(_numbers(each.values["albedo"])) for each in present)
     rows = present if scatters else [_absorbing(each, parameters) for each in present]
     table = Homogeneous.build([_constant(each) for each in rows], dtype, (*path, "table"), parameters, None)
-    extinctions, albedos = (_grids(rows, key, dtype, parameters) for key in ("sigma_t", "albedo"))
+    extinctions, albedos = (
+        _grids(rows, key, dtype, (*path, place), parameters)
+        for key, place in (("sigma_t", "extinctions"), ("albedo", "albedos"))
+    )
     phases, code = [], {}
     if scatters:
         asked = [each.values["phase"] for each in present]
@@ -131,14 +147,31 @@ def _constant(medium: Instance) -> Instance:
     return Instance(medium.kind, medium.name, values)
 
 
-def _grids(rows: list[Instance], key: str, dtype, parameters: Parameters) -> Grids | None:
-    """The grids that stand in the place of a parameter of media, which is none then; None: there are none."""
+def _grids(rows: list[Instance], key: str, dtype, path: tuple, parameters: Parameters) -> Grids | None:
+    """The grids that stand in the place of a parameter of media, which its values are then; None: there are none.
+
+    path: where they will be in the scene.
+    """
     values = {each: each.values[key] for each in rows if isinstance(each.values[key], GridVolume)}
-    for each in values:
-        name = f"{each.name}.{key}"
+    if not values:
+        return None
+    made = grids.build([values.get(each) for each in rows], dtype)
+    named: dict[int, str] = {}
+    for row, each in enumerate(rows):
+        if each not in values:
+            continue
+        name, grid, number = f"{each.name}.{key}", values[each], int(made.of[row])
         parameters.known.pop(name, None)
-        parameters.refused[name] = f"{name} is a grid, whose values are no parameters"
-    return grids.build([values.get(each) for each in rows], dtype) if values else None
+        if not grid.listed:
+            parameters.refused[name] = f"{name} is a volume that repeats or has one value, which is no parameter"
+        elif number in named:
+            parameters.refused[name] = f"{name} is the same grid as {named[number]}; set that, and both change"
+        else:
+            where = (*path, "values"), (int(made.first[number]),), grid.data.shape
+            rows_of_it = grid.data[..., 0].size
+            parameters.known[name] = Parameter(*where, each.kind.declared[key].bounds, key, rows=rows_of_it)
+            named[number] = name
+    return made
 
 
 def _absorbing(medium: Instance, parameters: Parameters) -> Instance:
@@ -206,27 +239,42 @@ def flight_weight(
 
     scatters: whether it ends in the medium, at a distance that `distance` drew; None: nothing scatters.
     """
-    passed = transmittance(media, medium, ray, distance)
+    nudges = media.nudges or Nudges()
+    passed = transmittance(media, medium, ray, distance, nudges.depth)
     if scatters is None:
         return passed
 
-    def at_end(number, values):
+    def at_end(number, values, nudge):
         if values is None:
             return number
         p = ray.o + jnp.where(scatters, distance, 0) * ray.d
         one = jnp.ones_like(p)
-        return number * _in_grid(values, medium, lambda grid: one * grids.look_up(values, grid, p), lambda: one)
 
-    sigma = at_end(extinction(media, medium), media.extinctions)
+        def of_grid(grid):
+            value = grids.look_up(values, grid, p)
+            return one * (value if nudge is None else value + nudge)
+
+        return number * _in_grid(values, medium, of_grid, lambda: one)
+
+    sigma = at_end(extinction(media, medium), media.extinctions, nudges.extinction)
     # The density with which each colour would have had the light end here, or go on further than this.
     density = jnp.where(scatters, sigma, 1) * passed
     drawn = lax.stop_gradient(dot(_chances(throughput), density))
-    albedo = at_end(Row(media.table, jnp.maximum(medium, 0)).albedo, media.albedos)
+    albedo = at_end(Row(media.table, jnp.maximum(medium, 0)).albedo, media.albedos, nudges.albedo)
     return jnp.where(scatters, albedo, 1) * safe_divide(density, drawn)
 
 
-def transmittance(media: Media, medium: Int[Array, ""], ray: Ray, distance: Float[Array, ""]) -> Float[Array, "3"]:
-    """Share of the light that comes through; of an endless way, which has no derivative, all or nothing."""
+def transmittance(
+    media: Media,
+    medium: Int[Array, ""],
+    ray: Ray,
+    distance: Float[Array, ""],
+    nudge: Float[Array, ""] | None = None,
+) -> Float[Array, "3"]:
+    """Share of the light that comes through; of an endless way, which has no derivative, all or nothing.
+
+    nudge: to be added to the depth in a grid.
+    """
     sigma = extinction(media, medium)
 
     def through():
@@ -236,7 +284,18 @@ def transmittance(media: Media, medium: Int[Array, ""], ray: Ray, distance: Floa
     values = media.extinctions
     if values is None:
         return through()
-    return _in_grid(values, medium, lambda grid: jnp.exp(-sigma * grids.depth(values, grid, ray, distance)), through)
+
+
+    def in_grid(grid):
+        depth = grids.depth(values, grid, ray, distance)
+        return jnp.exp(-sigma * (depth if nudge is None else depth + nudge))
+
+    return _in_grid(values, medium, in_grid, through)
+
+
+def nudged_shadow(media: Media, medium: Int[Array, ""]) -> Float[Array, "3"]:
+    """What the share of light is multiplied by whose depth in the grid of a medium is nudged."""
+    return jnp.exp(-extinction(media, medium) * media.nudges.shadow)
 
 
 def extinction(media: Media, medium: Int[Array, ""]) -> Float[Array, "3"]:
@@ -245,9 +304,34 @@ def extinction(media: Media, medium: Int[Array, ""]) -> Float[Array, "3"]:
     return jnp.where(medium >= 0, p.sigma_t * p.scale, 0)
 
 
+def on_the_way(
+    media: Media, medium: Int[Array, ""], ray: Ray, distance: Float[Array, ""], u: Float[Array, ""]
+) -> tuple[Float[Array, "3"], Float[Array, ""]]:
+    """Draw a point of a ray evenly of what lies in the grid of a medium's extinction up to a distance.
+
+    Returns:
+        The point, and the length of that part: 0 where the medium has no grid.
+    """
+    values = media.extinctions
+    grid = _grid(values, medium)
+    p, length = grids.on_the_way(values, jnp.maximum(grid, 0), ray, distance, u)
+    return p, jnp.where(grid >= 0, length, 0)
+
+
+def entries(values: Grids, medium: Int[Array, ""], p: Float[Array, "3"]) -> Pairs:
+    """Which values its grid's value at a point is the sum of, and the share of each; 0 where the medium has none."""
+    grid = _grid(values, medium)
+    found = grids.entries(values, jnp.maximum(grid, 0), p)
+    return tuple((place, jnp.where(grid >= 0, share, 0)) for place, share in found)
+
+
+def _grid(values, medium):
+    return jnp.where(medium >= 0, at(values.of, jnp.maximum(medium, 0)), NONE)
+
+
 def _in_grid(values, medium, of_grid, otherwise):
     """What a function finds of the grid of a medium, or what stands for it where it has none."""
-    grid = jnp.where(medium >= 0, at(values.of, jnp.maximum(medium, 0)), NONE)
+    grid = _grid(values, medium)
     return lax.cond(grid >= 0, lambda: of_grid(jnp.maximum(grid, 0)), otherwise)
 
 

@@ -20,6 +20,7 @@ from pathjax.compile import register_dataclass
 from pathjax.core.math import at, larger, smaller
 from pathjax.core.types import Ray
 from pathjax.media.gridvolume import GridVolume
+from pathjax.textures import Pairs
 
 # Halvings of a part of a ray between two planes, after which float32 tells no difference.
 _HALVINGS = 24
@@ -73,6 +74,28 @@ def look_up(grids: Grids, grid: Int[Array, ""], p: Float[Array, "3"]) -> Float[A
     to_grid = at(grids.to_grid, grid)
     x = to_grid[:, :3] @ p + to_grid[:, 3]
     return _interpolated(_corners(grids, grid, x), _shares(grids, grid, x))
+
+
+def entries(grids: Grids, grid: Int[Array, ""], p: Float[Array, "3"]) -> Pairs:
+    """Which of the values a grid's value at a point is the sum of, and the share of each."""
+    to_grid = at(grids.to_grid, grid)
+    x = to_grid[:, :3] @ p + to_grid[:, 3]
+    share = _shares(grids, grid, x)
+    found = []
+    for number, place in enumerate(_places(grids, grid, _lowest(grids, grid, x))):
+        a, b, c = (share[axis] if number >> axis & 1 else 1 - share[axis] for axis in range(3))
+        found.append((place, a * b * c))
+    return tuple(found)
+
+
+def on_the_way(
+    grids: Grids, grid: Int[Array, ""], ray: Ray, distance: Float[Array, ""], u: Float[Array, ""]
+) -> tuple[Float[Array, "3"], Float[Array, ""]]:
+    """A point of a ray, drawn evenly of what lies within the box of a grid up to a distance, and the length of that."""
+    start, end = _ends(grids, grid, ray)
+    end = smaller(distance, end)
+    start, length = jnp.where(start < end, start, 0), jnp.where(start < end, end - start, 0)
+    return ray.o + (start + u * length) * ray.d, length
 
 
 def depth(grids: Grids, grid: Int[Array, ""], ray: Ray, distance: Float[Array, ""]) -> Float[Array, " C"]:
@@ -197,13 +220,18 @@ def _shares(grids, grid, x):
 
 
 def _corners_at(grids, grid, low):
-    """Values (C,) at eight centres; x is the lowest bit of the number."""
+    """Values (C,) at eight centres."""
+    return [at(grids.values, place) for place in _places(grids, grid, low)]
+
+
+def _places(grids, grid, low):
+    """Of eight centres among all values; x is the lowest bit of the number."""
     size, first = at(grids.size, grid), at(grids.first, grid)
     high = jnp.minimum(low + 1, size - 1)
     found = []
     for number in range(8):
         x, y, z = (high[axis] if number >> axis & 1 else low[axis] for axis in range(3))
-        found.append(at(grids.values, first + (z * size[1] + y) * size[0] + x))
+        found.append(first + (z * size[1] + y) * size[0] + x)
     return found
 
 

@@ -5,24 +5,25 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
 
 from pathjax.errors import InputError
-from pathjax.kinds import Unused
+from pathjax.kinds import Stored, Unused
 from pathjax.system.files import write_whole
 
 _HEADER = struct.Struct("<3sB5i6f")  # "VOL", version, encoding, x, y, z, channels, the corners of the box
 _VERSION, _FLOAT32 = 3, 1
 # Of a grid that repeats: 4 GB of colours in float32.
 MOST_CELLS = 4e9 / 12
+UNIT = np.array([[0.0] * 3, [1.0] * 3])
 
 
 @dataclass(frozen=True, eq=False)
-class GridVolume:
+class GridVolume(Stored):
     """Values at the centres of the cells of a box, and between them the trilinear interpolation.
 
     Beyond the outermost centres they stay the same.
@@ -32,6 +33,8 @@ class GridVolume:
     to_grid: np.ndarray  # (3, 4), from world space to where the centre of cell i lies at i; x, y, z
     box: np.ndarray  # (2, 3) lower and upper corner in world space of the box around it, beyond which nothing is
     repeats: bool = False  # instead: see `repeated`
+    listed: bool = False  # its values are a parameter of the scene
+    box_of_file: np.ndarray = field(default_factory=lambda: UNIT)  # (2, 3), which a file of its values states
 
     unused: ClassVar[Mapping[str, Unused]] = {
         "accel": Unused("boolean"),
@@ -42,7 +45,7 @@ class GridVolume:
 
     @classmethod
     def read(cls, loader, fields, high: float) -> GridVolume:
-        data, box = fields.array("data", None), np.array([[0.0] * 3, [1.0] * 3])
+        data, box = fields.array("data", None), UNIT
         if data is None:
             path = loader.find(fields, "filename")
             data, of_file = read_vol(path)
@@ -58,7 +61,11 @@ class GridVolume:
             what = "not be negative" if high == np.inf else f"lie between 0 and {high:g}"
             raise fields.element.error(f"{path}: its values must {what}, and are {data.min():g} to {data.max():g}")
         repeats = fields.string("wrap_mode", "clamp", choices=("clamp", "mirror", "repeat")) == "repeat"
-        return cls(data, *_placed(fields.transform("to_world"), box, data.shape[2::-1]), repeats)
+        placed = _placed(fields.transform("to_world"), box, data.shape[2::-1])
+        return cls(data, *placed, repeats, listed=not repeats, box_of_file=box)
+
+    def write(self, path: Path, data: np.ndarray) -> None:
+        write_vol(path, data, self.box_of_file)
 
     def repeated(self, box: np.ndarray) -> GridVolume:
         """The same laid side by side, as far as a box (2, 3) in world space reaches.
@@ -78,7 +85,7 @@ class GridVolume:
 def boxed(value: np.ndarray, to_world: np.ndarray) -> GridVolume:
     """One value (3,) in a unit cube that a (4, 4) places."""
     data = np.reshape(value, (1, 1, 1, 3))
-    return GridVolume(data, *_placed(to_world, np.array([[0.0] * 3, [1.0] * 3]), (1, 1, 1)))
+    return GridVolume(data, *_placed(to_world, UNIT, (1, 1, 1)))
 
 
 def _placed(to_world: np.ndarray, box: np.ndarray, size: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
@@ -119,8 +126,8 @@ def read_vol(path: Path) -> tuple[np.ndarray, np.ndarray]:
     return data.reshape(z, y, x, channels).astype(np.float64), box
 
 
-def write_vol(path: Path, data: np.ndarray) -> None:
-    """Write values (Z, Y, X, C), in the unit cube, as float32."""
+def write_vol(path: Path, data: np.ndarray, box: np.ndarray = UNIT) -> None:
+    """Write values (Z, Y, X, C) in a box (2, 3), as float32."""
     z, y, x, channels = data.shape
-    header = _HEADER.pack(b"VOL", _VERSION, _FLOAT32, x, y, z, channels, 0, 0, 0, 1, 1, 1)
+    header = _HEADER.pack(b"VOL", _VERSION, _FLOAT32, x, y, z, channels, *box.ravel())
     write_whole(path, lambda file: file.write(header + data.astype("<f4").tobytes()))

@@ -59,6 +59,12 @@ def filled(*of_medium):
     return LIGHT + BALL.format(f'<bsdf type="null"/>{medium}')
 
 
+def grid(name, file):
+    place = '<transform name="to_world"><translate x="-0.5" y="-0.5" z="-0.5"/><scale value="2.6"/></transform>'
+    file = f'<string name="filename" value="textures/{file}.vol"/>'
+    return f'<volume name="{name}" type="gridvolume">{file}{place}</volume>'
+
+
 def lit(*emitter):
     return LIGHT + "".join(emitter) + BALL.format(GREY)
 
@@ -154,6 +160,13 @@ CASES = {
         rgb("albedo"),
         numbers(scale=1.5),
     ).replace('"homogeneous"', '"heterogeneous"'),
+    # Of one channel and of three, which shadow rays pass one after the other.
+    "heterogeneous, of grids": filled(grid("sigma_t", "cloud"), grid("albedo", "tints"), numbers(scale=1.5)).replace(
+        '"homogeneous"', '"heterogeneous"'
+    )
+    + '<shape type="sphere"><point name="center" value="0.8, 1.1, 0.3"/><float name="radius" value="0.4"/>'
+    f'<bsdf type="null"/><medium type="heterogeneous" name="interior" id="its">{grid("sigma_t", "tints")}'
+    f"{numbers(scale=4)}</medium></shape>",
     "isotropic": filled(SIGMA, rgb("albedo"), '<phase type="isotropic"/>'),
     "hg": filled(rgb("sigma_t", "1"), rgb("albedo"), f'<phase type="hg" id="phase">{numbers(g=0.6)}</phase>'),
     "blendphase": filled(

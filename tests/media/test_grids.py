@@ -22,6 +22,9 @@ slow = pytest.mark.slow
 CUBE = pj.Transform().scale(2).translate([-0.5, -0.5, -0.5]).matrix  # the unit cube becomes that from -1 to 1
 
 
+NAME = "cube_interior.sigma_t"
+
+
 def volume(data, to_world=CUBE, **more):
     return {"type": "gridvolume", "data": np.asarray(data, float), "to_world": to_world, **more}
 
@@ -124,9 +127,91 @@ def test_what_absorbs_in_a_grid_is_beers_law_and_so_is_its_derivative():
     image, J = pj.jacobian(made, ["cube_interior.scale"], spp=1)
     np.testing.assert_allclose(image, np.exp(-0.7 * depth), rtol=1e-5)
     np.testing.assert_allclose(J["cube_interior.scale"], -depth * np.exp(-0.7 * depth), rtol=1e-4)
-    assert "cube_interior.sigma_t" not in pj.parameters(made)
-    with pytest.raises(pj.InputError, match="is a grid, whose values are no parameters"):
-        pj.with_parameters(made, {"cube_interior.sigma_t": 1.0})
+
+
+@slow
+def test_values_of_a_grid_are_a_parameter():
+    """As above: the centres of cells share a way evenly. Its point is drawn, but shares add up to 1 in each sample."""
+    cells = np.reshape([1, 3, 2], (3, 1, 1))
+    made = scene({"type": "heterogeneous", "albedo": 0.0, "scale": 0.7, "sigma_t": volume(cells)})
+    values = pj.parameters(made)[NAME]
+    np.testing.assert_array_equal(values, cells[..., None])
+    other = pj.render(pj.with_parameters(made, {NAME: values[::-1] + 1}), spp=1)
+    through = np.exp(-0.7 * 2 * np.mean(cells))
+    np.testing.assert_allclose(other, through * np.exp(-0.7 * 2), rtol=1e-5)
+
+    def image(values, spp=256):
+        return pj.render(pj.with_parameters(made, {NAME: values}), spp)
+
+    found = jax.grad(lambda x: image(x).mean())(values)
+    np.testing.assert_allclose(found.sum(), -0.7 * 2 * through, rtol=1e-4)
+    # Of 1024 points a third is expected in each cell: within 4 standard errors.
+    np.testing.assert_allclose(found.ravel() / found.sum(), 1 / 3, atol=4 * np.sqrt(2 / 9 / 1024))
+    pushed = jax.jvp(image, (values,), (jnp.ones_like(values),))[1]
+    np.testing.assert_allclose(pushed, -0.7 * 2 * through, rtol=1e-4)
+
+
+@slow
+def test_products_in_grids_are_the_transpose_of_each_other():
+    """<v, J u> = <J' v, u> to rounding, of extinctions and albedos of two media, one in the light of the other."""
+
+    def ball(name, y, radius, **medium):
+        inside = {"type": "heterogeneous", "id": name, **medium}
+        return {"type": "sphere", "center": [0, y, 0], "radius": radius, "bsdf": {"type": "null"}, "interior": inside}
+
+    film = {"type": "hdrfilm", "width": 8, "height": 8, "filter": {"type": "box"}}
+    camera = pj.Transform().look_at(origin=[0, 1, 3.5], target=[0, 0, 0], up=[0, 1, 0])
+    turn = pj.Transform().translate([0, -1, 0]).rotate([1, 0, 0], -90).scale(3)
+    scattering = {"sigma_t": volume(RNG.random((3, 2, 4)) + 0.3), "albedo": volume(RNG.random((2, 3, 2, 3)))}
+    made = pj.load_dict({
+        "type": "scene",
+        "integrator": {"type": "volpath", "max_depth": 5},
+        "camera": {"type": "perspective", "fov": 45, "to_world": camera, "film": film},
+        "floor": {"type": "rectangle", "to_world": turn, "bsdf": {"type": "diffuse"}},
+        "below": ball("cloud", 0, 0.9, **scattering),
+        "above": ball("veil", 1.2, 0.3, sigma_t=volume(RNG.random((2, 2, 3, 3)), TURNED)),
+        "lamp": {"type": "point", "position": [0, 3, 0], "intensity": {"type": "rgb", "value": [6, 5, 4]}},
+        "sky": {"type": "constant", "radiance": {"type": "rgb", "value": [0.3, 0.4, 0.6]}},
+    })  # fmt: skip
+    values = {name: x for name, x in pj.parameters(made).items() if x.ndim == 4}
+    assert set(values) == {"cloud.sigma_t", "cloud.albedo", "veil.sigma_t"}
+    u = {name: jnp.asarray(RNG.normal(size=x.shape), jnp.float32) for name, x in values.items()}
+    v = RNG.normal(size=(8, 8, 3)).astype(np.float32)
+
+    def image(some):
+        return pj.render(pj.with_parameters(made, some), spp=16)
+
+    pulled = jax.vjp(image, values)[1](jnp.asarray(v))[0]
+    none = {name: jnp.zeros_like(x) for name, x in u.items()}
+    for name in values:
+        pushed = jax.jvp(image, (values,), ({**none, name: u[name]},))[1] * v
+        gap = abs(float((pulled[name] * u[name]).sum() - pushed.sum()))
+        assert gap < 1e-5 * float(jnp.abs(pushed).sum()), name
+
+
+def test_volumes_that_are_no_parameters_are_refused_by_name():
+    repeats = volume(np.ones((2, 2, 2)), wrap_mode="repeat")
+    for extinction in (repeats, {"type": "constvolume", "value": 2.0}):
+        made = scene({"type": "heterogeneous", "albedo": 0.0, "sigma_t": extinction})
+        with pytest.raises(pj.InputError, match="is a volume that repeats or has one value, which is no parameter"):
+            pj.with_parameters(made, {NAME: 1.0})
+
+
+@slow
+def test_a_grid_is_fitted():
+    """What absorbs in 2 x 2 columns, seen along them, within 5 standard errors."""
+    columns = np.reshape([0.5, 1, 1.5, 0.8], (1, 2, 2))
+    to_world = pj.Transform().translate([0, 0, -3]).matrix
+    film = {"type": "hdrfilm", "width": 16, "height": 16, "filter": {"type": "box"}}
+    fog = {"type": "heterogeneous", "albedo": 0.0, "sigma_t": volume(columns)}
+    cube = {"type": "cube", "id": "cube", "bsdf": {"type": "null"}, "interior": fog}
+    camera = {"type": "orthographic", "to_world": to_world, "film": film}
+    rest = {"integrator": {"type": "volpath"}, "sky": {"type": "constant", "id": "sky"}}
+    made = pj.load_dict({"type": "scene", "camera": camera, "cube": cube, **rest})
+    target = np.asarray(pj.render(made, 256, seed=5))
+    fitted = pj.fit(made, target, [NAME], start={NAME: np.full((1, 2, 2, 1), 1.0)}, spp=64)
+    error = np.abs(fitted.values[NAME][..., 0] - columns)
+    assert (error < 5 * fitted.standard_errors[NAME][..., 0] + 1e-3).all() and (error < 0.02).all()
 
 
 @slow
@@ -231,6 +316,19 @@ def test_files_hold_values_and_a_box(tmp_path):
 def test_a_saved_scene_has_its_grids_in_files(tmp_path):
     data = RNG.random((2, 3, 4)).astype(np.float32)
     made = scene({"type": "heterogeneous", "albedo": 0.0, "sigma_t": volume(data)})
+    pj.save_scene(made, tmp_path / "saved.xml")
+    again = pj.load_scene(tmp_path / "saved.xml")
+    for x, y in zip(jax.tree.leaves(made.media), jax.tree.leaves(again.media), strict=True):
+        np.testing.assert_array_equal(x, y)
+
+
+def test_a_saved_scene_has_the_values_of_its_grids(tmp_path):
+    """Also where the file's box is the grid's, which other values do not move."""
+    write_vol(tmp_path / "a.vol", RNG.random((2, 3, 4, 1)), np.array([[-1.0, 0, 0], [1, 2, 1]]))
+    file = {"type": "gridvolume", "filename": str(tmp_path / "a.vol"), "use_grid_bbox": True}
+    made = scene({"type": "heterogeneous", "albedo": volume(RNG.random((2, 1, 2, 3))), "sigma_t": file})
+    values = {NAME: RNG.random((2, 3, 4, 1)), "cube_interior.albedo": RNG.random((2, 1, 2, 3))}
+    made = pj.with_parameters(made, values)
     pj.save_scene(made, tmp_path / "saved.xml")
     again = pj.load_scene(tmp_path / "saved.xml")
     for x, y in zip(jax.tree.leaves(made.media), jax.tree.leaves(again.media), strict=True):

@@ -27,8 +27,7 @@ from pathjax.io.mesh import ply_writer
 from pathjax.io.mitsuba import dict_reader
 from pathjax.io.mitsuba.loader import read_again
 from pathjax.io.mitsuba.plugins import PLUGINS
-from pathjax.kinds import Instance
-from pathjax.media.gridvolume import write_vol
+from pathjax.kinds import Instance, Stored
 from pathjax.system.files import check_writable, write_text
 
 
@@ -61,6 +60,7 @@ class _Writer:
         self.path, self.sources, self.seen = path, sources, description.views[description.seen]
         self.files: dict[Path, Callable[[], None]] = {}  # and what writes each
         self.images = _changed_images(description.made.values(), values)
+        self.stored = _changed_arrays(description.made.values(), values)
 
     def text(self, element: Element, depth: int = 0) -> str:
         """The element and what it holds as lines of XML."""
@@ -113,6 +113,8 @@ class _Writer:
             element = self.with_values(element, made, values) if values else element
         if isinstance(made, Instance) and made in self.images:
             return self.with_image(element, *self.images[made])
+        if isinstance(made, Stored) and made in self.stored:
+            return self.with_array(element, made, *self.stored[made])
         if _has_arrays(element):
             names = [made.name if isinstance(made, Instance) else element.tag, element.attributes.get("name")]
             name = "_".join(filter(None, names))
@@ -132,7 +134,7 @@ class _Writer:
         found = []
         for key in made.values:
             value = self.values.get(f"{made.name}.{key}")
-            if value is not None and not isinstance(made.values[key], Instance) and made.values[key] is not None:
+            if value is not None and not isinstance(made.values[key], Instance | Stored | None):
                 read = np.broadcast_to(np.asarray(made.values[key], value.dtype), value.shape)
                 found += [key] if not np.array_equal(read, value) else []
         return found
@@ -142,7 +144,7 @@ class _Writer:
 
         Where the file sets them by other names, as a metal's by that of its material, it states all parameters instead.
         """
-        constant = {key: x for key, x in made.values.items() if not isinstance(x, Instance)}
+        constant = {key: x for key, x in made.values.items() if not isinstance(x, Instance | Stored)}
         listed = {key: x for key, x in constant.items() if f"{made.name}.{key}" in self.values}
         every = listed | values
         known = made.kind.declared.keys() | made.kind.unused.keys() | {"to_world"}
@@ -180,7 +182,8 @@ class _Writer:
             raise child.error(f"{child} of {parent}: no scene file holds such an array")
         if parent.tag == "volume":
             file = self.file(name, ".vol")
-            self.files[file] = lambda: write_vol(file, self.made[parent].data)
+            volume = self.made[parent]
+            self.files[file] = lambda: volume.write(file, volume.data)
             return Element("string", {"name": "filename", "value": file.name}, child.file, child.line)
         data = np.atleast_3d(child.data)
         data = np.broadcast_to(data, (*data.shape[:2], 3))
@@ -196,6 +199,17 @@ class _Writer:
         """The bitmap with other texels, in a file of its own."""
         file = self.file(name, ".exr")
         self.files[file] = lambda: _write_linear(file, texels)
+        return self.with_file(element, file)
+
+    def with_array(self, element: Element, stored: Stored, name: str, values: np.ndarray) -> Element:
+        """The volume with other values, in a file of its own."""
+        file = self.file(name, ".vol")
+        self.files[file] = lambda: stored.write(file, values)
+        return self.with_file(element, file)
+
+    @staticmethod
+    def with_file(element: Element, file: Path) -> Element:
+        """The element with a file in the place of its own or of its array."""
         children = [x for x in element.children if x.attributes.get("name") not in ("filename", "data")]
         children.append(Element("string", {"name": "filename", "value": file.name}, element.file, element.line))
         return Element(element.tag, element.attributes, element.file, element.line, children)
@@ -234,6 +248,20 @@ def _changed_images(made: Iterable[object], values: Mapping[str, np.ndarray]) ->
                 value, read = np.stack([value] * 3, -1), np.stack([luminance(read)] * 3, -1)
             if not np.array_equal(np.broadcast_to(read, value.shape), value):
                 found[image] = name, value
+    return found
+
+
+def _changed_arrays(
+    made: Iterable[object], values: Mapping[str, np.ndarray]
+) -> dict[Stored, tuple[str, np.ndarray]]:
+    """The same of volumes."""
+    found = {}
+    for owner in made:
+        for key, x in owner.values.items() if isinstance(owner, Instance) else ():
+            name = f"{owner.name}.{key}"
+            if isinstance(x, Stored) and name in values:
+                if not np.array_equal(x.data.astype(values[name].dtype), values[name]):
+                    found[x] = name, values[name]
     return found
 
 
