@@ -70,8 +70,13 @@ def keep_kernels() -> None:
 def _keep_programs(folder: Path) -> None:
     global _programs
     if _programs is None:
-        jax.monitoring.register_event_listener(lambda event, **_: "cache_hits" in event and _hits.append(event))
+        jax.monitoring.register_event_listener(_hear_hit)
     _programs = folder
+
+
+def _hear_hit(event: str, **_: str | int) -> None:
+    if "cache_hits" in event:
+        _hits.append(event)
 
 
 def compiled(function, *arguments, **static) -> Callable:

@@ -41,7 +41,7 @@ def _replica(x: jax.Array) -> jax.Array:
         return kept[1]
     here, used = jax.local_devices(), jax.devices()
     # A view of a CPU device's memory, which other CPU devices take as it is. It keeps the memory, and not x.
-    source = np.from_dlpack(x) if here[0].platform == "cpu" else x
+    source = np.from_dlpack(x) if here[0].platform == "cpu" else x  # type: ignore[arg-type]
     copies = [x if {device} == x.devices() else jax.device_put(source, device) for device in here]
     everywhere = NamedSharding(Mesh(np.array(used), ("device",)), PartitionSpec())
     replica = jax.make_array_from_single_device_arrays(x.shape, everywhere, copies)
