@@ -151,7 +151,8 @@ def text(facts: dict) -> str:
         low, high = parameter["bounds"]
         shown = ", ".join(f"{x:g}" for x in (parameter["mean"] if "mean" in parameter else parameter["value"]).ravel())
         if "mean" in parameter:
-            shown = f"{parameter['shape'][0]} x {parameter['shape'][1]} texels, mean {shown}"
+            size = parameter["shape"][: len(parameter["shape"]) - parameter["mean"].ndim]
+            shown = f"{' x '.join(map(str, size))} {'texels' if len(size) == 2 else 'values'}, mean {shown}"
         lines.append(f"  {name:32} {shown:28} in [{low:g}, {high:g}]")
     lines += [f"note        {note}" for note in facts["notes"]]
     return "\n".join(lines)

@@ -62,7 +62,7 @@ def text(fit: Fit) -> str:
         known = _summary(fit, name)
         size = " x ".join(map(str, known["shape"][:-1]))
         typical = f"+- {known['median_standard_error']:.3g} in the median" if known["seen"] else "not determined"
-        parts = "texels" if len(known["shape"]) == 3 else "cells"
+        parts = "texels" if len(known["shape"]) == 3 else "values"
         lines.append(f"{name:<{width}}  {size} {parts}, {known['seen']:.0%} of them seen, {typical}")
     for label, value, error in zip(listed, values, errors, strict=True):
         digits = 6 if not 0 < error < math.inf else min(max(1 - math.floor(math.log10(error)), 0), 8)

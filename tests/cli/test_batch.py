@@ -82,10 +82,10 @@ def test_images_are_those_of_single_renders_and_one_kernel_makes_them(folder, tm
     jobs = some_jobs()
     jobs[1] |= {"set": {"floor.reflectance": [0.1, 0.2, 0.3]}, "parameters": {"fov": 30}, "seed": 5}
     jobs[2] |= {"output": "deep/er/2.exr"}
-    before = passes._replicate_sums._cache_size()
+    before = passes._sums_of_replicates._cache_size()
     outcomes = pj.render_batch(write_jobs(folder / "jobs.jsonl", jobs), tmp_path)
     assert [outcome.status for outcome in outcomes] == ["done"] * 4
-    assert passes._replicate_sums._cache_size() - before <= 1
+    assert passes._sums_of_replicates._cache_size() - before <= 1
     assert sum(outcome.compile_seconds > 0.1 for outcome in outcomes) <= 1
     scene = pj.with_parameters(load_scene(folder / "1.xml", fov=30), jobs[1]["set"])
     single = pj.render_until(scene, spp=8, seed=5).image

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 import pathjax as pj
+from pathjax.images import write_png
+from pathjax.media.gridvolume import write_vol
 
 FURNACE = "scenes/furnace.xml"
 
@@ -19,6 +21,23 @@ def test_info_lists_every_parameter(run, name):
     lines = [line.split() for line in out.splitlines()]
     for parameter in parameters:
         assert any(line[:1] == [parameter] for line in lines), parameter
+
+
+def test_info_tells_how_many_numbers_stand_in_one_line(run, write_scene, tmp_path):
+    write_vol(tmp_path / "fog.vol", np.full((2, 3, 4, 1), 0.5, np.float32))
+    write_png(tmp_path / "dots.png", np.full((5, 6, 3), 0.25))
+    bitmap = f'<texture type="bitmap" name="%s"><string name="filename" value="{tmp_path}/dots.png"/></texture>'
+    grid = f'<volume type="gridvolume" name="sigma_t"><string name="filename" value="{tmp_path}/fog.vol"/></volume>'
+    path = write_scene(
+        f"""<shape type="sphere"><bsdf type="null"/>
+        <medium type="heterogeneous" name="interior" id="fog">{grid}</medium></shape>
+        <shape type="sphere"><bsdf type="roughconductor" id="metal">
+        {bitmap % "alpha"}{bitmap % "specular_reflectance"}</bsdf></shape>"""
+    )
+    path.write_text(path.read_text().replace('"path"', '"volpath"'))
+    _, out, _ = run("info", path)
+    assert "2 x 3 x 4 values, mean 0.5 " in out
+    assert out.count("5 x 6 texels, mean ") == 2
 
 
 def test_info_as_json(run):

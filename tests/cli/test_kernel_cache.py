@@ -25,7 +25,7 @@ events, traced = [], []
 jax.monitoring.register_event_listener(lambda event, **_: events.append(event.rpartition("/")[2]))
 jax.monitoring.register_event_duration_secs_listener(lambda event, _, **what: traced.append(what.get("fun_name")))
 status = cli.main(sys.argv[1:])
-print(events.count("compile_requests_use_cache"), events.count("cache_hits"), traced.count("_replicate_means"))
+print(events.count("compile_requests_use_cache"), events.count("cache_hits"), traced.count("_means_of_replicates"))
 sys.exit(status)
 """
 
@@ -73,7 +73,7 @@ def test_the_second_run_compiles_nothing_and_gives_the_same_image(counted, tmp_p
     kept = entries(cache)
     assert sum(name.endswith(".program") for name in kept) == 1
     assert any(name.startswith("jit__render_aovs") for name in kept)
-    assert not any(name.startswith("jit__replicate_means") for name in kept), "it is kept twice"
+    assert not any(name.startswith("jit__means_of_replicates") for name in kept), "it is kept twice"
     assert all(path.relative_to(cache).parts[0] == "pathjax" for path in cache.rglob("*") if path.is_file())
     wanted, found, traced, image = end(counted(*depth, XDG_CACHE_HOME=cache))
     assert wanted == found > 0

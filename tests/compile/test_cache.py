@@ -41,7 +41,7 @@ def test_a_program_is_found_again_and_gives_the_same(folder, monkeypatch):
 
 def test_what_a_program_depends_on_is_in_its_key(shipped):
     def key(scene, options=DEFAULTS):
-        return cache._key(passes._replicate_means, (nameless(scene), np.uint32(0)), {"options": options})
+        return cache._key(passes._means_of_replicates, (nameless(scene), np.uint32(0)), {"options": options})
 
     scene = shipped("furnace", res=8)
     assert key(scene) == key(pj.with_parameters(scene, pj.parameters(scene)))

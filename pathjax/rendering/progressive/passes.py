@@ -234,16 +234,16 @@ def compile(scene: Scene, options: Options, chunk: int) -> Callable:
     arguments = scene, jax.ShapeDtypeStruct((3, chunk), np.int32), np.uint32(0)
     if scene.film.shared:
         scale = jax.ShapeDtypeStruct((chunk,), np.float32)
-        kernel = compiled(_replicate_sums, *arguments, scale, options=replace(options, shared=True))
+        kernel = compiled(_sums_of_replicates, *arguments, scale, options=replace(options, shared=True))
     else:
-        kernel = compiled(_replicate_means, *arguments, options=options)
+        kernel = compiled(_means_of_replicates, *arguments, options=options)
     # A compiled kernel, unlike a jitted function, does not ask for the calling thread's contexts, such as
     # `jax.enable_x64`.
     return partial(kernel, scene)
 
 
 @partial(jax.jit, static_argnames="options")
-def _replicate_means(scene, numbers, seed, *, options):
+def _means_of_replicates(scene, numbers, seed, *, options):
     pixels, before, after = numbers
     first_sample = replicates.shares(before)
     spp = replicates.shares(after) - first_sample
@@ -254,7 +254,7 @@ def _replicate_means(scene, numbers, seed, *, options):
 
 
 @partial(jax.jit, static_argnames="options")
-def _replicate_sums(scene, numbers, seed, scale, *, options):
+def _sums_of_replicates(scene, numbers, seed, scale, *, options):
     pixels, before, after = numbers
     first_sample = replicates.shares(before)
     spp = replicates.shares(after) - first_sample
