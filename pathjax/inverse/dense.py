@@ -5,8 +5,9 @@ Light keeps its channel, so each channel has equations of its own, in Q colours:
     (J' W J + P) step = J' W (target - image) + P (mean - values),        errors C (J' W V W J + P) C
 
 with C = (J' W J + P)^-1 and V the variance of what pixels miss. J is the mean of two independent renders, whose
-difference tells how much of a pixel's row is noise. That noise adds to J' W J what no pixel knows, as if texels were
-known that are not; so a pixel weighs as much less as its row is less than sure, and V is what it was.
+difference D, halved, tells how much of it is noise. That noise adds D' W D to J' W J, as if texels were known that no
+pixel knows: to first order C is too small by C D' W D C, so J has as many samples as make this a small part of C. Where
+they cannot be had, a pixel weighs as much less as its row is less than sure, and what is missing is added to errors.
 """
 
 from __future__ import annotations
@@ -18,13 +19,22 @@ from scipy import linalg
 
 from pathjax import distributed
 from pathjax.derivatives.jacobian import has_rows
-from pathjax.inverse.many import Search
+from pathjax.inverse.many import BATCHES, CHECK_PART, PRETENDED, PRODUCT_SPP, Search, whole
 from pathjax.inverse.problem import Problem
 from pathjax.inverse.uncertainty import MAX_RELATIVE_ERROR
 
 # Up to so many numbers: a matrix of each channel is then 8 MB, and solved within a second. And up to so many products
 # of two entries of a pixel's row: to sum them up takes some seconds.
 MOST_NUMBERS, MOST_PRODUCTS = 3072, 1 << 34
+# Samples of each of the two J: at most so many times those of the image; and for errors they are raised so often, if
+# they are too few.
+MOST_SAMPLES, RAISED = 4, 2
+# What noise of J pretends to know is found with so many signs drawn for each pixel, and is to be small for all but this
+# part of the texels that are known.
+SIGNS, LEFT_OUT = 16, 0.05
+# How often a step solves its equations, at most, to find which values stay at a bound. So many rounds in a row may be
+# in vain, as no fewer values are wrongly at a bound or beyond one; then they change sides one by one.
+ROUNDS, PATIENCE = 50, 3
 
 
 def is_dense(problem: Problem) -> bool:
@@ -41,6 +51,7 @@ class Equations(NamedTuple):
     matrix: np.ndarray  # (3, Q, Q) J' W J
     gradient: np.ndarray  # (Q, 3) J' W (image - target)
     known: np.ndarray  # (Q, 3) diagonal of J' V^-1 J, to which noise of J adds nothing
+    pretended: np.ndarray  # (3, Q, K), of which the squares have the mean D' W D
     scatter: np.ndarray  # (3, Q, Q) J' W V W J, if asked for
 
 
@@ -51,21 +62,71 @@ class Dense(Search):
     least_told = 0.0
 
     def step(self) -> None:
-        self.equations = found = self.sums()
         self.prior_matrix = self.prior.of_channel()
+        found = self.solved()
         gradient = found.gradient.ravel() + self.prior.gradient(self.values)
-        self.free = self.inside(gradient)
         damping = self.damping * np.einsum("cqq->qc", found.matrix).ravel()
-        self.values = np.clip(self.values + self.solve(-gradient, damping), self.low, self.high)
+        self.values = self.bounded(gradient, damping)
 
-    def sums(self, scatter: bool = False) -> Equations:
-        """Sum up the normal equations over the kept pixels, with as many samples of J as the image had.
+    def bounded(self, gradient: np.ndarray, damping: np.ndarray) -> np.ndarray:
+        """Where the quadratic of this gradient and of `times` is least within the bounds.
+
+        A step that is merely clipped leaves neighbours where they made up for what was cut off. Which values stay at
+        a bound is found by block principal pivoting (Judice and Pires 1994, Computers & Operations Research 21(5)): all
+        that are wrongly there or beyond change sides, or the last one alone, while they become no fewer.
+        """
+        values, low, high = self.values, self.low, self.high
+        at_low, at_high = (values <= low) & (gradient > 0), (values >= high) & (gradient < 0)
+        fewest, in_vain = len(values) + 1, 0
+        for _ in range(ROUNDS):
+            self.free = free = ~(at_low | at_high)
+            bound = np.where(at_low, low - values, np.where(at_high, high - values, 0))
+            step = bound + self.solve(-gradient - self.times(bound) - damping * bound, damping)
+            slope = gradient + self.times(step) + damping * step
+            below, above = free & (values + step < low), free & (values + step > high)
+            wrong = below | above | at_low & (slope < 0) | at_high & (slope > 0)
+            count = int(wrong.sum())
+            if not count:
+                break
+            fewest, in_vain = (count, 0) if count < fewest else (fewest, in_vain + 1)
+            if in_vain > PATIENCE:
+                wrong = np.arange(len(values)) == np.flatnonzero(wrong)[-1]
+            at_low, at_high = np.where(wrong, (below, above), (at_low, at_high))
+        return np.clip(values + step, low, high)
+
+    def solved(self, variance: np.ndarray | None = None) -> Equations:
+        """Find the equations and their inverse; for errors (variance: of `sums`) with as many samples of J as it takes.
+
+        Steps have as many as those before asked for.
+        """
+        most = MOST_SAMPLES * self.samples
+        for _ in range(1 if variance is None else 1 + RAISED):
+            self.product_spp = min(max(self.sharp, PRODUCT_SPP), most)
+            self.equations = found = self.sums(variance)
+            self.inverse = np.stack([linalg.inv(m + self.prior_matrix) for m in found.matrix])
+            self.pretended = ((self.inverse @ found.pretended) ** 2).mean(-1).T.ravel()  # (n,) of their variances
+            variances = np.einsum("cqq->qc", self.inverse).ravel()
+            known = variances < (MAX_RELATIVE_ERROR * self.prior.scale) ** 2
+            part = (self.pretended / variances)[known if known.any() else ...]
+            self.sharp = int(np.ceil(self.product_spp * np.quantile(part, 1 - LEFT_OUT) / PRETENDED))
+            if self.sharp <= self.product_spp or self.product_spp == most:
+                break
+        return found
+
+    def times(self, x: np.ndarray) -> np.ndarray:
+        """The matrix of the equations of the last step times x (n,)."""
+        x = x.reshape(-1, 3)
+        return (np.einsum("cqr,rc->qc", self.equations.matrix, x) + self.prior_matrix @ x).ravel()
+
+    def sums(self, variance: np.ndarray | None = None) -> Equations:
+        """Sum up the normal equations over the kept pixels; with `scatter`, if their variance (N, 3) is given.
 
         Parts of the pixels are dealt to devices, and to processes, and added up in their order.
         """
         products, count = self.products, len(self.values) // 3
-        samples, draws = max(self.samples // 2, 1), (products.next_draw(), products.next_draw())
-        shapes = (3, count, count), (count, 3), (count, 3), (3 * scatter, count, count)
+        draws, scatter = (products.next_draw(), products.next_draw()), variance is not None
+        signs = self.random.choice([-0.5, 0.5], (products.count, SIGNS))
+        shapes = (3, count, count), (count, 3), (count, 3), (3, count, SIGNS), (3 * scatter, count, count)
         found = Equations(*map(np.zeros, shapes))
         ends = np.cumsum([x.size for x in found])
 
@@ -82,11 +143,13 @@ class Dense(Search):
                 mine.matrix[c] = here.T @ J[c]
                 mine.gradient[:, c] = here.T @ self.residual[part.places, c]
                 mine.known[:, c] = of_channel @ (a[c] * b[c])
+                root = np.sqrt(trust * w[:, c, None]) * signs[part.places]
+                mine.pretended[c] = (a[c] - b[c]).T @ root
                 if scatter:
-                    mine.scatter[c] = here.T @ (trust * J[c])
+                    mine.scatter[c] = here.T @ (variance[part.places, c, None] * here)
             return np.concatenate([x.ravel() for x in (*mine, trusts)]).view(np.uint32)
 
-        parts = products.rows(self.values, samples, draws)
+        parts = products.rows(self.values, self.product_spp, draws)
         for part, words in distributed.dealt(of_part, parts, lambda: self.interrupts.heard):
             if words is None:
                 raise KeyboardInterrupt
@@ -108,20 +171,37 @@ class Dense(Search):
         return solution.ravel()
 
     def determined(self) -> np.ndarray:
-        parts = [linalg.solve(m + self.prior_matrix, m, assume_a="pos") for m in self.equations.matrix]
-        return np.stack([np.diag(part) for part in parts], -1).ravel()
+        return np.einsum("cqr,crq->qc", self.inverse, self.equations.matrix).ravel()
 
     def draw(self) -> np.ndarray:
         e = self.random.normal(size=(len(self.values) // 3, 3))
         score = [linalg.cholesky(m + self.prior_matrix).T @ e[:, c] for c, m in enumerate(self.equations.matrix)]
         return self.solve(np.stack(score, -1).ravel())
 
+    def check(self) -> float:
+        """Look at where the last step led. Returns the variance of target and image, over that of one sample."""
+        equations = self.weights, self.render_part, self.samples, self.variances, self.renders
+        self.excess = self.look(whole(self.spp / CHECK_PART))
+        # Of few samples the noise is another, as they are spread less evenly: it is that of the renders before.
+        self.weights, self.render_part, self.samples, self.variances, self.renders = equations
+        # As many values as the pixels determine are fitted to the noise of target and image: with H what that makes of
+        # pixels, these miss (1 - H) times the noise of the target, and H times that of the image that was stepped from.
+        used = (self.weights > 0) * self.trust
+        count, told, image = used.sum(), self.told.sum(), 1 / (BATCHES * self.each)
+        single = self.products.kept([variance / self.renders for variance in self.variances])
+        share = float((used * single / self.products.kept(self.variance())).sum() / max(count, 1))
+        missed = self.missed / share if share > 0 else 0.0
+        target = float(np.clip((missed - image * told) / max(count - told, 1), 0, 1))
+        self.target_part = share * target
+        # The variance (N, 3) of what the image misses, of each pixel by itself: noisy, but not biased.
+        steps = self.products.kept([np.broadcast_to(t.step, t.image.shape) for t in self.problem.targets])
+        self.missing = single * (image + target) + steps**2 / 12 + self.problem.rounding**2
+        return self.render_part + self.target_part
+
     def find_errors(self, larger: float) -> None:
-        equations, P = self.sums(scatter=True), self.prior_matrix
-        variances = np.zeros_like(equations.known)
-        for c, (matrix, scatter) in enumerate(zip(equations.matrix, equations.scatter, strict=True)):
-            C = linalg.inv(matrix + P)
-            variances[:, c] = ((C @ (larger**2 * scatter + P)) * C).sum(1)
-        found, most = np.sqrt(variances).ravel(), MAX_RELATIVE_ERROR * self.prior.scale
-        unseen = (equations.known.ravel() * most**2 < larger**2) | (found > most)
-        self.standard_errors = np.where(unseen, np.inf, found)
+        """Standard errors, by what pixels miss by themselves, which holds how much larger their noise is."""
+        found, C = self.solved(self.missing), self.inverse
+        variances = (C @ (found.scatter + self.prior_matrix) * C).sum(-1).T.ravel() + self.pretended
+        most = (MAX_RELATIVE_ERROR * self.prior.scale) ** 2
+        unseen = (found.known.ravel() * most < 1) | (variances > most)
+        self.standard_errors = np.where(unseen, np.inf, np.sqrt(variances))

@@ -88,10 +88,10 @@ class Search:
         for part in LEVELS:
             if part == LEVELS[-1]:
                 self.survey()
-            self.descend(_whole(self.spp / part), part == LEVELS[-1])
+            self.descend(whole(self.spp / part), part == LEVELS[-1])
         supposed, found = 2 * self.render_part, self.check()
         if not 1 / OTHER_NOISE < found / supposed < OTHER_NOISE:
-            self.descend(_whole(self.spp), True)
+            self.descend(whole(self.spp), True)
             supposed, found = self.render_part + self.target_part, self.check()
         self.find_errors(np.sqrt(found / supposed))
         self.survey()
@@ -112,7 +112,7 @@ class Search:
     def check(self) -> float:
         """Look at where the last step led. Returns the variance of target and image, over that of one sample."""
         equations = self.weights, self.render_part
-        self.excess = self.look(_whole(self.spp / CHECK_PART))
+        self.excess = self.look(whole(self.spp / CHECK_PART))
         self.weights, self.render_part = equations
         # The expectation of this square is the number of parameters that the pixels determine: so many values are
         # fitted to noise, and the others miss the noise of the target.
@@ -319,5 +319,6 @@ class Search:
         distributed.heard(self.interrupts)  # its exception may have been lost, while Python collected garbage
 
 
-def _whole(samples: float) -> int:
+def whole(samples: float) -> int:
+    """So many samples or fewer, that are as many in each batch."""
     return max(int(samples) // BATCHES, 1) * BATCHES
