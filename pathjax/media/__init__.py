@@ -285,7 +285,6 @@ def transmittance(
     if values is None:
         return through()
 
-
     def in_grid(grid):
         depth = grids.depth(values, grid, ray, distance)
         return jnp.exp(-sigma * (depth if nudge is None else depth + nudge))

@@ -20,8 +20,6 @@ from pathjax.media.gridvolume import GridVolume, boxed, read_vol, write_vol
 
 slow = pytest.mark.slow
 CUBE = pj.Transform().scale(2).translate([-0.5, -0.5, -0.5]).matrix  # the unit cube becomes that from -1 to 1
-
-
 NAME = "cube_interior.sigma_t"
 
 
