@@ -27,7 +27,7 @@ from pathjax.compile import compute_once, is_traced, native_fold, native_rows, p
 from pathjax.compile.lanes import flags
 from pathjax.core import sampler
 from pathjax.core.math import LUMINANCE, at
-from pathjax.derivatives import places
+from pathjax.derivatives import differentiated
 from pathjax.derivatives.record import Record, Slot, extend
 from pathjax.emitters import Choice
 from pathjax.errors import InputError
@@ -266,8 +266,8 @@ def pixel_sweep(
     memory: Memory,
     *,
     options: Options,
-    slots: places.Slots,
-    paths: places.Paths,
+    slots: differentiated.Slots,
+    paths: differentiated.Paths,
     structure: Record,
 ) -> tuple[Float[Array, "3"], Memory]:
     """Add what the samples of a pixel give, and their mean.
@@ -318,11 +318,11 @@ class _Kernel(NamedTuple):
     of_pixel: Callable  # `pixel_sweep`
 
 
-def _kernel(scene: Scene, paths: places.Paths, options: Options) -> _Kernel:
+def _kernel(scene: Scene, paths: differentiated.Paths, options: Options) -> _Kernel:
     scene = options.applied(scene)
     choice = emitters.choice(scene.emitters, options.strategy)
-    slots = places.slots(scene, paths)
-    _, entries = places.firsts(scene, paths)
+    slots = differentiated.slots(scene, paths)
+    _, entries = differentiated.firsts(scene, paths)
 
     def record(scene, choice, x):
         now, _ = pixel.camera_path(scene, jnp.int32(0), x, x, options)
@@ -344,12 +344,12 @@ def pullback(
         scene: without names.
         adjoint: (N, 3) of the means of the pixels.
         pixels, first_sample, spp, seed: (N,) each.
-        paths: of the arrays, which `places` knows.
+        paths: of the arrays, which `differentiated` knows.
         ring: of `longest_ring`.
         form, devices: of `native_fold`.
     """
     scene, choice, structure, entries, sweep_of = _kernel(scene, paths, options)
-    first, _ = places.firsts(scene, paths)
+    first, _ = differentiated.firsts(scene, paths)
 
     def of_pixel(work, scene, choice, memory):
         adjoint, work = work
@@ -360,8 +360,8 @@ def pullback(
     total = native_fold(of_pixel, work, scene, choice, start=begin, finish=end, form=form, devices=devices)
 
     def of_array(path):
-        rows = total[3 * first[path] : 3 * (first[path] + places.count(scene, path))]
-        rows = rows if places.of_colors(scene, path) else rows.reshape(-1, 3).sum(1)
+        rows = total[3 * first[path] : 3 * (first[path] + differentiated.count(scene, path))]
+        rows = rows if differentiated.of_colors(scene, path) else rows.reshape(-1, 3).sum(1)
         return rows.reshape(named.get(scene, path).shape)
 
     return [of_array(path) for path in paths]

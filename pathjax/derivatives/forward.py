@@ -19,7 +19,7 @@ from pathjax import emitters
 from pathjax.compile import compute_once, persistent_loop
 from pathjax.core import sampler
 from pathjax.core.math import at, luminance
-from pathjax.derivatives import places
+from pathjax.derivatives import differentiated
 from pathjax.derivatives.record import Record, extend
 from pathjax.emitters import Choice
 from pathjax.integrators import path, pixel
@@ -30,7 +30,7 @@ from pathjax.scene.scene import Scene
 
 
 def changes(record: Record, v: Float[Array, "M 3"]) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
-    """What v does to Le + n and to w of a vertex. v: the list of changes, as `places` orders it."""
+    """What v does to Le + n and to w of a vertex. v: the list of changes, as `differentiated` orders it."""
     now = later = jnp.zeros_like(record.weight)
     for slot in record.slots:
         shares = slot.shares or (1,)
@@ -49,8 +49,8 @@ def pixel_change(
     v: Float[Array, "M 3"],
     *,
     options: Options,
-    slots: places.Slots,
-    paths: places.Paths,
+    slots: differentiated.Slots,
+    paths: differentiated.Paths,
 ) -> Float[Array, "3"]:
     """What v does to the mean of a pixel."""
     pixel_number, first_sample, spp, seed = work
@@ -85,15 +85,15 @@ def push(
         scene: without names.
         changed: v, of each of the arrays, of its shape.
         pixels, first_sample, spp, seed: (N,) each.
-        paths: of the arrays, which `places` knows.
+        paths: of the arrays, which `differentiated` knows.
         form, devices: of `native_map`.
     """
     scene = options.applied(scene)
     choice = emitters.choice(scene.emitters, options.strategy)
-    slots = places.slots(scene, paths)
+    slots = differentiated.slots(scene, paths)
 
     def entries(path, array):
-        array = array.reshape(places.count(scene, path), -1)
+        array = array.reshape(differentiated.count(scene, path), -1)
         return jnp.broadcast_to(array, (len(array), 3))
 
     rows = list(map(entries, paths, changed))

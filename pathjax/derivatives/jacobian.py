@@ -22,7 +22,7 @@ from pathjax import emitters
 from pathjax.bsdfs import dielectric
 from pathjax.compile import is_symbolic_zero, is_traced, native, on_all_devices, register_dataclass, usual_promotion
 from pathjax.core.types import Number
-from pathjax.derivatives import backward, ior, ior_difference, ior_step, places, rules, tangents
+from pathjax.derivatives import backward, differentiated, ior, ior_difference, ior_step, rules, tangents
 from pathjax.errors import InputError
 from pathjax.integrators import pixel
 from pathjax.integrators.options import Counts, Options
@@ -204,9 +204,9 @@ def takes_sweep(scene: Scene, parameters, options: Options, form: str | None = N
 def has_rows(scene: Scene, parameters) -> bool:
     """Whether `backward.rows` finds the derivatives in them: in colours alone, which move no path."""
     paths = {parameter.path for parameter in parameters}
-    if not paths <= places.paths(scene) or any(parameter.shape[-1:] != (3,) for parameter in parameters):
+    if not paths <= differentiated.paths(scene) or any(parameter.shape[-1:] != (3,) for parameter in parameters):
         return False
-    slots = places.slots(scene, tuple(paths))
+    slots = differentiated.slots(scene, tuple(paths))
     # What also stands for a number has a derivative across channels.
     return slots.of_bsdfs == slots.colors and not (slots.of_choices or slots.of_passed or slots.grids)
 
@@ -215,7 +215,7 @@ def has_rows(scene: Scene, parameters) -> bool:
 def _swept(wanted, options, ring, how, scene, pixels, *numbers):
     """Means and derivatives, by name. how: `form` and `devices`; lanes are the only form."""
     paths = tuple(dict.fromkeys(parameter.path for parameter in wanted.values()))
-    first, _ = places.firsts(scene, paths)
+    first, _ = differentiated.firsts(scene, paths)
     columns = tuple(first[parameter.path] + parameter.index[0] for parameter in wanted.values())
     options = replace(options, derivative=True, by_vertex=True)
     static = dict(columns=columns, paths=paths, options=options, ring=ring, devices=how.get("devices"))

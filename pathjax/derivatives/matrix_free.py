@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from pathjax.compile import usual_promotion
-from pathjax.derivatives import backward, forward, places
+from pathjax.derivatives import backward, differentiated, forward
 from pathjax.integrators import pixel
 from pathjax.integrators.options import Counts, Options
 from pathjax.kinds.parameter import Parameter
@@ -24,7 +24,7 @@ Changes = dict[str, Float[Array, "..."]]
 
 def is_swept(scene: Scene, parameter: Parameter) -> bool:
     """Whether the recorded sweep finds the parameter at the vertices of paths."""
-    return not parameter.moves_paths and parameter.path in places.paths(scene)
+    return not parameter.moves_paths and parameter.path in differentiated.paths(scene)
 
 
 @usual_promotion

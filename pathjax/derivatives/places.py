@@ -1,264 +1,40 @@
-"""Where the parameters that a path meets stand in one list of derivatives, and derivatives in what is looked up there.
-
-The list holds the entries of all arrays that are differentiated, one array after another: the row of a constant, a
-texel. A vertex of a path looks up a few numbers, each of one entry, or the sum of some (of four texels, say). A slot is
-one such number: the first colour that a bsdf looks up, or the second, or the first number, whatever the kind of the
-bsdf is.
-"""
+"""Where the numbers that a vertex looks up stand in the list of `differentiated`, by slot, and the share of each."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
-from dataclasses import dataclass, replace
 from functools import partial
-from itertools import accumulate, pairwise
 from types import SimpleNamespace
 
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
 from pathjax import emitters, media
-from pathjax.bsdfs import tree
 from pathjax.core.math import at
 from pathjax.core.types import EmitterSample, Hit, Ray
+from pathjax.derivatives.differentiated import (
+    BSDFS,
+    TEXTURES,
+    WRAPPERS,
+    Paths,
+    Slots,
+    declared,
+    firsts,
+    in_textures,
+    path_of_grid,
+)
 from pathjax.emitters import Choice
 from pathjax.integrators.random_numbers import Bounce
 from pathjax.integrators.shadow import Dimmed, Passed
 from pathjax.integrators.vertex import Vertex
-from pathjax.kinds import Declared
-from pathjax.media import Nudges
 from pathjax.scene import parameters as named
 from pathjax.scene.scene import Scene
 from pathjax.shapes import geometry
 from pathjax.textures import Pairs, alike
 
-# Of the arrays that are differentiated, where they are in the scene.
-Paths = tuple[tuple, ...]
 # Of one number: places in the list, and their shares where there are several.
 Entries = tuple[tuple[Int[Array, ""], ...], tuple[Float[Array, "..."], ...] | None]
-# By slot, the column that is looked up; None: none.
-Columns = tuple[int | None, ...]
-
-# Values of grids of media -> where they count: see `media.Nudges`.
-GRIDS = {
-    ("media", "extinctions", "values"): ("extinction", "depth", "shadow"),
-    ("media", "albedos", "values"): ("albedo",),
-}
-BSDFS, WRAPPERS, TEXTURES = (("materials", each) for each in ("tables", "wrappers", "textures"))
-
-
-@dataclass(frozen=True)
-class Slots:
-    """What is differentiated, by slot; of bsdfs those of colours come before those of numbers."""
-
-    bsdfs: tuple[Columns, ...]  # by table
-    lights: tuple[Columns, ...]  # by table; none of backgrounds
-    backgrounds: tuple[tuple[int, int, int], ...]  # table, row, column: of all at once, as all are met at once
-    colors: int  # of the slots of bsdfs
-    wrappers: tuple[Columns, ...]  # by table of bsdfs that hold others
-    choices: tuple[tuple[int, int, int], ...]  # of `tree.steps`: the step, its wrapper, and which of its columns
-    on_the_way: int  # wrappers that `tree.on_the_way` tells; each has a slot for each column
-    corners: bool  # whether what meshes carry is differentiated
-    grids: tuple[str, ...]  # of `media.Nudges`: what is nudged of media
-
-    @property
-    def of_bsdfs(self) -> int:
-        return max(map(len, self.bsdfs), default=0)
-
-    @property
-    def of_choices(self) -> int:
-        return len(self.choices)
-
-    @property
-    def of_passed(self) -> int:
-        return self.on_the_way * max(map(len, self.wrappers), default=0)
-
-    @property
-    def of_lights(self) -> int:
-        return max([len(self.backgrounds), *map(len, self.lights)])
-
-    def numbered(self) -> list[range]:
-        """Slots of bsdfs, lights, choices among bsdfs, what is passed and grids, counted through all of these."""
-        counts = self.of_bsdfs, self.of_lights, self.of_choices, self.of_passed, len(self.grids)
-        return [range(*each) for each in pairwise(accumulate(counts, initial=0))]
-
-
-# ---- what is differentiated -----------------------------------------------------------------------------------------
-
-
-def tables_of_textures(scene: Scene, path: tuple) -> list[tuple]:
-    """Paths of the tables of the textures that are at a path."""
-    textures = named.get(scene, path)
-    return [(*path, "tables", i) for i in range(len(textures.tables))] if textures else []
-
-
-def paths(scene: Scene) -> set[tuple]:
-    """Paths of all arrays that may be differentiated: not those of textures and backgrounds that tell no entries."""
-    tables = [(*BSDFS, i) for i in range(len(scene.materials.tables))] + [(*WRAPPERS, i) for i in _choosing(scene)]
-    covers = tables_of_textures(scene, TEXTURES)
-    for i in range(len(scene.emitters)):
-        tables.append(("emitters", i, "table"))
-        covers += tables_of_textures(scene, ("emitters", i, "textures"))
-
-    def tells_entries(path):
-        return named.get(scene, path).kind.tells_entries()
-
-    found = {path for table in filter(tells_entries, covers) for path in _columns(scene, table)}
-    for table in tables:
-        found |= {p for p in _columns(scene, table) if not _declared(scene, p).shared or tells_entries(table)}
-    shapes = enumerate(scene.geometry.tables)
-    found |= {path for path in GRIDS if scene.media is not None and named.get(scene, path[:-1]) is not None}
-    return found | {("geometry", "tables", i, "attributes", name) for i, each in shapes for name in each.attributes}
-
-
-def _choosing(scene: Scene) -> list[int]:
-    """Wrappers whose parameters decide what is chosen."""
-    return [i for i, table in enumerate(scene.materials.wrappers) if table.kind.chooses]
-
-
-def _columns(scene: Scene, table: tuple) -> dict[tuple, int]:
-    """Paths to the values of the columns of a table -> place of the column."""
-    columns = named.get(scene, table).columns
-    return {(*table, "columns", i, "values"): i for i, column in enumerate(columns) if column is not None}
-
-
-def _in_textures(scene: Scene, paths: Iterable[tuple], of_textures: tuple) -> dict[tuple[int, int | str], tuple]:
-    """The arrays that textures look up: by table, and column or name of what meshes carry."""
-    found: dict[tuple[int, int | str], tuple] = {}
-    for number, path in enumerate(tables_of_textures(scene, of_textures)):
-        table = named.get(scene, path)
-        found |= {(number, place): column for column, place in _columns(scene, path).items() if column in paths}
-        names = table.kind.attributes(dict(table.settings))
-        found |= {(number, each[-1]): each for each in paths if each[0] == "geometry" and each[-1] in names}
-    return found
-
-
-def slots(scene: Scene, paths: Paths) -> Slots:
-    def looked_up(table, textures):
-        """Colours and numbers that are looked up in a table."""
-        textured = bool(_in_textures(scene, paths, textures))
-        columns = named.get(scene, table).columns
-        held = _columns(scene, table).items()
-        found = [i for path, i in held if path in paths or (textured and columns[i].texture is not None)]
-        return [i for i in found if columns[i].values.ndim > 1], [i for i in found if columns[i].values.ndim == 1]
-
-    def joined(found):
-        """All colours, and all numbers behind the most colours that any table has."""
-        most, numbers = (max(map(len, each), default=0) for each in zip(*found, strict=True)) if found else (0, 0)
-
-        def filled(columns, count):
-            return (*columns, *[None] * (count - len(columns)))
-
-        return tuple(filled(c, most) + filled(n, numbers) for c, n in found), most
-
-    choosing, count = _choosing(scene), len(scene.materials.wrappers)
-    wrappers, _ = joined([looked_up((*WRAPPERS, i), TEXTURES) if i in choosing else ([], []) for i in range(count)])
-    wrappers = wrappers if any(map(len, wrappers)) else ()
-    bsdfs, colors = joined([looked_up((*BSDFS, i), TEXTURES) for i in range(len(scene.materials.tables))])
-    of_lights = [looked_up(("emitters", i, "table"), ("emitters", i, "textures")) for i in range(len(scene.emitters))]
-    behind = emitters.backgrounds(scene.emitters)
-    lights = tuple(() if i in behind else (*each[0], *each[1]) for i, each in enumerate(of_lights))
-    backgrounds = [
-        (i, row, column) for i in behind for column in sum(of_lights[i], []) for row in range(scene.emitters[i].count)
-    ]
-    choices = tuple(
-        (step, place, number)
-        for step, place in enumerate(tree.steps(scene.materials) if wrappers else ())
-        for number, column in enumerate(wrappers[place])
-        if column is not None
-    )
-    met = {place for level in scene.materials.passing for place in level if wrappers}
-    passed = any(column is not None for place in met for column in wrappers[place])
-    on_the_way = tree.most_on_the_way(scene.materials) if passed else 0
-    corners = any(path[0] == "geometry" for path in paths)
-    of_scattering = () if scene.scatters else ("extinction", "albedo")
-    grids = tuple(n for path, nudges in GRIDS.items() if path in paths for n in nudges if n not in of_scattering)
-    return Slots(bsdfs, lights, tuple(backgrounds), colors, wrappers, choices, on_the_way, corners, grids)
-
-
-def prepared(scene: Scene, paths: Paths, slots: Slots, number: Int[Array, ""]) -> Scene:
-    """The scene that tells of its vertices what derivatives take. number: of a surface that a shadow ray passes."""
-    first, _ = firsts(scene, paths)
-    listed = tuple((key, first[path]) for key, path in _in_textures(scene, paths, TEXTURES).items())
-    materials = replace(scene.materials, recorded=slots.wrappers, listed=listed)
-    if slots.on_the_way:
-        none = jnp.zeros((slots.on_the_way, len(slots.wrappers[0])), scene.camera.origin.dtype)
-        materials = replace(materials, nudged=(number, none))
-    scene = replace(scene, materials=materials, geometry=replace(scene.geometry, corners=slots.corners))
-    return _with_grids_nudged(scene, slots, [jnp.zeros_like(scene.camera.origin[0])] * len(slots.grids))
-
-
-def nudged(scene: Scene, slots: Slots, nudges: Float[Array, " slots"]) -> Scene:
-    """The scene where each slot's number is larger by its nudge, in all channels.
-
-    Those of choices are left as they are: see `by_choices`.
-    """
-    of_bsdfs, of_lights, _, of_passed, of_grids = slots.numbered()
-
-    def of(table, columns, nudges):
-        return table.nudged({column: nudges[s] for s, column in enumerate(columns) if column is not None})
-
-    own = [nudges[of_bsdfs.start :]] * len(slots.bsdfs)
-    materials = replace(scene.materials, tables=tuple(map(of, scene.materials.tables, slots.bsdfs, own)))
-    if of_passed:
-        number, none = materials.nudged
-        materials = replace(materials, nudged=(number, nudges[of_passed.start :].reshape(none.shape)))
-    beyond = nudges[of_lights.start :]
-    tables = [of(each.table, columns, beyond) for each, columns in zip(scene.emitters, slots.lights, strict=True)]
-    for s, (i, row, column) in enumerate(slots.backgrounds):
-        nudge = tables[i].columns[column].nudge
-        nudge = jnp.zeros((scene.emitters[i].count,), beyond.dtype) if nudge is None else nudge
-        tables[i] = tables[i].nudged({column: nudge.at[row].set(beyond[s])})
-    lights = tuple(replace(each, table=table) for each, table in zip(scene.emitters, tables, strict=True))
-    scene = replace(scene, materials=materials, emitters=lights)
-    return _with_grids_nudged(scene, slots, [nudges[k] for k in of_grids])
-
-
-def _with_grids_nudged(scene, slots, nudges):
-    if not slots.grids:
-        return scene
-    return replace(scene, media=replace(scene.media, nudges=Nudges(**dict(zip(slots.grids, nudges, strict=True)))))
-
-
-# ---- the list -------------------------------------------------------------------------------------------------------
-
-
-def firsts(scene: Scene, paths: Paths) -> tuple[dict[tuple, int], int]:
-    """Where each array begins in the list, and the length of the list."""
-    ends = np.cumsum([0, *(count(scene, path) for path in paths)]).tolist()
-    return dict(zip(paths, ends[:-1], strict=True)), ends[-1]
-
-
-def count(scene: Scene, path: tuple) -> int:
-    """Entries of an array: its colours, or its numbers."""
-    array = named.get(scene, path)
-    return array.size // 3 if of_colors(scene, path) else array.size
-
-
-def path_of_grid(nudge: str) -> tuple:
-    """Path to the values that a nudge stands for."""
-    return next(path for path, nudges in GRIDS.items() if nudge in nudges)
-
-
-def of_colors(scene: Scene, path: tuple) -> bool:
-    """Whether an array holds colours; else it holds numbers."""
-    array = named.get(scene, path)
-    if array.ndim > 1:
-        return array.shape[-1] == 3
-    declared = _declared(scene, path)
-    return declared.shared and declared.colors
-
-
-def _declared(scene: Scene, path: tuple) -> Declared:
-    """What the parameter is declared as whose column is at a path."""
-    *table, _, column, _ = path
-    return list(named.get(scene, table).kind.declared.values())[column]
-
-
-# ---- where the numbers of a vertex stand ----------------------------------------------------------------------------
 
 
 def of_bsdf(scene: Scene, paths: Paths, slots: Slots, slot: int, here: Vertex) -> Entries:
@@ -270,7 +46,7 @@ def of_bsdf(scene: Scene, paths: Paths, slots: Slots, slot: int, here: Vertex) -
     ]
     calls = alike(found, here.wi.dtype)
     pairs = calls[0]() if len(calls) == 1 else lax.switch(jnp.maximum(here.kind, 0), calls)
-    return _entries(pairs, whole=not _in_textures(scene, paths, TEXTURES))
+    return _entries(pairs, whole=not in_textures(scene, paths, TEXTURES))
 
 
 def by_choices(slots: Slots, here: Vertex) -> Float[Array, " slots"]:
@@ -289,7 +65,7 @@ def of_choice(scene: Scene, paths: Paths, slots: Slots, slot: int, here: Vertex)
     step, place, number = slots.choices[slot]
     column, row = slots.wrappers[place][number], here.chosen[step].row
     call = partial(_of_row, scene, first, (*WRAPPERS, place), column, row, TEXTURES, here.surface)
-    return _entries(alike([call], here.wi.dtype)[0](), whole=not _in_textures(scene, paths, TEXTURES))
+    return _entries(alike([call], here.wi.dtype)[0](), whole=not in_textures(scene, paths, TEXTURES))
 
 
 def of_passed(scene: Scene, paths: Paths, slots: Slots, slot: int, passed: Passed) -> Entries:
@@ -305,7 +81,7 @@ def of_passed(scene: Scene, paths: Paths, slots: Slots, slot: int, passed: Passe
 
     calls = alike([of(*each) for each in enumerate(slots.wrappers)], passed.surface.p.dtype)
     pairs = calls[0]() if len(calls) == 1 else lax.switch(jnp.maximum(place, 0), calls)
-    return _entries(pairs, whole=not _in_textures(scene, paths, TEXTURES))
+    return _entries(pairs, whole=not in_textures(scene, paths, TEXTURES))
 
 
 def of_grid(
@@ -382,7 +158,7 @@ def of_light_sample(
 def _whole(scene: Scene, paths: Paths) -> bool:
     """Whether each number that a light looks up is one entry, and not the sum of some."""
     own = {("emitters", i, "table") for i in range(len(scene.emitters))}  # else a texture's
-    return all(path[:3] in own and not _declared(scene, path).shared for path in paths if path[0] == "emitters")
+    return all(path[:3] in own and not declared(scene, path).shared for path in paths if path[0] == "emitters")
 
 
 def _lit(scene: Scene, number: int, light: Int[Array, ""], here: Vertex, drawn: EmitterSample):
@@ -425,7 +201,7 @@ def _of_row(scene: Scene, first: dict, path: tuple, column: int | None, row, of_
     values, codes = (getattr(table.columns[column], each) for each in ("values", "texture"))
     begins = first.get((*path, "columns", column, "values"))
     constant = () if begins is None else ((jnp.int32(begins + row), jnp.ones((), values.dtype)),)
-    if codes is None or not (wanted := _in_textures(scene, first, of_textures)):
+    if codes is None or not (wanted := in_textures(scene, first, of_textures)):
         return constant
     code, wanted = at(codes, row), {key: first[each] for key, each in wanted.items()}
 

@@ -22,7 +22,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from pathjax.compile import register_dataclass
 from pathjax.core.math import smaller
-from pathjax.derivatives import places
+from pathjax.derivatives import differentiated, places
 from pathjax.emitters import Choice
 from pathjax.integrators import path
 from pathjax.integrators.options import Options
@@ -60,8 +60,8 @@ def extend(
     now: path.Path,
     u: Bounce,
     options: Options,
-    slots: places.Slots,
-    paths: places.Paths,
+    slots: differentiated.Slots,
+    paths: differentiated.Paths,
     scale: Float[Array, "3"],
     number: Int[Array, ""],
 ) -> tuple[path.Path, Record, Bool[Array, ""]]:
@@ -74,14 +74,14 @@ def extend(
         scale: what derivatives are multiplied by, beside the throughput.
         number: of the Record among those of the vertex.
     """
-    scene = places.prepared(scene, paths, slots, number)
+    scene = differentiated.prepared(scene, paths, slots, number)
     hit, here, u = path.meet(scene, now, u, options)
     if slots.of_passed or slots.grids:
         now = now._replace(L=now.L._replace(nudged=none_passed(scene), dimmed=none_dimmed(scene, u.along)))
     of_bsdfs, of_lights, of_choices, of_passed, of_grids = slots.numbered()
 
     def varied(changes):
-        changed = places.nudged(scene, slots, changes)
+        changed = differentiated.nudged(scene, slots, changes)
         there = here
         if of_choices:
             change = jnp.dot(changes[of_choices.start : of_choices.stop], places.by_choices(slots, here))
@@ -112,7 +112,7 @@ def extend(
     on = on._replace(L=on.L._replace(dimmed=None))
     for nudge, k in zip(slots.grids, of_grids, strict=True):
         entries = places.of_grid(scene, paths, nudge, now.medium, now.ray, end, u, shadow)
-        is_number = not places.of_colors(scene, places.path_of_grid(nudge))
+        is_number = not differentiated.of_colors(scene, differentiated.path_of_grid(nudge))
         if nudge == "shadow":
             found.append(Slot(*entries, scale * dn[k], None, is_number))
         else:

@@ -15,8 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pathjax.compile import devices_of_a_call
-from pathjax.derivatives import backward
-from pathjax.derivatives import places as entries
+from pathjax.derivatives import backward, differentiated
 from pathjax.integrators import pixel
 from pathjax.integrators.options import Options
 from pathjax.inverse.compiled_cache import compiled
@@ -178,7 +177,7 @@ def _rows(values, views, pixels, spp, seeds, vector):
         how = dict(paths=paths, options=options, ring=backward.longest_ring(scene))
         numbers = pixel.numbers(pixels, 0, spp, seed)
         _, found = backward.rows(scene, pixels, *numbers, devices=devices_of_a_call(), **how)
-        first, _ = entries.firsts(scene, paths)
+        first, _ = differentiated.firsts(scene, paths)
 
         def of_pixel(row):
             columns = []
@@ -187,7 +186,7 @@ def _rows(values, views, pixels, spp, seeds, vector):
                 if name in views.names:
                     parameter = views.wanted[name]
                     array = named.get(scene, parameter.path)
-                    here = row[first[parameter.path] :][: entries.count(scene, parameter.path)]
+                    here = row[first[parameter.path] :][: differentiated.count(scene, parameter.path)]
                     slope = parameter.transposed(here.reshape(array.shape))
                 else:
                     slope = jnp.zeros(shape, row.dtype)

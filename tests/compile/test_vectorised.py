@@ -45,7 +45,7 @@ results = {"image": image, "J": J.derivatives}
 """
 EVERYTHING = """
 from pathjax import transport
-from pathjax.derivatives import backward, places
+from pathjax.derivatives import backward
 from pathjax.integrators import pixel, reference
 from pathjax.integrators.options import Options
 from pathjax.scene import parameters as named
