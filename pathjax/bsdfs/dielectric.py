@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from pathjax.bsdfs import fresnel
 from pathjax.bsdfs.interface import Interface
-from pathjax.bsdfs.ior import IOR
+from pathjax.bsdfs.ior import IOR, LEAST_IOR
 from pathjax.core.math import larger, smaller
 from pathjax.core.types import BSDFSample
 from pathjax.description.elements import nearest
@@ -27,7 +27,7 @@ MIN_BRANCH = 0.1
 class IndexOfRefraction(Number):
     """A positive number, or in files the name of a material."""
 
-    bounds: tuple[float, float] = (float(np.finfo(np.float32).tiny), np.inf)
+    bounds: tuple[float, float] = (LEAST_IOR, math.inf)
 
     def read(self, loader, fields, name, owner):
         value = fields.float_or_name(name, self.default)

@@ -1,5 +1,10 @@
 """Indices of refraction by name, in the visible and under normal conditions: the names and numbers of Mitsuba."""
 
+import numpy as np
+
+# The least one: derivatives hold fourth powers of the ratio of two, and of this the square of one is a number in float32.
+LEAST_IOR = float(np.finfo(np.float32).tiny) ** (1 / 8)
+
 IOR = {
     "vacuum": 1.0,
     "helium": 1.000036,

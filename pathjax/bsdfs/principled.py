@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar, NamedTuple
 
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from pathjax.bsdfs import burley, fresnel
 from pathjax.bsdfs.bsdf import BSDF
+from pathjax.bsdfs.ior import LEAST_IOR
 from pathjax.bsdfs.microfacet import mirrored
 from pathjax.core.math import dot, larger, normalize, safe_divide, safe_sqrt, smaller
 from pathjax.core.types import BSDFSample
@@ -52,7 +53,7 @@ class Principled(BSDF):
     anisotropic = Share()
     metallic = Share()
     spec_trans = Share()
-    eta = Number(None, bounds=(float(np.finfo(np.float32).tiny), np.inf))
+    eta = Number(None, bounds=(LEAST_IOR, math.inf))
     specular = Number(None, bounds=(0, 1))  # in the place of eta
     spec_tint = Share()
     sheen = Share()

@@ -7,12 +7,12 @@ from collections.abc import Mapping
 from typing import ClassVar, NamedTuple
 
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from pathjax.bsdfs import burley, fresnel
 from pathjax.bsdfs.bsdf import BSDF
+from pathjax.bsdfs.ior import LEAST_IOR
 from pathjax.bsdfs.microfacet import mirrored
 from pathjax.bsdfs.principled import LEAST_REFLECTANCE, Share, mean
 from pathjax.core.math import dot, normalize, safe_divide, smaller
@@ -28,7 +28,7 @@ class PrincipledThin(BSDF):
     roughness = Number(0.5, bounds=(0, 1), textured=True)
     anisotropic = Share()
     spec_trans = Share()
-    eta = Number(1.5, bounds=(float(np.finfo(np.float32).tiny), np.inf), textured=True)
+    eta = Number(1.5, bounds=(LEAST_IOR, math.inf), textured=True)
     spec_tint = Share()
     sheen = Share()
     sheen_tint = Share()

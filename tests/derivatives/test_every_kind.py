@@ -6,11 +6,14 @@ A right derivative fails with the chance 1e-3 each; seeds are fixed.
 import math
 from functools import cache
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import pathjax as pj
 from pathjax import bsdfs, emitters, media, textures
+from pathjax.sensors.film import image_shape
 
 SEEDS = 16
 # Samples per pixel to begin with, and at most; as many are taken as find an error of this size half of the time.
@@ -277,6 +280,31 @@ def test_derivatives_are_those_of_differences(scene_of, case):
     }
     print(case, told)
     assert all(check.passed and check.resolution < 2 * RESOLUTION for check in found.values()), told
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", CASES)
+def test_no_derivative_is_nan(scene_of, case):
+    """Of a million paths with the values of the scene, of fewer with each number at its bounds, and all at theirs."""
+    scene = scene_of(case)
+    known, values = scene.about.parameters, pj.parameters(scene)
+    names = [name for name in values if not known[name].moves_paths]
+    # What is below the least value that counts has no derivative.
+    least = {name: max(known[name].bounds[0], np.nextafter(np.float32(known[name].least), np.inf)) for name in names}
+    ends = {name: [least[name], known[name].bounds[1]] for name in names}
+    ends = {name: [np.full_like(values[name], end) for end in each if np.isfinite(end)] for name, each in ends.items()}
+    lowest, highest = ({name: each[i] for name, each in ends.items() if each[i:]} for i in (0, -1))
+    single = [{name: end} for name, each in ends.items() for end in each if not known[name].is_texture]
+    v = jnp.asarray(np.random.default_rng(1).normal(size=(*image_shape(scene.film), 3)), jnp.float32)
+
+    def wrong(changed, spp, seed):
+        at = pj.with_parameters(scene, changed)
+        start = {name: jnp.asarray(pj.parameters(at)[name]) for name in names}
+        pull = jax.vjp(lambda values: pj.render(pj.with_parameters(at, values), spp, seed), start)[1]
+        return [name for name, slope in pull(v)[0].items() if not np.isfinite(slope).all()]
+
+    assert not wrong({}, 4096, 0)
+    assert not {str(each): found for each in (lowest, highest, *single) if (found := wrong(each, 64, 1))}
 
 
 # Mitsuba covers spots by no colour, and its blends of mirrors lose light, where the sum of two images does not.
