@@ -60,13 +60,21 @@ class Color(Declared):
         if self.textured and (made := loader.texture(fields, name, owner)) is not None:
             if self.radiance and made.kind.mean(made) is None:
                 raise fields.error(name, "is a texture without a mean over uv, to choose among lights by; use a bitmap")
-            return _in_range(fields, name, made, self.bounds)
+            return self.checked(loader, fields, name, made)
         default = None if self.default is None else np.broadcast_to(np.asarray(self.default, float), 3)
         low, high = self.bounds
         color = fields.color(name, default, at_most=high, radiance=self.radiance)
         if color is not None and (color < low).any():
             raise fields.error(name, f"must be at least {low:g}, is {', '.join(f'{c:g}' for c in color)}")
         return color
+
+    def checked(self, loader, fields, name, texture):
+        """The texture, whose colours may be larger than those that a file says in numbers: Mitsuba takes them, too."""
+        low, high = self.bounds
+        made, (_, largest) = _in_range(fields, name, texture, (low, math.inf)), texture.kind.span(texture)
+        if largest > high:
+            loader.note(fields.where(name), f"has colours up to {largest:.4g}, above {high:g}, which are kept")
+        return made
 
 
 @dataclass(frozen=True)
@@ -79,7 +87,7 @@ class Transform2(Declared):
     def read(self, loader, fields, name, owner):
         matrix = fields.transform(name)
         if not np.allclose([matrix[:2, 2], matrix[2, :2]], 0, atol=1e-9):
-            raise fields.error(name, "mixes z with u and v; shifts are <translate>, or the last column of 16 numbers")
+            loader.note(fields.where(name), "mixes z with u and v, which has no effect; shifts are <translate>")
         return matrix[np.ix_([0, 1], [0, 1, 3])]
 
 

@@ -119,6 +119,7 @@ class Parameters:
         elif first not in self.refused:
             color = self.textures[texture]
             shape = color.shape if declared.shape == (3,) else color.shape[:2]
-            now = self.known.get(first, replace(color, shape=shape, bounds=declared.bounds))
-            low, high = zip(now.bounds, declared.bounds, strict=True)
+            bounds = declared.bounds[0], max(declared.bounds[1], texture.kind.span(texture)[1])
+            now = self.known.get(first, replace(color, shape=shape, bounds=bounds))
+            low, high = zip(now.bounds, bounds, strict=True)
             self.known[first] = replace(now, shape=max(now.shape, shape, key=len), bounds=(max(low), min(high)))

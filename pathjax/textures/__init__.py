@@ -1,7 +1,8 @@
 """What varies over a surface: a file a kind, the table of kinds, and the look-up among those that a scene holds.
 
-A texture is a subclass of `Texture`, which says what it must offer. Where a bsdf declares a `Color` or a `Number`, a
-scene file may put a texture; of kinds that the scene does not hold nothing is compiled.
+A texture is a subclass of `Texture`, which says what it must offer. Where a bsdf, or a texture, declares a `Color`, or
+a `Number` that may be textured, a scene file may put a texture; of kinds that the scene does not hold nothing is
+compiled.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from pathjax.compile import register_dataclass
+from pathjax.core.math import at
 from pathjax.core.types import Surface
 from pathjax.kinds import Instance, Parameters, Row, Table, ordered
 from pathjax.kinds import register as register_kind
@@ -61,19 +63,26 @@ Pairs = tuple[tuple[Int[Array, ""], Float[Array, "..."]], ...]
 @register_dataclass
 @dataclass(frozen=True)
 class Textures:
-    tables: tuple[Table, ...]  # one for each kind present
+    tables: tuple[Table, ...]  # one for each kind present; of what holds textures behind the tables of these
 
     def look_up(self, code: Int[Array, "2"], surface: Surface) -> Float[Array, "3"]:
         """Colour of a texture at a point of a surface. code: kind and row, or below 0: any."""
 
-        def of(table):
+        def of(number, table):
             def look_up():
-                p = Row(table, jnp.maximum(code[1], 0))
+                p = self._row(number, table, jnp.maximum(code[1], 0), surface)
                 return table.kind.look_up(p, _uv(p, surface), surface)
 
             return look_up
 
-        return self._switch(code, [of(table) for table in self.tables])
+        return self._switch(code, [of(*each) for each in enumerate(self.tables)])
+
+    def _row(self, number: int, table: Table, row: Int[Array, ""], surface: Surface) -> Row:
+        return Row(table, row, surface, self._held(number)) if table.textured else Row(table, row)
+
+    def _held(self, number: int) -> Textures:
+        """Those that the textures of a table may hold."""
+        return Textures(self.tables[:number])
 
     def entries(
         self, code: Int[Array, "2"], surface: Surface, first: Mapping[tuple[int, int | str], int]
@@ -96,14 +105,20 @@ class Textures:
         def of(number, table):
             def found():
                 row = jnp.maximum(code[1], 0)
-                p, known = Row(table, row), {table.kind.place(name): name for name in table.kind.declared}
-                wanted = {known.get(column, column): at for (each, column), at in first.items() if each == number}
+                p = self._row(number, table, row, surface)
+                known = {table.kind.place(name): name for name in table.kind.declared}
+                begins = {known.get(column, column): i for (each, column), i in first.items() if each == number}
                 color, parts = find(table.kind, p, _uv(p, surface), surface)
-                return color, tuple(
-                    (wanted[name] + (row if entry is None else entry), share)
-                    for name, entry, share in parts
-                    if name in wanted
-                )
+                pairs = []
+                for name, entry, share in parts:
+                    if name in known.values() and table.kind.place(name) in table.textured:
+                        held = at(table.column(name).texture, row)
+                        inside = self._held(number).entries(held, surface, first)
+                        pairs += [(place, jnp.where(held[0] >= 0, share * part, 0)) for place, part in inside]
+                        share = jnp.where(held[0] >= 0, 0, share)
+                    if name in begins:
+                        pairs.append((begins[name] + (row if entry is None else entry), share))
+                return color, tuple(pairs)
 
             return found
 
@@ -146,9 +161,20 @@ def _uv(p: Row, surface: Surface) -> Float[Array, "2"]:
 
 
 def build(instances: list[Instance], dtype, path: tuple, parameters: Parameters) -> tuple[Textures | None, dict]:
-    """Textures, or None where there are none, and the code (kind, row) of each instance."""
-    tables, codes = [], {}
-    for kind, rows in ordered(instances, KINDS).items():
-        codes |= {each: (len(tables), row) for row, each in enumerate(rows)}
-        tables.append(kind.build(rows, dtype, (*path, "tables", len(tables)), parameters, None))
+    """Textures, or None where there are none, and the code (kind, row) of each instance and of those that they hold."""
+    tables, codes, levels = [], {}, {}
+    for instance in instances:
+        _enter_level(instance, levels)
+    for level in sorted(set(levels.values())):
+        for kind, rows in ordered([each for each in levels if levels[each] == level], KINDS).items():
+            codes |= {each: (len(tables), row) for row, each in enumerate(rows)}
+            tables.append(kind.build(rows, dtype, (*path, "tables", len(tables)), parameters, codes.get))
     return (Textures(tuple(tables)) if tables else None), codes
+
+
+def _enter_level(texture: Instance, levels: dict[Instance, int]) -> int:
+    """How deep the textures are nested that a texture holds; 0: it holds none. It and these are entered."""
+    if texture not in levels:
+        held = [_enter_level(each, levels) for each in texture.values.values() if isinstance(each, Instance)]
+        levels[texture] = max(held, default=-1) + 1
+    return levels[texture]

@@ -13,8 +13,8 @@ from pathjax.textures.texture import Texture
 class Checkerboard(Texture):
     """Squares of two colours; the first one lies at uv = (0, 0)."""
 
-    color0 = Color(0.4, textured=False)
-    color1 = Color(0.2, textured=False)
+    color0 = Color(0.4)
+    color1 = Color(0.2)
 
     @staticmethod
     def look_up(p: Row, uv: Float[Array, "2"], surface: Surface) -> Float[Array, "3"]:

@@ -52,14 +52,19 @@ class Texture(Kind):
     @classmethod
     def span(cls, texture: Instance) -> tuple[float, float]:
         """Least and largest value that the texture has; NaN where it holds one."""
-        colors = [texture.values[key] for key, declared in cls.declared.items() if isinstance(declared, Color)]
-        return float(np.min(colors)), float(np.max(colors))
+        spans = [x.kind.span(x) if isinstance(x, Instance) else (np.min(x), np.max(x)) for x in cls.colors(texture)]
+        return float(np.min(spans)), float(np.max(spans))
 
     @classmethod
     def mean(cls, texture: Instance) -> np.ndarray | None:
         """(3,) colour by which a light that it covers is chosen among others; None: the texture cannot cover lights."""
-        colors = [texture.values[key] for key, declared in cls.declared.items() if isinstance(declared, Color)]
-        return np.mean([np.broadcast_to(color, 3) for color in colors], axis=0) if colors else None
+        means = [x.kind.mean(x) if isinstance(x, Instance) else np.broadcast_to(x, 3) for x in cls.colors(texture)]
+        return None if any(mean is None for mean in means) or not means else np.mean(means, axis=0)
+
+    @classmethod
+    def colors(cls, texture: Instance) -> list:
+        """What its colours are, (3,) or one number each, or textures."""
+        return [texture.values[key] for key, declared in cls.declared.items() if isinstance(declared, Color)]
 
     @classmethod
     def resolution(cls, texture: Instance) -> tuple[int, int]:

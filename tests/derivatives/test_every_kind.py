@@ -141,6 +141,12 @@ CASES = {
     "checkerboard": on_ball(
         "diffuse", f'<texture type="checkerboard" name="reflectance">{rgb("color0")}{rgb("color1", "0.2")}</texture>'
     ),
+    "checkerboard, of textures": on_ball(
+        "diffuse",
+        f'<texture type="checkerboard" name="reflectance">{PICTURE.format("color0")}<texture type="checkerboard" '
+        f'name="color1" id="board">{rgb("color0")}<transform name="to_uv"><scale x="9" y="5"/></transform></texture>'
+        '<transform name="to_uv"><scale x="2" y="1.5"/></transform></texture>',
+    ),
     "bitmap": on_ball("diffuse", PICTURE.format("reflectance")),
     "bitmap, in a metal": on_ball("roughconductor", METAL, PICTURE.format("specular_reflectance"), numbers(alpha=0.3)),
     "bitmap, in a number": on_ball("roughconductor", GGX, METAL, PICTURE.format("alpha")),

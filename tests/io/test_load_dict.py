@@ -237,8 +237,8 @@ def itself():
         (with_reflectance({"type": "rgb", "value": 1, "x": 2}), "takes value, and no 'x'"),
         (with_reflectance({"type": "spectrum", "value": [1, 2, 3]}), "a number or pairs of wavelength and number"),
         (
-            with_reflectance(np.full((2, 2, 3), 2.0)),
-            "scene.ball.bsdf.reflectance: .*a texture with values below 0, above 1",
+            with_reflectance(np.full((2, 2, 3), -2.0)),
+            "scene.ball.bsdf.reflectance: .*a texture with values below 0, inf or NaN",
         ),
         (with_reflectance(np.full((2, 2, 3), np.nan)), "scene.ball.bsdf.reflectance: .*or NaN"),
         (with_reflectance(np.zeros((2, 2, 4))), r"reflectance: .*must have the shape \(H, W\)"),
@@ -348,6 +348,22 @@ def test_mutated_dictionaries_load_or_are_refused(made):
 
 def test_the_unchanged_dictionary_loads():
     assert len(load_dict(RICH).shapes) == 3
+
+
+@pytest.mark.parametrize("kind", ["ScalarTransform3f", "ScalarTransform4f", "array"])
+def test_to_uv_is_the_transform_of_mitsuba_of_two_dimensions_or_three(kind):
+    mi = pytest.importorskip("mitsuba")
+    mi.set_variant("scalar_rgb")
+    expected = np.array([[2, 0, 0.3], [0, 3, 0.1]])
+    if kind == "array":
+        given = np.vstack([expected, [0, 0, 1]])
+    else:
+        size = int(kind[-2]) - 1
+        given = getattr(mi, kind)().translate([0.3, 0.1, 0][:size]).scale([2, 3, 1][:size])
+    made = load_dict(with_reflectance({"type": "checkerboard", "to_uv": given}))
+    found = made.shapes[0].bsdf.values["reflectance"].values["to_uv"]
+    np.testing.assert_allclose(found, expected, rtol=1e-6)
+    assert not any("to_uv" in note for note in made.notes)
 
 
 def test_points_and_colours_of_mitsuba_are_taken():

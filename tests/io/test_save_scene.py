@@ -70,7 +70,10 @@ def dictionary():
             "uv": np.array([[0, 0], [1, 0], [1, 1], [0, 1]]),
             "bsdf": {
                 "type": "diffuse",
-                "reflectance": {"type": "bitmap", "data": random.random((3, 4, 1)), "raw": True},
+                "reflectance": {
+                    "type": "checkerboard",
+                    "color1": {"type": "bitmap", "data": random.random((3, 4, 1)), "raw": True},
+                },
             },
         },
         "ball": {
@@ -100,7 +103,7 @@ def test_files_come_back_as_they_were(path, again):
 def test_arrays_come_back_from_files_beside(again, tmp_path):
     scene = pj.load_dict(dictionary())
     same(scene, again(scene))
-    files = {"bytes_reflectance.png", "floor_reflectance.exr", "sky.exr", "floor.ply", "ball.ply"}
+    files = {"bytes_reflectance.png", "floor_color1.exr", "sky.exr", "floor.ply", "ball.ply"}
     assert {file.name for file in tmp_path.iterdir()} == {"saved.xml", *(f"saved_{name}" for name in files)}
     same(scene, again(again(scene), "second.xml"))
 

@@ -112,6 +112,32 @@ def test_checkerboard_starts_with_color0_and_repeats():
     np.testing.assert_allclose(colors[:, 0], np.float32([0.1, 0.9, 0.9, 0.1, 0.9, 0.1]))
 
 
+def nested():
+    """A board of an image and of a board of another board."""
+    inner = Checkerboard.instance("inner", color0=checkerboard(), color1=0.5, to_uv=np.diag([5.0, 3.0, 1.0])[:2])
+    outer = np.array([[2.0, 0, 0.1], [0, 1.5, 0.2]])
+    return Checkerboard.instance("outer", color0=bitmap(4, 6), color1=inner, to_uv=outer)
+
+
+def test_a_board_of_textures_looks_them_up_at_the_uv_of_the_surface():
+    """Beside others, among them some that it holds and that stand alone, too."""
+    board = nested()
+    image, inner = board.values["color0"], board.values["color1"]
+    uv = random_uv()
+    found = lookup_all([checkerboard(TO_UV), inner, board, image], uv)
+    plain = {"color0": np.zeros(3), "color1": np.ones(3)}
+    where = reference(Checkerboard.instance("", to_uv=board.values["to_uv"], **plain), uv)
+    where_inner = reference(Checkerboard.instance("", to_uv=inner.values["to_uv"], **plain), uv)
+    expected_inner = np.where(where_inner > 0, 0.5, reference(inner.values["color0"], uv))
+    expected = np.where(where > 0, expected_inner, reference(image, uv))
+    places = [(np.c_[uv, np.ones(len(uv))] @ each.values["to_uv"].T) * 2 for each in (board, inner)]
+    clear = np.all([np.abs(place - np.round(place)).min(1) > 1e-4 for place in places], axis=0)
+    np.testing.assert_allclose(found[1][clear], expected_inner[clear], atol=2e-5)
+    np.testing.assert_allclose(found[2][clear], expected[clear], atol=2e-5)
+    np.testing.assert_allclose(found[3], reference(image, uv), atol=2e-5)
+    assert Checkerboard.span(board) == (min(image.values["texels"].min(), 0.1), max(image.values["texels"].max(), 0.9))
+
+
 def test_kinds_stand_beside_each_other_in_float64(x64):
     with x64():
         made = [textures.Uniform.instance("u", value=0.3), checkerboard()]

@@ -237,6 +237,9 @@ def _transform(key: str, matrix: object, place: str) -> Element:
     matrix = _array(matrix, place)
     if matrix.shape not in _MATRICES:
         raise InputError(f"{place}: a transform is a pj.Transform or a (4, 4) matrix, has the shape {matrix.shape}")
+    if key == "to_uv" and matrix.shape == (3, 3):  # of (u, v, 1), as Mitsuba's `ScalarTransform3f` has it
+        of_plane, matrix = matrix, np.eye(4)
+        matrix[np.ix_([0, 1, 3], [0, 1, 3])] = of_plane
     step = Element("matrix", {"value": _text(matrix)}, place, 0)
     return Element("transform", {"name": key}, place, 0, [step])
 

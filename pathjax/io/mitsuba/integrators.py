@@ -26,9 +26,15 @@ class Path:
     def read(cls, loader, fields: Fields) -> d.Integrator:
         max_depth = fields.integer("max_depth", cls.default_depth, at_least=-1)
         if max_depth == 0:
-            raise fields.error("max_depth", "is 0, which renders black; use -1 (no limit), or 1 and more")
+            max_depth = cls.zero(loader, fields)
         rr_depth = fields.integer("rr_depth", 5, at_least=1)
         return d.Integrator(max_depth, rr_depth, fields.boolean("hide_emitters", False))
+
+    @staticmethod
+    def zero(loader, fields: Fields) -> int:
+        """The depth that a `max_depth` of 0 stands for."""
+        loader.note(fields.where("max_depth"), "renders black, as in Mitsuba; -1 means no limit, 1 emission alone")
+        return 0
 
 
 class VolPath(Path):
@@ -53,6 +59,11 @@ class PRB(Path):
     def read(cls, loader, fields):
         loader.note(fields.element, f"is for derivatives; its image is that of {cls.same}")
         return super().read(loader, fields)
+
+    @staticmethod
+    def zero(loader, fields):
+        loader.note(fields.where("max_depth"), "is 1 for this integrator of Mitsuba, too, which shows emission")
+        return 1
 
 
 class PRBBasic(PRB):

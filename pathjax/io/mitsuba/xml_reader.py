@@ -27,6 +27,8 @@ MAX_VALUE = 10_000
 REFERENCE = re.compile(r"\$(\w+)")
 _DECLARATION = re.compile(rb"\s*(<\?xml\b[^>]*\?>)")
 _AMPERSAND = re.compile(rb"&(?!#?\w{1,8};)")
+# With what it declares between brackets; what stands in quotes may hold any of these characters.
+_DOCTYPE = re.compile(rb"""<!DOCTYPE(?:[^]["'>]|"[^"]*"|'[^']*'|\[(?:[^]"']|"[^"]*"|'[^']*')*\])*>""")
 
 
 def read(path: str | Path, parameters: Mapping[str, object]) -> Document:
@@ -35,7 +37,7 @@ def read(path: str | Path, parameters: Mapping[str, object]) -> Document:
     Args:
         parameters: values that override the file's `default`s; each must be used by the file.
     Raises:
-        InputError: unreadable or malformed XML, a document type, an include cycle, an unknown `$name`, a duplicate id.
+        InputError: unreadable or malformed XML, an include cycle, an unknown `$name`, a duplicate id.
     """
     reader = _Reader(Path(path), {name: _as_text(value) for name, value in parameters.items()})
     root = reader.expand(_parse(Path(path), str(path), reader.notes), chain=(Path(path).resolve(),))
@@ -81,9 +83,9 @@ class _Reader:
             raise root.error(f'the outermost element is {root}; a scene file starts with <scene version="3.0.0">')
         require_attributes(root, required=("version",), optional=("id",))
         version = root.attributes["version"]
-        if not re.fullmatch(r"[0-3]\.\d+\.\d+", version):
-            raise root.error(f'scene version "{version}" is not supported; use Mitsuba 3\'s format, version="3.0.0"')
-        if version[0] in "01":
+        if not re.fullmatch(r"\d{1,9}\.\d{1,9}\.\d{1,9}", version):
+            raise root.error(f'scene version "{version}" is not of the form "3.0.0"; use that, Mitsuba 3\'s')
+        if int(version.partition(".")[0]) < 2:
             upgrade(root)
         children: list[Element] = []
         for element in root.children:
@@ -185,7 +187,8 @@ def _parse(path: Path, shown: str, notes: list[str]) -> Element:
 
 def _well_formed(data: bytes) -> bytes:
     """What is XML to the letter, where Mitsuba's parser is lenient: with `--` and any bytes in comments, white space
-    before the declaration, and & for itself. Lines stay where they are. What is UTF-16 is left alone.
+    before the declaration, and & for itself. It skips a document type, too, so that no entities are known. Lines stay
+    where they are. What is UTF-16 is left alone.
     """
     if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return data
@@ -194,6 +197,8 @@ def _well_formed(data: bytes) -> bytes:
         parts += [data[end:start], b"\n" * data.count(b"\n", start, close)]
         end = close + 3
     data = b"".join([*parts, data[end:]])
+    if found := _DOCTYPE.match(data, max(data.find(b"<!DOCTYPE"), 0)):
+        data = data[: found.start()] + b"\n" * data.count(b"\n", *found.span()) + data[found.end() :]
     if data[:1].isspace() and (declared := _DECLARATION.match(data)):
         lines = b"\n" * data.count(b"\n", 0, declared.start(1))
         data = declared[1] + lines + data[declared.end() :]
