@@ -39,10 +39,8 @@ def scene(path: Path, parameters: Mapping[str, object]) -> tuple[dict, list[str]
         raise InputError(f"{path}: holds no triangles")
     cameras = {name: each for name, each in objects.items() if "aspect" in each}
     if not cameras:
-        cameras = {
-            gltf.unused("camera", objects): _framing(np.concatenate([each["vertices"] for each in shapes]), path)
-            | {"aspect": ASPECT}
-        }
+        framed = _around(np.concatenate([each["vertices"] for each in shapes]), path)
+        cameras = {gltf.unused("camera", objects): _framing(*framed) | {"aspect": ASPECT}}
         notes.append(f"{path}: has no camera; one that frames it is used")
     width = _whole(parameters.get("res", WIDTH), path)
     cameras = {name: _with_film(camera, width) for name, camera in cameras.items()}
@@ -74,15 +72,28 @@ def framing(geometries: Sequence[Shape], file: str) -> dict:
     Raises:
         InputError: they have no extent, or one that is not finite.
     """
+    return _framing(*around(geometries, file))
+
+
+def around(geometries: Sequence[Shape], file: str) -> tuple[np.ndarray, float]:
+    """Center (3,) and radius of the sphere around the box of all shapes.
+
+    Raises:
+        InputError: they have no extent, or one that is not finite.
+    """
     corners = [corner for geometry in geometries for corner in geometry.primitives(flip=False).boxes()]
-    return _framing(np.concatenate([np.reshape(corner, (-1, 3)) for corner in corners]), file)
+    return _around(np.concatenate([np.reshape(corner, (-1, 3)) for corner in corners]), file)
 
 
-def _framing(points: np.ndarray, file: object) -> dict:
+def _around(points: np.ndarray, file: object) -> tuple[np.ndarray, float]:
     low, high = points.min(axis=0), points.max(axis=0)
     center, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
     if not 0 < radius < math.inf:
         raise InputError(f"{file}: has no extent, or one that is not finite")
+    return center, radius
+
+
+def _framing(center: np.ndarray, radius: float) -> dict:
     distance = radius / math.sin(math.radians(FOV / 2))
     origin = center + TOWARDS * (distance / np.linalg.norm(TOWARDS))
     to_world = Transform().look_at(origin, center, [0, 1, 0])

@@ -6,16 +6,20 @@ made of. A filter is a class of `filters`. One row in a table makes a kind exist
 
 from __future__ import annotations
 
+from pathjax.sensors.distant import Distant
 from pathjax.sensors.orthographic import Orthographic
 from pathjax.sensors.perspective import Perspective
+from pathjax.sensors.radiancemeter import RadianceMeter
 from pathjax.sensors.sensor import Camera, Sensor
 from pathjax.sensors.thinlens import ThinLens
 
-__all__ = ["KINDS", "Camera", "Orthographic", "Perspective", "Sensor", "ThinLens"]
+__all__ = ["KINDS", "Camera", "Distant", "Orthographic", "Perspective", "RadianceMeter", "Sensor", "ThinLens"]
 
 # By the name that scene files give them.
 KINDS: dict[str, type[Sensor]] = {
     "perspective": Perspective,
     "thinlens": ThinLens,
     "orthographic": Orthographic,
+    "radiancemeter": RadianceMeter,
+    "distant": Distant,
 }

@@ -35,6 +35,7 @@ class Camera(ABC):
 class Sensor(ABC):
     """What a scene file says of a sensor, NumPy and numbers."""
 
+    one_pixel: ClassVar[bool] = False  # measures one number, whatever the filter
     # Nothing moves while the shutter is open.
     unused: ClassVar[Mapping[str, Unused]] = {"shutter_open": Unused("float"), "shutter_close": Unused("float")}
 

@@ -93,6 +93,10 @@ NEEDS = {
     **dict.fromkeys(("perspective", "projector"), ["", '<float name="fov" value="40"/>']),
     "thinlens": [f'<float name="aperture_radius" value="1"/>{fov}' for fov in ("", '<float name="fov" value="40"/>')],
     "instance": ['<shape type="shapegroup"/>'],
+    **dict.fromkeys(
+        ("radiancemeter", "distant"),
+        ['<film type="hdrfilm"><integer name="width" value="1"/><integer name="height" value="1"/></film>'],
+    ),
     **dict.fromkeys(("uniform", "constvolume"), ['<float name="value" value="1"/>']),
     "gridvolume": ['<string name="filename" value="grid.vol"/>'],
     "mesh_attribute": ['<string name="name" value="vertex_color"/>'],

@@ -8,8 +8,11 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from itertools import count
 from pathlib import Path
+
+import numpy as np
 
 from pathjax import description as d
 from pathjax import emitters, sensors
@@ -75,6 +78,7 @@ class _Loader:
         self.making: set[Element] = set()
         self.made: dict[Element, object] = {}
         self.copied = 0  # triangles of instances
+        self.placed: tuple[d.Shape, ...] = ()  # all of the scene, once they are known
         self.on_shapes: dict[Element, Element] = {}  # a light by reference, and the shape that it shines from
         self.on_surfaces: list[Element] = []  # sensors inside of shapes
 
@@ -109,6 +113,7 @@ class _Loader:
             if not _kind_of_light(element).on_surfaces
         )
         shapes = tuple(shape for element in scene["shape"] for shape in self.shapes(element))
+        self.placed = shapes
         for element in self.on_surfaces:
             if not scene["sensor"]:
                 raise element.error(f"{element} measures what falls on a shape; add a <sensor> outside of the shapes")
@@ -155,6 +160,12 @@ class _Loader:
         where = "one that frames its shapes" if shapes else "one at the origin"
         self.note(root, f"has no <sensor>; {where} is used")
         return element
+
+    def around(self, element: Element) -> tuple[np.ndarray, float]:
+        """Center and radius of the sphere around the box of all shapes, which an element needs."""
+        if not self.placed:
+            return np.zeros(3), 0.0
+        return bare.around([shape.geometry for shape in self.placed], element.place)
 
     def view(self, element: Element, seen: Element) -> d.View | InputError:
         """What a sensor sees. One that is not used may be of a kind that is not supported, and gets one note alone."""
@@ -364,6 +375,11 @@ def _sensor(loader: _Loader, fields: Fields) -> d.View:
     camera = sensors.KINDS[fields.type].read(loader, fields)
     films, drawn = fields.objects("film"), fields.objects("sampler")
     made = loader.make(films[0], film.KINDS) if films else film.HDRFilm()
+    if camera.one_pixel:
+        if (made.width, made.height) != (1, 1):
+            place = films[0] if films else fields.element
+            raise place.error(f"{fields.element} measures one number: its film must have width and height 1")
+        made = replace(made, filter=sensors.filters.Box())
     spp = loader.make(drawn[0], samplers.KINDS) if drawn else samplers.DEFAULT_COUNT
     sampler = drawn[0].attributes["type"] if drawn else "independent"
     around = fields.objects("medium")

@@ -42,8 +42,6 @@ REASONS = {
     "linearcurve": "rays are not tested against curves",
     "sdfgrid": "rays are not tested against grids of distances",
     "measured": "files of measured reflectance are not read",
-    "distant": "sensors are cameras, whose pixels see from one place",
-    "irradiancemeter": "sensors are cameras, and see surfaces from outside",
-    "radiancemeter": "sensors are cameras, of whole images",
+    "irradiancemeter": "sensors see surfaces from outside; an <emitter> in its place shines where it would look",
     "timed_sunsky": "light does not change with time; <emitter type=\"sunsky\"> is its sky at one time",
 }

@@ -1,0 +1,66 @@
+"""The sensor infinitely far away: the radiance that leaves a scene in one direction."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from jaxtyping import Array, Float
+
+from pathjax.compile import register_dataclass
+from pathjax.core.types import Ray
+from pathjax.core.warp import square_to_disk
+from pathjax.description.fields import Fields
+from pathjax.kinds import Direction, Unused
+from pathjax.sensors.film import HDRFilm
+from pathjax.sensors.radiancemeter import OneRay
+from pathjax.sensors.sensor import Sensor
+
+
+@register_dataclass
+@dataclass(frozen=True)
+class ParallelRays(OneRay):
+    """Rays that start evenly on a disk around `origin`."""
+
+    across: Float[Array, "2 3"]  # two radii of the disk
+
+    def sample_ray(self, position: Float[Array, "2"], u_lens: Float[Array, "2"]) -> Ray:
+        ray, offset = super().sample_ray(position, u_lens), square_to_disk(u_lens)
+        return ray._replace(o=ray.o + offset[0] * self.across[0] + offset[1] * self.across[1])
+
+
+@dataclass(frozen=True)
+class Distant(Sensor):
+    """Looks in one direction, at a point or evenly at the disk that the sphere around the scene's box covers.
+
+    In files the direction, or `to_world`, which turns z to it; its scale is that of the disk.
+    """
+
+    direction: np.ndarray  # (3,) unit
+    across: np.ndarray  # (2, 3) x and y of `to_world`
+    target: np.ndarray | None  # (3,); None: all of the scene
+    center: np.ndarray  # (3,) of that sphere
+    radius: float
+
+    one_pixel: ClassVar[bool] = True
+    unused: ClassVar[Mapping[str, Unused]] = Sensor.unused
+
+    @classmethod
+    def read(cls, loader, fields: Fields) -> Distant:
+        direction = Direction().read(loader, fields, "direction", "")
+        for shape in fields.objects("shape"):
+            raise shape.error(f"{shape} as a target is not supported; use a point, or no target for all of the scene")
+        if fields.has("to_world"):
+            across = fields.transform("to_world")[:3, :2].T
+        else:
+            _, _, (_, *across) = np.linalg.svd(direction[None])  # any two unit vectors at right angles
+        return cls(direction, np.stack(across), fields.point("target", None), *loader.around(fields.element))
+
+    def build(self, film: HDRFilm, dtype) -> OneRay:
+        if self.target is not None:
+            start = self.target - self.direction * (np.linalg.norm(self.target - self.center) + self.radius)
+            return OneRay(np.asarray(start, dtype), np.asarray(self.direction, dtype))
+        numbers = self.center - self.direction * self.radius, self.direction, self.radius * self.across
+        return ParallelRays(*(np.asarray(x, dtype) for x in numbers))
