@@ -244,7 +244,7 @@ def itself():
         (with_reflectance(np.zeros((2, 2, 4))), r"reflectance: .*must have the shape \(H, W\)"),
         (with_reflectance({"type": "bitmap", "data": np.zeros((2, 2)), "filename": "x"}), "excludes filename"),
         (scene(kite={"type": "mesh"}), 'scene.kite: .*needs <array name="vertices"'),
-        (scene(kite={"type": "mesh", "mesh": 3}), 'scene.kite: "mesh" must be a trimesh.Trimesh, is of type int'),
+        (scene(kite={"type": "mesh", "mesh": 3}), 'kite: "mesh" must be a .*Trimesh or a mitsuba.Mesh, is of type int'),
         (scene(kite={"type": "mesh", **TRIANGLE, "faces": [[0, 1, 7]]}), "scene.kite: face 0 .*has the vertex 7"),
         (scene(kite={"type": "mesh", **TRIANGLE, "faces": np.ones((1, 3))}), "scene.kite: faces must be integers"),
         (scene(kite={"type": "mesh", **TRIANGLE, "uv": np.eye(3)}), r"scene.kite: uv must have the shape \(V, 2\)"),
@@ -348,6 +348,60 @@ def test_mutated_dictionaries_load_or_are_refused(made):
 
 def test_the_unchanged_dictionary_loads():
     assert len(load_dict(RICH).shapes) == 3
+
+
+@pytest.fixture
+def mitsubas_mesh(root):
+    """(file, what else of the shape) -> an object of Mitsuba."""
+    mi = pytest.importorskip("mitsuba")
+    mi.set_variant("scalar_rgb")
+
+    def make(file="ball_smooth.ply", **more):
+        kind = {"type": file.rpartition(".")[2], "filename": f"{root}/tests/scenes/meshes/{file}"}
+        return mi.load_dict(kind | more)
+
+    return make
+
+
+@pytest.mark.parametrize("how", [{}, {"face_normals": True}, {"flip_normals": True}], ids=str)
+@pytest.mark.parametrize("file", ["ball_smooth.ply", "tinted.ply", "saddle.obj"])
+def test_a_mesh_of_mitsuba_is_that_of_the_file(mitsubas_mesh, root, file, how):
+    """With normals, texture coordinates and colours; Mitsuba keeps float32."""
+    it = mitsubas_mesh(file, **how)
+    path = {"type": file.rpartition(".")[2], "filename": f"{root}/tests/scenes/meshes/{file}"}
+    (expected,) = load_dict(scene(it=path | how)).shapes
+    for made in (it, {"type": "mesh", "mesh": it, "bsdf": {"type": "conductor"}}):
+        (shape,) = load_dict(scene(it=made)).shapes
+        assert shape.flip_normals == expected.flip_normals
+        for key in ("vertices", "normals", "uv"):
+            numbers = [getattr(each.geometry, key) for each in (shape, expected)]
+            assert (numbers[0] is None) == (numbers[1] is None)
+            if numbers[0] is not None:
+                corners = [x[each.geometry.faces] for x, each in zip(numbers, (shape, expected), strict=True)]
+                np.testing.assert_allclose(*corners, atol=1e-6)
+        assert ("vertex_color" in shape.geometry.attributes) == (file == "tinted.ply")
+
+
+def test_the_colours_of_a_mesh_of_mitsuba_are_read_back(mitsubas_mesh):
+    red = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.7, 0.2, 0.1]}}
+    lamp = {"type": "area", "radiance": {"type": "rgb", "value": [3, 2, 1]}}
+    known = pj.parameters(pj.load_dict(scene(it=mitsubas_mesh(bsdf=red, emitter=lamp))))
+    np.testing.assert_allclose(known["it.reflectance"], [0.7, 0.2, 0.1])
+    np.testing.assert_allclose(known["it.radiance"], [3, 2, 1])
+    # What stands beside it is taken instead; nothing need be readable then.
+    made = {"type": "mesh", "mesh": mitsubas_mesh(bsdf={"type": "plastic"}), "bsdf": {"type": "diffuse", "id": "own"}}
+    assert "own.reflectance" in pj.parameters(pj.load_dict(scene(it=made)))
+    made["bsdf"] = {"type": "ref", "id": "clay"}
+    assert "clay.reflectance" in pj.parameters(pj.load_dict(scene(clay={"type": "diffuse"}, it=made)))
+
+
+def test_what_a_mesh_of_mitsuba_does_not_tell_is_refused(mitsubas_mesh):
+    textured = {"type": "diffuse", "reflectance": {"type": "checkerboard"}}
+    for bsdf, kind in ({"type": "plastic"}, "SmoothPlastic"), (textured, "SmoothDiffuse"):
+        with pytest.raises(pj.InputError, match=f"scene.it: the bsdf of a mesh of Mitsuba, {kind}, cannot be read"):
+            load_dict(scene(it=mitsubas_mesh(bsdf=bsdf)))
+    with pytest.raises(pj.InputError, match="scene.it: the medium of a mesh of Mitsuba, Homogeneous.*, cannot be read"):
+        load_dict(scene(it=mitsubas_mesh(interior={"type": "homogeneous"})))
 
 
 @pytest.mark.parametrize("kind", ["ScalarTransform3f", "ScalarTransform4f", "array"])

@@ -18,7 +18,7 @@ from pathjax.compile import is_traced
 from pathjax.description.elements import Document, Element, find_file, nearest
 from pathjax.description.fields import ONE_COLOR
 from pathjax.errors import InputError
-from pathjax.io.mitsuba import integrators, samplers
+from pathjax.io.mitsuba import integrators, mesh_objects, samplers
 from pathjax.io.mitsuba.plugins import PLUGINS
 from pathjax.io.mitsuba.xml_reader import MAX_DEPTH, by_id
 from pathjax.sensors import film, filters
@@ -111,7 +111,7 @@ class _Reader:
             if kind in VALUE_TYPES:
                 return getattr(self, f"_{kind}")(key, value, place)
             return self.object(key, value, place, top)
-        if hasattr(value, "vertices") and hasattr(value, "faces"):  # of trimesh
+        if mesh_objects.is_mesh(value):
             return self.object(key, {"type": "mesh", "mesh": value}, place, top)
         if np.shape(getattr(value, "matrix", ()))[:2] in _MATRICES:  # Dr.Jit's points have an attribute matrix as well
             return _transform(key, value.matrix, place)
@@ -148,13 +148,20 @@ class _Reader:
         if name is not None:
             attributes["id"] = _string(name, place)
         if tag == "shape" and "mesh" in value:
-            value = {key: each for key, each in value.items() if key != "mesh"} | _of_trimesh(value["mesh"], place)
+            value = self.mesh(value["mesh"], {key: each for key, each in value.items() if key != "mesh"}, place)
         element = Element(tag, attributes, place, 0)
         element.children = self.children(value, place)
         if tag not in ("shape", "texture"):  # their arrays are what they consist of; elsewhere they are images
             element.children = [_as_texture(child) for child in element.children]
         self.paths[place.removeprefix(f"{self.name}.")] = element
         return element
+
+    def mesh(self, mesh: object, beside: dict, place: str) -> dict:
+        """The arrays of a mesh object, and what stands beside it, which takes the place of its own bsdf and emitter."""
+        kinds = [each.get("type") for each in beside.values() if isinstance(each, Mapping)]
+        given = ["bsdf" if kind == "ref" else self.tag(kind, place) for kind in kinds if isinstance(kind, str)]
+        arrays = mesh_objects.arrays_of(mesh, place, lambda numbers: _array(numbers, place))
+        return mesh_objects.looks_of(mesh, place, given) | arrays | beside
 
     def tag(self, kind: str, place: str) -> str:
         found = [tag for tag, kinds in self.kinds.items() if kind in kinds]
@@ -267,16 +274,3 @@ def _as_texture(child: Element) -> Element:
         return child
     data = Element("array", {"name": "data"}, child.file, 0, data=child.data)
     return Element("texture", {"name": child.attributes["name"], "type": "bitmap"}, child.file, 0, [data])
-
-
-def _of_trimesh(mesh: object, place: str) -> dict[str, object]:
-    """Arrays of a `trimesh.Trimesh`, with its texture coordinates, whose v grows upwards, and colours of vertices."""
-    if not (hasattr(mesh, "vertices") and hasattr(mesh, "faces")):
-        raise InputError(f'{place}: "mesh" must be a trimesh.Trimesh, is of type {type(mesh).__name__}')
-    arrays: dict[str, object] = {"vertices": np.asarray(mesh.vertices), "faces": np.asarray(mesh.faces)}
-    visual = getattr(mesh, "visual", None)
-    if getattr(visual, "kind", None) == "vertex":
-        arrays["vertex_color"] = np.asarray(visual.vertex_colors)[:, :3] / 255
-    if (uv := getattr(visual, "uv", None)) is not None:
-        arrays["uv"] = np.asarray(uv) * [1, -1] + [0, 1]
-    return arrays
