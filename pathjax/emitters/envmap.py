@@ -25,8 +25,8 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from pathjax.compile import compute_once, is_traced
+from pathjax.core.cumulated import STEP, cumulated, search
 from pathjax.core.math import at, cos_sin_turns, luminance, safe_atan2, safe_divide, safe_sqrt, turns
-from pathjax.emitters.cumulated import STEP, cumulated, search
 from pathjax.emitters.emitter import Background
 from pathjax.images import read_rgb
 from pathjax.kinds import Number, Parameter, PerRow, Rotation, Row, Shared, Unused

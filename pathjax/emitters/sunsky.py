@@ -22,6 +22,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from pathjax.core.cumulated import cumulated, search
 from pathjax.core.math import (
     at,
     cos_sin_turns,
@@ -37,7 +38,6 @@ from pathjax.core.math import (
     turns,
 )
 from pathjax.core.warp import cone_pdf, square_to_cone
-from pathjax.emitters.cumulated import cumulated, search
 from pathjax.emitters.emitter import Background
 from pathjax.kinds import Direction, Instance, Number, PerRow, Rotation, Row, Shared
 

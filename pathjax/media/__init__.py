@@ -35,6 +35,7 @@ from pathjax.media.homogeneous import VOLUMES, Heterogeneous, Homogeneous
 from pathjax.media.isotropic import Isotropic
 from pathjax.media.phase import Phase
 from pathjax.media.rayleigh import Rayleigh
+from pathjax.media.tabphase import TabPhase
 from pathjax.textures import Pairs
 
 __all__ = [
@@ -52,12 +53,19 @@ __all__ = [
     "Nudges",
     "Phase",
     "Rayleigh",
+    "TabPhase",
     "register",
 ]
 
 # By the name that scene files give them.
 KINDS = {"homogeneous": Homogeneous, "heterogeneous": Heterogeneous}
-PHASES: dict[str, type[Phase]] = {"isotropic": Isotropic, "hg": HG, "rayleigh": Rayleigh, "blendphase": BlendPhase}
+PHASES: dict[str, type[Phase]] = {
+    "isotropic": Isotropic,
+    "hg": HG,
+    "rayleigh": Rayleigh,
+    "tabphase": TabPhase,
+    "blendphase": BlendPhase,
+}
 # In the place of a row: no medium; and of shapes that say nothing, which leave paths in the medium that they are in.
 NONE, SAME = -1, -2
 # Least probability of each colour: what the path carries nothing of may have a derivative.

@@ -184,6 +184,9 @@ CASES = {
         f'<phase type="blendphase" id="phase">{numbers(weight=0.3)}<phase type="isotropic"/>'
         f'<phase type="hg" id="held">{numbers(g=0.6)}</phase></phase>',
     ),
+    "tabphase": filled(
+        SIGMA, rgb("albedo"), '<phase type="tabphase"><string name="values" value="0.3, 0.1, 0.2, 0.5, 2"/></phase>'
+    ),
     "rayleigh": filled(SIGMA, rgb("albedo"), '<phase type="rayleigh"/>'),
     "area": BALL.format(GREY)
     + '<shape type="sphere"><point name="center" value="1, 1, 1"/><float name="radius" value="0.5"/>'

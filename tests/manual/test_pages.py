@@ -103,6 +103,7 @@ NEEDS = {
     **dict.fromkeys(("bitmap", "envmap"), ['<string name="filename" value="marks.png"/>']),
     **dict.fromkeys(("twosided", "mask"), ['<bsdf type="diffuse"/>']),
     "blendbsdf": ['<bsdf type="diffuse"/><bsdf type="diffuse"/><float name="weight" value="0.5"/>'],
+    "tabphase": ['<string name="values" value="1, 2"/>'],
     "blendphase": ['<phase type="isotropic"/><phase type="hg"/><float name="weight" value="0.5"/>'],
     "bumpmap": ['<bsdf type="diffuse"/><texture type="checkerboard"/>'],
     "normalmap": ['<bsdf type="diffuse"/><rgb name="normalmap" value="0.5, 0.5, 1"/>'],

@@ -71,6 +71,7 @@ def test_older_files_name_the_extinction_in_their_way(tmp_path):
     assert load(tmp_path / "old.xml").shapes[0].interior.values["sigma_t"][0] == 3
 
 
+TABLE = '<phase type="tabphase"><string name="values" value="{}"/></phase>'
 HG, WEIGHT = '<phase type="hg"/>', '<float name="weight" value="0.5"/>'
 BLEND = f'<phase type="blendphase">{WEIGHT}{2 * HG}</phase>'
 
@@ -85,6 +86,11 @@ BLEND = f'<phase type="blendphase">{WEIGHT}{2 * HG}</phase>'
         (ball(medium=f'<phase type="blendphase">{2 * HG}</phase>'), 'needs <float name="weight"'),
         (ball(medium=f'<phase type="blendphase">{WEIGHT}{HG}{BLEND}</phase>'), "blend two that are no blends"),
         (ball(medium='<phase type="hg"><float name="g" value="1"/></phase>'), '"g" of .*must be above -1 and below 1'),
+        (ball(medium='<phase type="tabphase"/>'), 'needs <string name="values"'),
+        (ball(medium=TABLE.format("1")), '"values" of .* must be two numbers or more, none negative, and not all 0'),
+        (ball(medium=TABLE.format("1, -1, 2")), "must be two numbers or more"),
+        (ball(medium=TABLE.format("0 0")), "must be two numbers or more"),
+        (ball(medium=TABLE.format("1, nan")), "'nan' is not a finite number"),
         (ball(medium='<phase type="sggx"/>'), "sggx.*not supported yet; use one of isotropic"),
         (ball(medium='<phase type="isotropc"/>'), 'did you mean "isotropic"'),
         (ball(medium='<volume name="albedo" type="gridvolume"/>'), 'needs <string name="filename"'),

@@ -23,10 +23,17 @@ def cumulated(weights: np.ndarray) -> np.ndarray:
 
 
 def search(
-    cdf: Float[Array, " N"], first: Int[Array, ""] | int, count: int, u: Float[Array, ""]
+    cdf: Float[Array, " N"],
+    first: Int[Array, ""] | int,
+    count: Int[Array, ""] | int,
+    u: Float[Array, ""],
+    most: int | None = None,
 ) -> tuple[Int[Array, ""], Float[Array, ""]]:
-    """The last i < count with cdf[first + i] <= u, and where u lies between that and the next, in [0, 1)."""
-    halvings = max(count - 1, 0).bit_length()
+    """The last i < count with cdf[first + i] <= u, and where u lies between that and the next, in [0, 1).
+
+    most: that count may be, where that is not known.
+    """
+    halvings = max((count if most is None else most) - 1, 0).bit_length()
 
     def halve(k, i):
         further = i + jnp.left_shift(jnp.int32(1), halvings - 1 - k)
