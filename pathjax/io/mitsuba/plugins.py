@@ -43,5 +43,6 @@ REASONS = {
     "sdfgrid": "rays are not tested against grids of distances",
     "measured": "files of measured reflectance are not read",
     "irradiancemeter": "sensors see surfaces from outside; an <emitter> in its place shines where it would look",
+    "directionalarea": "each point shines in one direction, which no path from the camera meets",
     "timed_sunsky": "light does not change with time; <emitter type=\"sunsky\"> is its sky at one time",
 }
