@@ -111,7 +111,7 @@ def test_values_that_a_parameter_does_not_take(refused, tmp_path, setting, says)
         ("res=0", "furnace.xml:32: "),
         ("res=-3", "furnace.xml:32: "),
         ("res=99999", "furnace.xml:32: "),
-        ("max_depth=0", "max_depth"),
+        ("max_depth=-2", "max_depth"),
         ("res", "name=value"),
     ],
 )
