@@ -18,11 +18,16 @@ from typing import NamedTuple
 
 import numpy as np
 
+from pathjax.system.cores import SMALL, over_cores
+
 # In machine epsilons of the coordinates along the normal, for each of the two primitives: an upper bound on what its
 # point, its plane and a distance from that lose by rounding (see `planar.leaf_numbers`).
 MARGIN = 4
 # In machine epsilons of the scene's size, since rays come from anywhere in it.
 _GAP = 8
+# Of a large mesh all faces are compared with so many planes; for more of them, sorting the faces takes less.
+MOST_PLANES = 64
+BLOCK = 1 << 13  # of them at a time: their numbers stay in the cache
 
 
 class Faces(NamedTuple):
@@ -142,7 +147,8 @@ def _coplanar(shapes: list[Faces], movable, others, least, dtype):
     low, high = map(np.concatenate, zip(*(_ends(shapes[i].corners) for i in movable), strict=True))
     slack = precision(dtype) * np.maximum(np.abs(low), np.abs(high))
     bottoms, tops = low - slack, high + slack
-    near_by = [_near_any(shapes[j].corners, bottoms, tops) for j in others]
+    planes = [np.concatenate(each) for each in zip(*((shapes[i].corners[:, 0], shapes[i].normal) for i in movable))]
+    near_by = [_near_any(shapes[j].corners, bottoms, tops, *planes, precision(dtype)) for j in others]
     owner, rows = np.repeat(others, [len(each) for each in near_by]), np.concatenate(near_by)
     if not len(rows):
         return
@@ -179,22 +185,46 @@ def _coplanar(shapes: list[Faces], movable, others, least, dtype):
                 yield from ((i, row, j, *map(np.atleast_1d, group)) for group in groups)
 
 
-def _near_any(corners, bottoms, tops):
-    """Return the rows of the faces (F, K, 3) in the box around those boxes (M, 3) that reach the faces' own.
+def _near_any(corners, bottoms, tops, points, normals, tolerance):
+    """Return the rows of the faces (F, K, 3) that may lie in the plane of a box that reaches the faces' own.
 
     Few triangles of a large mesh are near what it stands on.
+
+    Args:
+        bottoms, tops: (M, 3) the boxes; points, normals: (M, 3) a point of each plane, and its unit normal.
+        tolerance: relative, of `precision`.
     """
     columns = np.moveaxis(corners, 2, 0)
-    reached = (bottoms <= [c.max() for c in columns]).all(1) & (tops >= [c.min() for c in columns]).all(1)
+    low, high = (np.array([end(c) for c in columns]) for end in (np.min, np.max))
+    reached = (bottoms <= high).all(1) & (tops >= low).all(1)
     if not reached.any():
         return np.zeros(0, np.int64)
     bottom, top = bottoms[reached].min(0), tops[reached].max(0)
     rows = np.arange(len(corners))
+    if len(rows) >= SMALL and np.count_nonzero(reached) <= MOST_PLANES:
+        rows = _in_any_plane(corners[:, 0], points[reached], normals[reached], tolerance)
     for axis in np.argsort(top - bottom):
         ends = np.moveaxis(columns[axis] if len(rows) == len(corners) else columns[axis, rows], 1, 0)
         reaches = (reduce(np.logical_or, flags) for flags in (ends <= top[axis], ends >= bottom[axis]))
         rows = rows[np.logical_and(*reaches)]
     return rows
+
+
+def _in_any_plane(corners, points, normals, tolerance):
+    """Rows of the corners (F, 3) that lie in any of the planes, up to what rounding may be."""
+
+    def within(begin):
+        x, y, z = np.ascontiguousarray(corners[begin : begin + BLOCK].T)
+        farthest = [np.abs(column).max() for column in (x, y, z)]
+        found = np.zeros(len(x), bool)
+        for point, n in zip(points, normals, strict=True):
+            # Twice: these sums are rounded, and have other orders than those that decide.
+            reach = 2 * tolerance * ((np.abs(point) + farthest) @ np.abs(n))
+            found |= np.abs(n[0] * x + n[1] * y + n[2] * z - point @ n) <= reach
+        return begin + np.flatnonzero(found)
+
+    with over_cores(len(corners)) as run:
+        return np.concatenate(list(run(within, range(0, len(corners), BLOCK))))
 
 
 def _ends(corners):
