@@ -76,8 +76,8 @@ def render(
     options.check_strategy(scene)
     if control is not None:
         _check_control(control, scene)
-    image = render_pixels(scene, film.pixels(scene.film), 0, spp, seed, options, control)
-    return image.reshape(*film.image_shape(scene.film), 3)
+    shape = film.image_shape(scene.film)
+    return render_pixels(scene, film.pixels(scene.film), 0, spp, seed, options, control, shape=shape)
 
 
 def _check_control(control, scene: Scene) -> None:
@@ -92,16 +92,20 @@ def _check_control(control, scene: Scene) -> None:
 
 
 @usual_promotion
-def render_pixels(scene: Scene, pixels, first_sample, spp, seed, options: Options = DEFAULTS, control=None, **how):
+def render_pixels(
+    scene: Scene, pixels, first_sample, spp, seed, options: Options = DEFAULTS, control=None, shape=None, **how
+):
     """Means over the samples first_sample, ..., first_sample + spp - 1 of some pixels: (N,) int32 -> (N, 3).
 
     first_sample, spp, seed: each one number, or (N,) of the pixels.
     control: of `render`, for options that are controlled.
+    shape: (height, width) of an image that the pixels make; the means are (height, width, 3) then.
     how: `form` and `devices` of `native_map`.
     """
     numbers = pixel.numbers(pixels, first_sample, spp, seed)
     scene = on_all_devices(scene, how.get("devices"))
-    return estimate(_PixelMeans(options, tuple(how.items()), longest_ring(scene)), scene, control, pixels, *numbers)
+    means = _PixelMeans(options, tuple(how.items()), longest_ring(scene), shape or pixels.shape)
+    return estimate(means, scene, control, pixels, *numbers)
 
 
 @dataclass(frozen=True)
@@ -109,15 +113,17 @@ class _PixelMeans:
     options: Options
     how: tuple[tuple[str, object], ...]
     ring: int  # of `backward.longest_ring`, which the scene tells here alone: within `estimate` nothing of it is known
+    shape: tuple[int, ...]  # of the pixels in the value
 
     def value(self, scene, control, pixels, *numbers):
-        return pixel_means(scene, pixels, *numbers, control, options=self.options, **dict(self.how))
+        how = dict(self.how, shape=self.shape)
+        return pixel_means(scene, pixels, *numbers, control, options=self.options, **how)
 
     def jacobian(self, scene, wanted, control, pixels, *numbers):
         self.options.check_differentiable()
         how = dict(self.how, ring=self.ring)
         image, derivatives, *_ = pixel_jacobians(scene, wanted, pixels, *numbers, self.options, **how)
-        return image, derivatives
+        return jax.tree.map(self._shaped, (image, derivatives))
 
     def matrix_free(self, scene, wanted):
         # Many colours, and textures always.
@@ -128,12 +134,17 @@ class _PixelMeans:
     def push(self, scene, wanted, changes, control, pixels, *numbers):
         self.options.check_differentiable()
         options, *work = self._own_samples(scene, pixels, *numbers)
-        return matrix_free.push(scene, wanted, changes, *work, options, **dict(self.how))
+        return self._shaped(matrix_free.push(scene, wanted, changes, *work, options, **dict(self.how)))
 
     def pull(self, scene, wanted, adjoint, control, pixels, *numbers):
         self.options.check_differentiable()
         options, *work = self._own_samples(scene, pixels, *numbers)
+        adjoint = adjoint.reshape(-1, 3)
         return matrix_free.pull(scene, wanted, adjoint, *work, options, self.ring, **dict(self.how))
+
+    def _shaped(self, values):
+        """(N, ...) -> (*shape, ...)"""
+        return values.reshape(*self.shape, *values.shape[1:])
 
     def _own_samples(self, scene, pixels, *numbers):
         """What a sweep takes: it knows of pixels that draw their own samples alone, whose means are the same."""
@@ -144,11 +155,14 @@ class _PixelMeans:
         return replace(self.options, shared=False), pixels, *numbers
 
 
-@partial(jax.jit, static_argnames=("options", "form", "devices"))
-def pixel_means(scene, pixels, first_sample, spp, seed, control=None, *, options: Options, form=None, devices=None):
+@partial(jax.jit, static_argnames=("options", "form", "devices", "shape"))
+def pixel_means(
+    scene, pixels, first_sample, spp, seed, control=None, *, options: Options, form=None, devices=None, shape=None
+):
     """What `render_pixels` gives, without derivatives; arguments as there, spp and seed (N,) uint32."""
     scene = options.applied(scene)
     choice = emitters.choice(scene.emitters, options.strategy)
     work = pixels, first_sample, spp, seed
     of_pixel = partial(pixel.mean, options=options)
-    return map_pixels(of_pixel, work, scene, choice, control, options=options, form=form, devices=devices)
+    means = map_pixels(of_pixel, work, scene, choice, control, options=options, form=form, devices=devices)
+    return means if shape is None else means.reshape(*shape, 3)

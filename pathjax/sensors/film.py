@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Real
 
-from pathjax.compile import register_dataclass
+from pathjax.compile import is_traced, register_dataclass
 from pathjax.core.math import at
 from pathjax.description.fields import Fields
 from pathjax.kinds import Unused
@@ -108,9 +108,10 @@ def sample_position(
     return (center + offset) / jnp.array([film.width, film.height], u.dtype), weight
 
 
-def pixels(film: Film) -> Int[Array, " N"]:
-    """All pixels that are sampled for an image, row by row."""
-    return jnp.arange(pixel_count(of_samples(film)), dtype=jnp.int32)
+def pixels(film: Film) -> Int[Array | np.ndarray, " N"]:
+    """All pixels that are sampled for an image, row by row. NumPy numbers them where it can: that compiles nothing."""
+    module = jnp if any(map(is_traced, jax.tree.leaves(film))) else np
+    return module.arange(pixel_count(of_samples(film)), dtype=np.int32)
 
 
 def pixel_count(film: Film) -> int:
