@@ -19,6 +19,7 @@ from pathjax.shapes.accel.leaves import numbers_of, pack, rows_of
 from pathjax.shapes.accel.traverse import Tree
 from pathjax.shapes.coincident import Faces, precision, unit_normal
 from pathjax.shapes.shape import Primitives, Shape, Table
+from pathjax.system.cores import over_cores
 
 # Formats of the files that meshes come from, as `io.mesh` reads them.
 FORMATS = ("obj", "ply", "stl", "glb", "gltf")
@@ -101,13 +102,17 @@ class Triangles(Table):
                 return None
             return joined([default(p.vertices) if v is None else v for p, v in zip(parts, values, strict=True)])
 
-        normals = optional("normals", lambda v: np.repeat(unit_normal(v)[:, None], 3, axis=1))
-        uv = optional("uv", lambda v: np.broadcast_to(np.array([[0, 0], [1, 0], [0, 1]], float), (len(v), 3, 2)))
+        defaults = {
+            "normals": lambda v: np.repeat(unit_normal(v)[:, None], 3, axis=1),
+            "uv": lambda v: np.broadcast_to(np.array([[0, 0], [1, 0], [0, 1]], float), (len(v), 3, 2)),
+            "vertices": None,
+        }
+        with over_cores(sum(part.count for part in parts)) as run:
+            normals, uv, vertices = run(optional, defaults, defaults.values())
         cdf = None
         if any(lit):
             running = ((part.areas, on) for part, on in zip(parts, lit, strict=True))
             cdf = joined([np.cumsum(areas) / np.sum(areas) * on for areas, on in running])
-        vertices = joined([part.vertices for part in parts])
         packed, tree, built = pack(leaf_numbers(vertices), *bounds(vertices), dtype, rule)
         names = dict.fromkeys(name for part in parts for name in part.attributes)
         attributes = {
@@ -312,14 +317,16 @@ class Mesh(Shape):
 
     def primitives(self, flip):
         faces = self.faces[:, ::-1] if flip else self.faces
-        normals = None
-        if self.normals is not None:
-            normals = np.take(-self.normals if flip else self.normals, faces, axis=0)
+        normals = -self.normals if flip and self.normals is not None else self.normals
         own = np.repeat(np.arange(len(faces))[:, None], 3, axis=1)
         entries = {name: faces if name.startswith("vertex_") else own for name in self.attributes}
         carried = {name: np.take(values, entries[name], axis=0) for name, values in self.attributes.items()}
-        uv = None if self.uv is None else np.take(self.uv, faces, axis=0)
-        return Facets(np.take(self.vertices, faces, axis=0), normals, uv, carried, entries)
+
+        def at_corners(values):
+            return None if values is None else np.take(values, faces, axis=0)
+
+        with over_cores(len(faces)) as run:
+            return Facets(*run(at_corners, (self.vertices, normals, self.uv)), carried, entries)
 
 
 class SerializedMesh(Mesh):
