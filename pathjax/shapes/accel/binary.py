@@ -19,7 +19,7 @@ import numpy as np
 from pathjax.system.cores import over_cores
 
 THICKNESS = np.float32(1e-6)  # of the scene, added to every extent: flat and linear boxes have areas to compare too
-PLACES = 128  # with twice or half as many, rays visit the same number of nodes within 1 %
+PLACES = 64  # with twice or half as many, rays visit the same number of nodes within 1 %
 BATCH = 1 << 16  # primitives whose nodes are split together: their arrays stay in the cache
 SPREAD = 1.15  # of counts in a batch, in which all nodes are filled up to the largest
 FEW = 1 << 12  # primitives that are not worth a batch of their own
