@@ -15,6 +15,7 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
@@ -133,7 +134,7 @@ def _as_images(of_pixels, shape):
 def pixel_jacobians(
     scene: Scene,
     wanted: dict[str, Parameter],
-    pixels: Int[Array, " N"],
+    pixels: Int[Array | np.ndarray, " N"],
     first_sample: Counts,
     spp: Counts,
     seed: Counts,

@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from pathjax.compile import usual_promotion
@@ -47,7 +48,7 @@ def pull(
     scene: Scene,
     wanted: Mapping[str, Parameter],
     adjoint: Float[Array, "N 3"],
-    pixels: Int[Array, " N"],
+    pixels: Int[Array | np.ndarray, " N"],
     first_sample: Counts,
     spp: Counts,
     seed: Counts,

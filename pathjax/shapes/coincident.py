@@ -147,8 +147,9 @@ def _coplanar(shapes: list[Faces], movable, others, least, dtype):
     low, high = map(np.concatenate, zip(*(_ends(shapes[i].corners) for i in movable), strict=True))
     slack = precision(dtype) * np.maximum(np.abs(low), np.abs(high))
     bottoms, tops = low - slack, high + slack
-    planes = [np.concatenate(each) for each in zip(*((shapes[i].corners[:, 0], shapes[i].normal) for i in movable))]
-    near_by = [_near_any(shapes[j].corners, bottoms, tops, *planes, precision(dtype)) for j in others]
+    points = np.concatenate([shapes[i].corners[:, 0] for i in movable])
+    normals = np.concatenate([shapes[i].normal for i in movable])
+    near_by = [_near_any(shapes[j].corners, bottoms, tops, points, normals, precision(dtype)) for j in others]
     owner, rows = np.repeat(others, [len(each) for each in near_by]), np.concatenate(near_by)
     if not len(rows):
         return
