@@ -12,8 +12,9 @@ from pathjax.bsdfs import Diffuse
 from pathjax.scene import build
 from pathjax.sensors import Perspective
 from pathjax.sensors.film import HDRFilm
-from pathjax.shapes import Rectangle
-from pathjax.shapes.coincident import close_pairs
+from pathjax.shapes import Rectangle, coincident
+from pathjax.shapes.coincident import Faces, close_pairs, contacts
+from pathjax.system import cores
 
 SKY = '<emitter type="constant"><rgb name="radiance" value="1"/></emitter>'
 GREY = '<bsdf type="twosided"><bsdf type="diffuse"><rgb name="reflectance" value="0.5"/></bsdf></bsdf>'
@@ -226,6 +227,37 @@ def test_copies_get_a_margin_wherever_they_stand_among_thousands():
     apart = [rectangle(z, x) for z, x in zip(rng.permutation(3000), rng.uniform(-5, 5, 3000), strict=True)]
     (table,) = tables_of(*apart, apart[123])
     assert np.flatnonzero(np.asarray(table.margins)).tolist() == [123, 3000]
+
+
+@pytest.mark.parametrize("planes", [1, 70])
+def test_of_a_large_mesh_the_triangles_in_a_plane_are_found(planes, monkeypatch):
+    """Hills around a level field, on which a rectangle lies, turned as a whole; other rectangles cut through them."""
+    rng = np.random.default_rng(planes)
+    turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    side = int(np.sqrt(cores.SMALL / 2)) + 2
+    x, y = np.mgrid[:side, :side] - side / 2
+    height = np.maximum(0, np.hypot(x, y) - side / 4) * rng.uniform(0.1, 1, x.shape)
+    at = np.stack([x, y, height], -1)
+    a, b, c, d = (v.reshape(-1, 3) for v in (at[:-1, :-1], at[1:, :-1], at[1:, 1:], at[:-1, 1:]))
+    triangles = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
+    assert len(triangles) >= cores.SMALL
+    square = np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) * side / 6
+    level = (triangles[:, :, 2] == 0).all(1)
+    under = level & (triangles.min(1) <= side / 6)[:, :2].all(1) & (triangles.max(1) >= -side / 6)[:, :2].all(1)
+    through = [square @ np.linalg.qr(rng.normal(size=(3, 3)))[0].T + 0.3 for _ in range(planes)]
+    corners = np.stack([square, *through]) @ turn.T
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 3] - corners[:, 0])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    sheets = Faces(corners, normals, np.full(len(corners), np.inf), False, False)
+    found = []
+    for most in (coincident.MOST_PLANES, 0):
+        monkeypatch.setattr(coincident, "MOST_PLANES", most)
+        _, margins = contacts([Faces(triangles @ turn.T, None, None, False, False), sheets], np.float32)
+        found.append(margins)
+    (mesh, flat), others = found
+    assert np.array_equal(mesh, others[0]) and np.array_equal(flat, others[1])
+    assert under.sum() > 1000 and (mesh[under] > 0).all() and not mesh[~level].any()
+    assert (flat > 0).tolist() == [True] + [False] * planes
 
 
 @pytest.mark.parametrize("count, distance", [(0, 1), (1, 1), (2, 0), (300, 1e-9), (300, 0.2)])
