@@ -24,12 +24,14 @@ from pathjax.compile.mapping import MANY_ITEMS, cuts, native_fold, native_map, n
 from pathjax.compile.primitives import Search, compute_once, interleaved, one_by_one, persistent_loop, together
 from pathjax.compile.promotion import usual_promotion
 from pathjax.compile.replicas import on_all_devices
+from pathjax.compile.rows import Rows
 from pathjax.compile.threads import calls_at_once, concurrently, devices_of_a_call
 from pathjax.compile.xla import native, setup
 
 __all__ = [
     "MANY_ITEMS",
     "SELECTED_ROWS",
+    "Rows",
     "Search",
     "calls_at_once",
     "compiled",

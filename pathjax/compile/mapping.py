@@ -18,6 +18,7 @@ from jax.sharding import Mesh, PartitionSpec
 
 from pathjax.compile.lanes import lanes
 from pathjax.compile.promotion import usual_promotion
+from pathjax.compile.rows import Rows
 from pathjax.compile.vectorised import most_lanes, vectorised, vectorised_sum
 from pathjax.compile.xla import native
 
@@ -121,11 +122,11 @@ def native_rows(
     Args:
         f: (x, number of the item, *shared, memory) -> (y, memory); items of a part are numbered from 0.
         start: (number of lanes, number of items, *shared) -> memory before the first item.
-        finish: memory after the last item of a part -> pytree of arrays (M, items, ...).
+        finish: memory after the last item of a part -> array (M, items, ...).
         xs, shared, form, devices: of `native_fold`.
     Returns:
-        y and the rows of all items, pytrees of arrays (N, ...) and (M, N, ...), as what takes one number of many items
-        finds them side by side. Under `jax.vmap` one call follows another.
+        y, a pytree of arrays (N, ...), and the M `Rows` of all items, as what takes one number of many items finds them
+        side by side. Under `jax.vmap` one call follows another.
     """
     count = jax.tree.leaves(xs)[0].shape[0]
     form = _form(form)
@@ -134,16 +135,11 @@ def native_rows(
 
     def alone(x, *shared):
         y, memory = f(x, jnp.int32(0), *shared, start(1, 1, *shared))
-        return y, jax.tree.map(lambda row: row[:, 0], finish(memory))
+        return y, finish(memory)[:, 0]
 
     if form == "vmap":
         ys, rows = native_map(alone, xs, *shared, form=form, devices=devices)
-        return ys, jax.tree.map(lambda x: x.swapaxes(0, 1), rows)
-
-    def gathered(x, axis):
-        """(parts, ..., items, ...) -> (..., N, ...)"""
-        x = jnp.moveaxis(x, 0, axis + 1)
-        return lax.slice_in_dim(x.reshape(*x.shape[:axis], -1, *x.shape[axis + 2 :]), 0, count, axis=axis)
+        return ys, Rows((rows.swapaxes(0, 1)[None],), (count, *rows.shape[2:]))
 
     @custom_vmap
     def run(xs, *shared):
@@ -154,7 +150,8 @@ def native_rows(
             return ys, finish(memory)
 
         ys, rows = _by_parts(part, xs, shared, devices)
-        return jax.tree.map(partial(gathered, axis=0), ys), jax.tree.map(partial(gathered, axis=1), rows)
+        ys = jax.tree.map(lambda y: y.swapaxes(0, 1).reshape(-1, *y.shape[2:])[:count], ys)
+        return ys, Rows((rows,), (count, *rows.shape[3:]))
 
     @run.def_vmap
     @usual_promotion

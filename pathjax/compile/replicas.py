@@ -1,4 +1,4 @@
-"""Large arrays on all devices: JAX copies an array of one device to the others at each call that needs it there."""
+"""Large arrays on all devices, which JAX copies at each call that needs them there; and on one without copies."""
 
 from __future__ import annotations
 
@@ -48,3 +48,17 @@ def _replica(x: jax.Array) -> jax.Array:
     key = id(x)
     _kept[key] = weakref.ref(x, lambda _: _kept.pop(key, None)), replica
     return replica
+
+
+def on_one_device(x: jax.Array, axis: int) -> tuple[jax.Array, ...]:
+    """What several CPU devices hold of an array, along an axis, as arrays of one of them: they share one memory.
+
+    An array of which this cannot be said is returned as it is.
+    """
+    if is_traced(x) or not x.is_fully_addressable or len(x.devices()) == 1:
+        return (x,)
+    pieces = {shard.index[axis].start or 0: shard.data for shard in x.addressable_shards}
+    whole = sum(piece.shape[axis] for piece in pieces.values()) == x.shape[axis]
+    if not whole or jax.default_backend() != "cpu":
+        return (x,)
+    return tuple(jax.device_put(np.from_dlpack(pieces[start])) for start in sorted(pieces))

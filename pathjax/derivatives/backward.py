@@ -23,7 +23,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from pathjax import bsdfs, emitters
-from pathjax.compile import compute_once, is_traced, native_fold, native_rows, persistent_loop, together
+from pathjax.compile import Rows, compute_once, is_traced, native_fold, native_rows, persistent_loop, together
 from pathjax.compile.lanes import flags
 from pathjax.core import sampler
 from pathjax.core.math import LUMINANCE, at
@@ -305,7 +305,8 @@ def finish(structure: Record, memory: Memory) -> Float[Array, " numbers"]:
     total = memory.total
     if isinstance(total, list):
         total = jnp.stack([jnp.sum(x) for x in total])
-    return jnp.where(memory.lost != 0, jnp.nan, total)
+    # A loop of no trip, where a choice would copy what may be most of the memory.
+    return lax.fori_loop(0, memory.lost, lambda _, total: jnp.full_like(total, jnp.nan), total)
 
 
 class _Kernel(NamedTuple):
@@ -370,8 +371,8 @@ def pullback(
 @partial(jax.jit, static_argnames=("paths", "options", "ring", "form", "devices"))
 def rows(
     scene: Scene, pixels, first_sample, spp, seed, *, paths, options: Options, ring, form=None, devices=None
-) -> tuple[Float[Array, "N 3"], Float[Array, "M N 3"]]:
-    """Means of pixels, and their derivatives in each of the list of colours: of each channel in its own.
+) -> tuple[Float[Array, "N 3"], Rows]:
+    """Means of pixels, and rows (N, 3), their derivatives in each of the list of colours: of each channel in its own.
 
     Arguments as for `pullback`; the arrays hold colours alone.
     """

@@ -24,6 +24,7 @@ from pathjax.bsdfs import dielectric
 from pathjax.compile import is_symbolic_zero, is_traced, native, on_all_devices, register_dataclass, usual_promotion
 from pathjax.core.types import Number
 from pathjax.derivatives import backward, differentiated, ior, ior_difference, ior_step, rules, tangents
+from pathjax.derivatives.color_slopes import ColorSlopes
 from pathjax.errors import InputError
 from pathjax.integrators import pixel
 from pathjax.integrators.options import Counts, Options
@@ -35,7 +36,7 @@ from pathjax.scene.scene import Scene
 from pathjax.sensors import film
 from pathjax.system import memory
 
-Slopes = dict[str, Float[Array, "..."]]
+Slopes = Mapping[str, Float[Array, "..."]]
 METHODS = ("difference", "attached")
 # Up to so many colours tangents are the cheaper way: for 1, 2, 3 colours of the Cornell box, image and Jacobian took
 # 1.14, 1.24, 1.44 images of CPU time, and by a recorded sweep 1.23, 1.24, 1.26.
@@ -47,17 +48,21 @@ MOST_TANGENTS = 2
 class Jacobian(Mapping[str, Array]):
     """Derivatives of an image by the names of parameters: `J[name]` is (H, W, 3, *shape of the parameter).
 
+    derivatives: of many colours, `ColorSlopes`, which make each when it is read.
     bias: of those that are differences, an estimate of derivative minus truth (H, W, 3) from a second step; noisy in a
         single pixel, meant for averages.
     step: of those, the change of the relative IOR to either side.
     """
 
-    derivatives: dict[str, jax.Array]
+    derivatives: Mapping[str, jax.Array]
     bias: dict[str, jax.Array]
     step: dict[str, jax.Array]
 
     def __getitem__(self, name: str) -> Array:
         return self.derivatives[name]
+
+    def __contains__(self, name: object) -> bool:
+        return name in self.derivatives
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.derivatives)
@@ -121,7 +126,10 @@ def jacobian(
     image, derivatives, bias, used = pixel_jacobians(
         scene, wanted, pixels, 0, spp, seed, options, method=method, step=step
     )
-    image, derivatives, bias = _as_images((image, derivatives, bias), film.image_shape(scene.film))
+    shape = film.image_shape(scene.film)
+    if isinstance(derivatives, ColorSlopes):
+        return image.reshape(*shape, 3), Jacobian(replace(derivatives, shape=shape), bias, used)
+    image, derivatives, bias = _as_images((image, derivatives, bias), shape)
     return image, Jacobian(derivatives, bias, used)
 
 
@@ -216,19 +224,15 @@ def has_rows(scene: Scene, parameters) -> bool:
 def _swept(wanted, options, ring, how, scene, pixels, *numbers):
     """Means and derivatives, by name. how: `form` and `devices`; lanes are the only form."""
     paths = tuple(dict.fromkeys(parameter.path for parameter in wanted.values()))
-    first, _ = differentiated.firsts(scene, paths)
-    columns = tuple(first[parameter.path] + parameter.index[0] for parameter in wanted.values())
+    first, entries = differentiated.firsts(scene, paths)
+    entry = {name: first[parameter.path] + parameter.index[0] for name, parameter in wanted.items()}
+    kept = sorted(set(entry.values()))
     options = replace(options, derivative=True, by_vertex=True)
-    static = dict(columns=columns, paths=paths, options=options, ring=ring, devices=how.get("devices"))
-    image, slopes = _columns(scene, pixels, *numbers, **static)
-    return image, dict(zip(wanted, slopes, strict=True))
-
-
-@partial(jax.jit, static_argnames=("columns", "paths", "options", "ring", "devices"))
-def _columns(*work, columns, **how):
-    """One program for all: of hundreds, calls one by one took longer than the kernel."""
-    image, found = backward.rows(*work, **how)
-    return image, [tangents.by_channel(found[column]) for column in columns]
+    image, rows = backward.rows(
+        scene, pixels, *numbers, paths=paths, options=options, ring=ring, devices=how.get("devices")
+    )
+    rows = rows if len(kept) == entries else rows.taken(kept)
+    return image, ColorSlopes(rows, tuple((name, kept.index(entry[name])) for name in wanted), (len(pixels),))
 
 
 @partial(_swept.defjvp, symbolic_zeros=True)
@@ -246,9 +250,13 @@ def _swept_jvp(wanted, options, ring, how, primals, changes):
         scene = tree.unflatten(at_place.values())
         steps = ior_step.steps(scene, (), None)
         image, slopes, *_ = _jacobians(scene, *work, steps, wanted=held, options=options, **how)
-        return image, {name: tangents.by_channel(slopes[:, k]) for k, name in enumerate(wanted)}
+        return image, slopes
 
-    return jax.jvp(of, ([leaves[k] for k in moved],), ([changes[k] for k in moved],))
+    image, slopes = _swept(wanted, options, ring, how, scene, *work)
+    _, (moves, by_color) = jax.jvp(of, ([leaves[k] for k in moved],), ([changes[k] for k in moved],))
+    number_of = {row: k for k, (_, row) in enumerate(slopes.places)}
+    rows = jnp.stack([by_color[:, number_of[row]] for row in range(len(number_of))])
+    return (image, slopes), (moves, replace(slopes, rows=slopes.rows.like(rows)))
 
 
 def choosing_by_present_iors(scene: Scene, rows: tuple[int, ...]) -> Scene:

@@ -135,7 +135,9 @@ def test_items_keep_rows_of_their_own(form):
 
     twice, rows = native_rows(f, xs, jnp.float32(0.5), start=start, finish=lambda memory: memory[:-1].T, form=form)
     np.testing.assert_array_equal(twice, 2 * xs)
-    np.testing.assert_array_equal(rows, 0.5 * (np.arange(4)[:, None] < xs))
+    np.testing.assert_array_equal(rows.all(), 0.5 * (np.arange(4)[:, None] < xs))
+    np.testing.assert_array_equal(rows[2], rows.all()[2])
+    np.testing.assert_array_equal(rows.like(rows.all()).of_parts[0], rows.of_parts[0])
 
 
 def test_map_passes_tangents():

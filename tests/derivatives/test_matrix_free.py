@@ -175,6 +175,7 @@ def test_a_jacobian_in_many_colours_is_that_by_tangents(make_scene, monkeypatch)
     pair = jax.vmap(lambda seed: pj.jacobian(scene, names, SPP, seed))(jnp.array([5, 3]))
     for one, of_two in zip(jax.tree.leaves(swept), jax.tree.leaves(pair), strict=True):
         np.testing.assert_array_equal(one, of_two[1])
+    np.testing.assert_array_equal(swept[1][names[1]], pair[1][names[1]][1])
     alone = jacobian.pixel_jacobians(
         named.nameless(scene),
         scene.about.parameters,
@@ -184,9 +185,14 @@ def test_a_jacobian_in_many_colours_is_that_by_tangents(make_scene, monkeypatch)
     )
     np.testing.assert_array_equal(swept[0].reshape(-1, 3), alone[0])
     np.testing.assert_array_equal(swept[1][names[0]].reshape(-1, 3, 3), alone[1][names[0]])
+    some = pj.jacobian(scene, names[: jacobian.MOST_TANGENTS : -1], SPP, 3)[1]
+    assert set(some) == set(names[: jacobian.MOST_TANGENTS : -1])
+    np.testing.assert_array_equal(some[names[-1]], swept[1][names[-1]])
     monkeypatch.setattr(jacobian, "MOST_TANGENTS", len(names))
     by_tangents = pj.jacobian(scene, names, SPP, 3)
-    for one, other in zip(jax.tree.leaves(swept), jax.tree.leaves(by_tangents), strict=True):
+    assert set(swept[1]) == set(by_tangents[1])
+    images = [(swept[0], by_tangents[0]), *((swept[1][name], by_tangents[1][name]) for name in names)]
+    for one, other in images:
         # Of float32 sums of some tens of numbers of one sign.
         np.testing.assert_allclose(one, other, rtol=3e-6, atol=3e-6 * np.abs(other).max())
 

@@ -1,0 +1,62 @@
+"""What items leave in rows of memory that are their own, before it is brought together."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array
+
+from pathjax.compile.jax_compat import register_dataclass
+from pathjax.compile.replicas import on_one_device
+
+
+@register_dataclass
+@dataclass(frozen=True)
+class Rows:
+    """M rows (N, ...) of N items, as the parts left them to which the items were dealt, each on its device.
+
+    They may fill all memory, and to copy what is written once costs more than to make it: so a row is brought together
+    when it is read. An axis that `jax.vmap` has put in front of all stays there.
+    """
+
+    # (parts, M, items of a part, ...); item i is of part i % parts. Or pieces of it.
+    of_parts: tuple[Array, ...]
+    shape: tuple[int, ...] = field(metadata={"static": True})  # of a row
+
+    @property
+    def _axis(self) -> int:
+        """Of the parts."""
+        return self.of_parts[0].ndim - len(self.shape) - 2
+
+    def __getitem__(self, row) -> Array:
+        """(N, ...)."""
+        axis = self._axis
+        of_parts = [lax.dynamic_index_in_dim(x, row, axis + 1, keepdims=False) for x in self.of_parts]
+        return self._joined(jnp.concatenate(of_parts, axis), axis)
+
+    def all(self) -> Array:
+        """(M, N, ...)."""
+        of_parts = jnp.concatenate(self.of_parts, self._axis)
+        return self._joined(of_parts.swapaxes(self._axis, self._axis + 1), self._axis + 1)
+
+    def here(self) -> Rows:
+        """The same on one device, if nothing has to be copied for that; what is read of it is not on all of them."""
+        return Rows(sum((on_one_device(x, self._axis) for x in self.of_parts), ()), self.shape)
+
+    def taken(self, rows: list[int]) -> Rows:
+        return Rows(tuple(jnp.take(x, jnp.asarray(rows), axis=self._axis + 1) for x in self.of_parts), self.shape)
+
+    def like(self, rows: Array) -> Rows:
+        """Rows (M, N, ...) in parts of as many items as these, of one piece."""
+        parts, _, items = self.of_parts[0].shape[self._axis :][:3]
+        rows = jnp.pad(rows, [(0, 0), (0, parts * items - rows.shape[1]), *[(0, 0)] * (rows.ndim - 2)])
+        rows = rows.reshape(len(rows), items, parts, *rows.shape[2:])
+        return Rows((jnp.moveaxis(rows, 2, 0),), self.shape)
+
+    def _joined(self, x: Array, axis: int) -> Array:
+        """(..., parts, items, ...) -> (..., N, ...)"""
+        x = x.swapaxes(axis, axis + 1)
+        x = x.reshape(*x.shape[:axis], -1, *x.shape[axis + 2 :])
+        return lax.slice_in_dim(x, 0, self.shape[0], axis=axis)
