@@ -46,6 +46,10 @@ ROULETTE = 900
 FEW = 8
 # Bytes of a list that stay in near caches.
 NEAR = 1 << 19
+# Numbers of an entry of a list: three, and one more, so that they are added at once, and lie on one line of a cache.
+WIDTH = 4
+# Lanes that add to a list in one trip of a loop, which takes as long as some of them.
+AT_ONCE = 4
 
 # Bits of what a lane records.
 BEGINS, ENDS, HOLDS = 1, 2, 4
@@ -63,7 +67,7 @@ def columns_of(record: Record) -> list:
 
 class Memory(NamedTuple):
     # Of few entries, a column for each number of theirs; or the list, of which whole vectors are added up.
-    total: list[Float[Array, " W"]] | Float[Array, " numbers"]
+    total: list[Float[Array, " W"]] | Float[Array, "entries 4"]
     clock: Int[Array, ""]  # trips
     swept: Int[Array, ""]  # trips before the last sweep
     lost: Int[Array, ""]  # 1: a path was longer than the ring
@@ -79,7 +83,7 @@ class Sweep(NamedTuple):
     complete: Int[Array, " W"]  # 1: has met the end of a path, so that it knows what arrives
     stopped: Int[Array, " W"]  # 1: all that is older has been swept before
     R: list[Float[Array, " W"]]
-    total: list[Float[Array, " W"]] | Float[Array, " numbers"]
+    total: list[Float[Array, " W"]] | Float[Array, "entries 4"]
 
 
 def start(scene: Scene, record: Record, entries: int, ring: int, lanes: int) -> Memory:
@@ -98,7 +102,7 @@ def start(scene: Scene, record: Record, entries: int, ring: int, lanes: int) -> 
         )
     dtype = scene.camera.origin.dtype
     few = entries <= FEW
-    total = [jnp.zeros((lanes,), dtype)] * (3 * entries) if few else jnp.zeros((3 * entries,), dtype)
+    total = [jnp.zeros((lanes,), dtype)] * (3 * entries) if few else jnp.zeros((entries, WIDTH), dtype)
     # No trip is read that was not written. On CPUs it is filled with zeros all the same, so it had better be short.
     buffers = [lax.empty((ring, lanes), x.dtype) for x in jax.eval_shape(columns_of, record)]
     zero = jnp.int32(0)
@@ -214,32 +218,40 @@ def add(total, slot: Slot, change: list[Float[Array, " W"]]):
     # XLA's own scatter would break the native kernel; a lane that adds nothing adds 0.
     def one(lane, total):
         of_lane = partial(jax.tree.map, lambda column: at(column, lane))
-        x = of_lane(change)
+        x = _as_entry(of_lane(change))
         for place, share in of_lane(list(zip(places, slot.shares or [None], strict=True))):
-            # Number by number: a loop over three would not be unrolled.
-            for channel, number in enumerate(_part(x, share)):
-                where = (_number(place, channel),)
-                new = lax.dynamic_slice(total, where, (1,), allow_negative_indices=False) + number
-                total = lax.dynamic_update_slice(total, new, where, allow_negative_indices=False)
+            where = place.astype(jnp.uint32), jnp.uint32(0)
+            more = x if share is None else x * (_as_entry(share) if isinstance(share, list) else share)
+            new = lax.dynamic_slice(total, where, more.shape, allow_negative_indices=False) + more
+            total = lax.dynamic_update_slice(total, new, where, allow_negative_indices=False)
         return total
 
-    return lax.fori_loop(first, len(change[0]), one, total)
+    count = AT_ONCE if len(change[0]) % AT_ONCE == 0 else 1
+
+    def some(trip, total):
+        for k in range(count):
+            total = one(trip * count + k, total)
+        return total
+
+    return lax.fori_loop(first, len(change[0]) // count, some, total)
 
 
-def _number(place, channel):
-    """Where it stands in the list."""
-    return 3 * place.astype(jnp.uint32) + jnp.uint32(channel)
+def _as_entry(numbers: list[Float[Array, ""]]) -> Float[Array, "1 4"]:
+    """Three numbers as the list has them. Stacked, they would be laid side by side by branches, one after another."""
+    k = jnp.arange(WIDTH)
+    x = jnp.zeros_like(numbers[0])
+    for channel, number in enumerate(numbers):
+        x = jnp.where(k == channel, number, x)
+    return x[None]
 
 
-def _read_ahead(total: Float[Array, " numbers"], places: Sequence[Int[Array, " W"]]) -> Int[Array, ""]:
+def _read_ahead(total: Float[Array, "entries 4"], places: Sequence[Int[Array, " W"]]) -> Int[Array, ""]:
     """0, when all places have been read, and so are in a near cache.
 
     Processors read far memory many places at a time, but add to few: each add holds the ones behind it up. The result
     depends on what was read, so that no compiler leaves the reading out.
     """
-    # Texels are neighbours in pairs: the ends of a pair lie on all lines of the cache that it does.
-    ends = [_number(place, 2 * (k % 2)) for k, place in enumerate(places)]
-    read = sum(total.at[end].get(mode="promise_in_bounds") * 0 for end in ends)
+    read = sum(total.at[place.astype(jnp.uint32), 0].get(mode="promise_in_bounds") * 0 for place in places)
     return jnp.where(jnp.sum(read) > 0, 1, 0)
 
 
@@ -300,11 +312,11 @@ def pixel_sweep(
     return share * total, memory
 
 
-def finish(structure: Record, memory: Memory) -> Float[Array, " numbers"]:
+def finish(structure: Record, memory: Memory) -> Float[Array, "entries 4"]:
     memory = sweep(structure, memory, jnp.bool_(True))
     total = memory.total
     if isinstance(total, list):
-        total = jnp.stack([jnp.sum(x) for x in total])
+        total = jnp.pad(jnp.stack([jnp.sum(x) for x in total]).reshape(-1, 3), [(0, 0), (0, WIDTH - 3)])
     # A loop of no trip, where a choice would copy what may be most of the memory.
     return lax.fori_loop(0, memory.lost, lambda _, total: jnp.full_like(total, jnp.nan), total)
 
@@ -361,8 +373,8 @@ def pullback(
     total = native_fold(of_pixel, work, scene, choice, start=begin, finish=end, form=form, devices=devices)
 
     def of_array(path):
-        rows = total[3 * first[path] : 3 * (first[path] + differentiated.count(scene, path))]
-        rows = rows if differentiated.of_colors(scene, path) else rows.reshape(-1, 3).sum(1)
+        rows = total[first[path] :][: differentiated.count(scene, path), :3]
+        rows = rows if differentiated.of_colors(scene, path) else rows.sum(1)
         return rows.reshape(named.get(scene, path).shape)
 
     return [of_array(path) for path in paths]
@@ -372,15 +384,15 @@ def pullback(
 def rows(
     scene: Scene, pixels, first_sample, spp, seed, *, paths, options: Options, ring, form=None, devices=None
 ) -> tuple[Float[Array, "N 3"], Rows]:
-    """Means of pixels, and rows (N, 3), their derivatives in each of the list of colours: of each channel in its own.
+    """Means of pixels, and rows (N, 4), of which the last number is none, their derivatives in each of the list of colours: of each channel in its own.
 
     Arguments as for `pullback`; the arrays hold colours alone.
     """
     scene, choice, structure, entries, sweep_of = _kernel(scene, paths, options)
 
     def of_pixel(work, number, scene, choice, memory):
-        size = len(memory.total) if isinstance(memory.total, list) else memory.total.size
-        pixels = size // (3 * entries)
+        size = len(memory.total) // 3 if isinstance(memory.total, list) else len(memory.total)
+        pixels = size // entries
         ones = jnp.ones_like(scene.camera.origin)
         return sweep_of(work, scene, choice, ones, lambda place: pixels * place + number, memory)
 
@@ -388,7 +400,7 @@ def rows(
         return start(scene, structure, pixels * entries, ring, lanes)
 
     def end(memory):
-        return finish(structure, memory).reshape(entries, -1, 3)
+        return finish(structure, memory).reshape(entries, -1, WIDTH)
 
     work = pixels, first_sample, spp, seed
     return native_rows(of_pixel, work, scene, choice, start=begin, finish=end, form=form, devices=devices)

@@ -21,7 +21,7 @@ class ColorSlopes(Mapping[str, Array]):
     Light keeps its channel, so a third of their numbers says all.
     """
 
-    rows: Rows  # (N, 3), of each channel in its own
+    rows: Rows  # (N, 4), of each channel in its own; the last number is none
     places: tuple[tuple[str, int], ...] = field(metadata={"static": True})  # name -> row
     shape: tuple[int, ...] = field(metadata={"static": True})  # of the N pixels
 
@@ -48,5 +48,5 @@ class ColorSlopes(Mapping[str, Array]):
 
 @partial(jax.jit, static_argnames="shape")
 def _slope(rows: Rows, number, shape: tuple[int, ...]) -> Float[Array, "... 3 3"]:
-    row = rows[number]
+    row = rows[number][..., :3]
     return tangents.by_channel(row.reshape(*row.shape[:-2], *shape, 3))

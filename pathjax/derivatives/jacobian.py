@@ -256,6 +256,7 @@ def _swept_jvp(wanted, options, ring, how, primals, changes):
     _, (moves, by_color) = jax.jvp(of, ([leaves[k] for k in moved],), ([changes[k] for k in moved],))
     number_of = {row: k for k, (_, row) in enumerate(slopes.places)}
     rows = jnp.stack([by_color[:, number_of[row]] for row in range(len(number_of))])
+    rows = jnp.pad(rows, [(0, 0), (0, 0), (0, backward.WIDTH - 3)])
     return (image, slopes), (moves, replace(slopes, rows=slopes.rows.like(rows)))
 
 

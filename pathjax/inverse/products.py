@@ -193,6 +193,6 @@ def _rows(values, views, pixels, spp, seeds, vector):
                 columns.append(slope.reshape(-1, 3))
             return jnp.concatenate(columns) * views.exposure
 
-        return jax.vmap(of_pixel, in_axes=1)(found.all())
+        return jax.vmap(of_pixel, in_axes=1)(found.all()[..., :3])
 
     return views.map(one, (seeds, pixels))
