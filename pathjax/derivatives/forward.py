@@ -35,7 +35,8 @@ def changes(record: Record, v: Float[Array, "M 3"]) -> tuple[Float[Array, "3"], 
     for slot in record.slots:
         shares = slot.shares or (1,)
         change = sum(share * at(v, place) for place, share in zip(slot.places, shares, strict=True))
-        change = luminance(change) if slot.is_number else change
+        # Read once, as both of its consumers would read it from far memory.
+        change = compute_once(luminance(change) if slot.is_number else change)
         now = now + slot.now * change
         if slot.later is not None:
             later = later + slot.later * change
