@@ -55,10 +55,10 @@ def on_one_device(x: jax.Array, axis: int) -> tuple[jax.Array, ...]:
 
     An array of which this cannot be said is returned as it is.
     """
-    if is_traced(x) or not x.is_fully_addressable or len(x.devices()) == 1:
+    if not isinstance(x, jax.Array) or is_traced(x) or not x.is_fully_addressable or len(x.devices()) == 1:
         return (x,)
     pieces = {shard.index[axis].start or 0: shard.data for shard in x.addressable_shards}
-    whole = sum(piece.shape[axis] for piece in pieces.values()) == x.shape[axis]
-    if not whole or jax.default_backend() != "cpu":
+    # Unless another axis is dealt, too.
+    if sum(piece.size for piece in pieces.values()) != x.size or jax.default_backend() != "cpu":
         return (x,)
     return tuple(jax.device_put(np.from_dlpack(pieces[start])) for start in sorted(pieces))

@@ -368,12 +368,17 @@ def pullback(
         adjoint, work = work
         return sweep_of(work, scene, choice, adjoint, lambda place: place, memory)[1]
 
-    begin, end = partial(start, scene, structure, entries, ring), partial(finish, structure)
+
+    def end(memory):
+        # The sums of parts are those of three numbers.
+        return finish(structure, memory)[:, :3]
+
+    begin = partial(start, scene, structure, entries, ring)
     work = adjoint, (pixels, first_sample, spp, seed)
     total = native_fold(of_pixel, work, scene, choice, start=begin, finish=end, form=form, devices=devices)
 
     def of_array(path):
-        rows = total[first[path] :][: differentiated.count(scene, path), :3]
+        rows = total[first[path] :][: differentiated.count(scene, path)]
         rows = rows if differentiated.of_colors(scene, path) else rows.sum(1)
         return rows.reshape(named.get(scene, path).shape)
 
@@ -384,9 +389,9 @@ def pullback(
 def rows(
     scene: Scene, pixels, first_sample, spp, seed, *, paths, options: Options, ring, form=None, devices=None
 ) -> tuple[Float[Array, "N 3"], Rows]:
-    """Means of pixels, and rows (N, 4), of which the last number is none, their derivatives in each of the list of colours: of each channel in its own.
+    """Means of pixels, and their derivatives in each of the list of colours, of each channel in its own.
 
-    Arguments as for `pullback`; the arrays hold colours alone.
+    Arguments as for `pullback`; the arrays hold colours alone. A row is (N, 4), and the last number is none.
     """
     scene, choice, structure, entries, sweep_of = _kernel(scene, paths, options)
 

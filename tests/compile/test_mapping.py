@@ -137,7 +137,40 @@ def test_items_keep_rows_of_their_own(form):
     np.testing.assert_array_equal(twice, 2 * xs)
     np.testing.assert_array_equal(rows.all(), 0.5 * (np.arange(4)[:, None] < xs))
     np.testing.assert_array_equal(rows[2], rows.all()[2])
-    np.testing.assert_array_equal(rows.like(rows.all()).of_parts[0], rows.of_parts[0])
+
+
+def test_rows_are_read_of_items_in_any_number_of_parts(monkeypatch):
+    """Of several devices each has its own; so they are under `jax.vmap`, and what is read is on one device."""
+
+    def f(x, number, memory):
+        def put(memory, here, numbers):
+            def one(lane, memory):
+                return memory.at[numbers[lane]].add(jnp.where(here[lane], 1, 0))
+
+            return lax.fori_loop(0, len(numbers), one, memory)
+
+        def step(state):
+            k, memory = state
+            return k + 1, together(put)(memory, number)
+
+        return persistent_loop(lambda state: state[0] != x, step, (jnp.int32(0), memory))
+
+    def rows(xs, parts):
+        monkeypatch.setattr(mapping, "ITEMS_OF_A_PART", -(-len(xs) // parts))
+        start = lambda lanes, items: jnp.zeros(items, jnp.int32)  # noqa: E731
+        run = lambda xs: native_rows(f, xs, start=start, finish=lambda x: jnp.stack([x, -x]))[1]  # noqa: E731
+        return jax.jit(run)(xs), jax.jit(jax.vmap(run))(jnp.stack([xs, xs + 2]))
+
+    xs = jnp.arange(37, dtype=jnp.int32) % 5
+    for parts in (1, 2, 4):
+        found, pair = rows(xs, parts)
+        for one in (found, found.here()):
+            np.testing.assert_array_equal(one[1], -xs)
+            np.testing.assert_array_equal(one.all(), [xs, -xs])
+            np.testing.assert_array_equal(one.taken([1])[0], one[1])
+        assert len(found.here()[0].devices()) == 1 or parts == 1
+        np.testing.assert_array_equal(found.like(found.all()).of_parts[0], found.of_parts[0])
+        np.testing.assert_array_equal(pair.here()[1], [-xs, -xs - 2])
 
 
 def test_map_passes_tangents():

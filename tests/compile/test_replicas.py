@@ -11,6 +11,7 @@ import trimesh
 
 import pathjax as pj
 from pathjax.compile import on_all_devices
+from pathjax.compile.replicas import on_one_device
 from pathjax.derivatives import jacobian
 from pathjax.rendering import aovs, bounces, query, render
 
@@ -34,6 +35,23 @@ def test_large_arrays_are_on_all_devices_without_a_copy():
     assert addresses(found["large"]) == addresses(given["large"])
     assert found["small"] is given["small"] and found["none"] is None
     assert on_all_devices(given)["large"] is found["large"], "it is made once"
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_what_is_dealt_to_devices_is_on_one_without_a_copy(axis):
+    count = len(jax.devices())
+    x = LARGE[: 24 * count].reshape(3, 8, count).swapaxes(2, axis).copy()
+    mesh = jax.sharding.Mesh(np.array(jax.devices()), ("device",))
+    dealt = [None] * axis + ["device"]
+    given = jax.device_put(x, jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec(*dealt)))
+    pieces = on_one_device(given, axis)
+    assert len(pieces) == count and all(piece.devices() == {jax.devices()[0]} for piece in pieces)
+    np.testing.assert_array_equal(np.concatenate(pieces, axis), x)
+    assert {piece.unsafe_buffer_pointer() for piece in pieces} == addresses(given)
+    (alone,) = on_one_device(given, 1 - axis)
+    assert alone is given
+    assert on_one_device(x, axis)[0] is x
+    np.testing.assert_array_equal(jax.jit(lambda x: on_one_device(x, axis)[0] + 1)(given), x + 1)
 
 
 def test_what_was_placed_or_is_traced_stays_and_so_does_all_for_one_device():

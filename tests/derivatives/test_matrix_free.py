@@ -205,14 +205,14 @@ def test_lanes_add_to_a_list_that_is_far_as_to_one_that_is_near(monkeypatch, nea
     places = random.integers(0, 50, (4, 64)).astype(np.int32)
     shares, change = (random.random((n, 64)).astype(np.float32) for n in (4, 3))
     change[:, ::3] = 0
-    total = np.zeros((60, 3), np.float32)
-    total[55] = np.nan, np.inf, -np.inf
+    total = np.zeros((60, backward.WIDTH), np.float32)
+    total[55, :3] = np.nan, np.inf, -np.inf
     expected = total.copy()
     for place, share in zip(places, shares, strict=True):
-        np.add.at(expected, place, (share * change).T)
+        np.add.at(expected[:, :3], place, (share * change).T)
     slot = record.Slot(tuple(jnp.asarray(places)), tuple(jnp.asarray(shares)), None, None)
-    found = jax.jit(lambda *args: backward.add(*args))(jnp.asarray(total.ravel()), slot, list(jnp.asarray(change)))
-    np.testing.assert_allclose(found, expected.ravel(), rtol=1e-5)  # sums in another order
+    found = jax.jit(lambda *args: backward.add(*args))(jnp.asarray(total), slot, list(jnp.asarray(change)))
+    np.testing.assert_allclose(found, expected, rtol=1e-5)  # sums in another order
 
 
 @pytest.mark.slow
