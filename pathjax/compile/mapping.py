@@ -230,32 +230,33 @@ def _by_parts(part: Callable, xs, shared, devices: int | None, most: int = MOST_
         x = jnp.pad(x, [(0, each * parts - count), *[(0, 0)] * (x.ndim - 1)])
         x = x.reshape(each, parts, *x.shape[1:]).swapaxes(0, 1)
         x = jnp.pad(x, [(0, rounds * len(used) - parts), *[(0, 0)] * (x.ndim - 1)])
-        return x.reshape(len(used), rounds, *x.shape[1:])
+        return x.reshape(rounds, len(used), *x.shape[1:]).swapaxes(0, 1)
 
     def on_one_device(xs, *shared):
         return lax.map(lambda xs: part(xs, width, shared), xs)
 
-    def added(total, result):
-        return jax.tree.map(jnp.add, total, result)
-
-    if len(used) == 1 and total is not None:
-        # Parts that are not kept till all are done need far less memory.
-        parted = jax.tree.map(lambda x: deal(x)[0], xs)
-        return lax.scan(lambda total, xs: (added(total, part(xs, width, shared)), None), total, parted)[0]
     xs = jax.tree.map(deal, xs)
     if total is None:
         results = _dealt(on_one_device, used, xs, shared)
-        return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:parts], results)
+        return jax.tree.map(lambda x: x.swapaxes(0, 1).reshape(-1, *x.shape[2:])[:parts], results)
 
-    def share_of_sum(x):
-        """Of (rounds, ...) here and on the others the sums of a share of the numbers: each device adds up its own."""
-        x = x.reshape(rounds, -1)
-        share = -(-x.shape[1] // len(used))
-        x = jnp.pad(x, [(0, 0), (0, share * len(used) - x.shape[1])]).reshape(rounds, len(used), share)
-        x = lax.all_to_all(x.swapaxes(0, 1), "device", 0, 0).reshape(-1, share)[:parts]
-        return reduce(jnp.add, list(x), jnp.zeros_like(x[0]))
+    def shares(x):
+        """Of the parts of one round, in their order, the share of the numbers that this device adds up."""
+        share = -(-x.size // len(used))
+        x = jnp.pad(x.ravel(), (0, share * len(used) - x.size)).reshape(len(used), share)
+        return x if len(used) == 1 else lax.all_to_all(x, "device", 0, 0)
 
-    sums = _dealt(lambda *args: jax.tree.map(share_of_sum, on_one_device(*args)), used, xs, shared)
+    def share_of_sum(xs, *shared):
+        """Parts that are not kept till all are done need far less memory."""
+
+        def step(totals, xs):
+            found = jax.tree.map(shares, part(xs, width, shared))
+            return jax.tree.map(lambda total, new: reduce(jnp.add, list(new), total), totals, found), None
+
+        zeros = jax.tree.map(lambda x: jnp.zeros((-(-x.size // len(used)),), x.dtype), total)
+        return lax.scan(step, zeros, xs)[0]
+
+    sums = _dealt(share_of_sum, used, xs, shared)
     return jax.tree.map(lambda zero, x: x.reshape(-1)[: zero.size].reshape(zero.shape), total, sums)
 
 
