@@ -32,9 +32,8 @@ MOST_SAMPLES, RAISED = 4, 2
 # What noise of J pretends to know is found with so many signs drawn for each pixel, and is to be small for all but this
 # part of the texels that are known.
 SIGNS, LEFT_OUT = 16, 0.05
-# How often a step solves its equations, at most, to find which values stay at a bound. So many rounds in a row may be
-# in vain, as no fewer values are wrongly at a bound or beyond one; then they change sides one by one.
-ROUNDS, PATIENCE = 50, 3
+# How often a step solves its equations, at most, to find which values stay at a bound: some 50 rounds are usual.
+ROUNDS = 500
 
 
 def is_dense(problem: Problem) -> bool:
@@ -43,6 +42,51 @@ def is_dense(problem: Problem) -> bool:
     if count > MOST_NUMBERS or pixels * (count // 3) ** 2 > MOST_PRODUCTS:
         return False
     return all(has_rows(views.scene, views.wanted.values()) for views in problem.groups)
+
+
+def least_within(
+    A: np.ndarray, gradient: np.ndarray, x: np.ndarray, low: np.ndarray, high: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Where a quadratic is least within bounds, and which values are at none of them: (n,), (n,) bool.
+
+    By an active set (Nocedal and Wright 2006, Numerical Optimization, 16.5). Values at a bound are held there; the
+    others go to where the quadratic is least, or as far on the way as bounds allow, and those that meet one are held.
+    When none does, those are let go that the quadratic draws inwards. It becomes less in each round: pivoting without
+    that guarantee goes round in circles where values are strongly correlated.
+
+    Args:
+        A: (n, n) symmetric, positive definite.
+        gradient: (n,) at x.
+        x: (n,) within the bounds.
+    """
+    start, slope = x, gradient
+    held = (x <= low) & (slope > 0) | (x >= high) & (slope < 0)
+
+    def change(to):
+        step = to - start
+        return step @ (gradient + A @ step / 2)
+
+    for _ in range(ROUNDS):
+        free = np.flatnonzero(~held)
+        step = np.zeros(len(x))
+        step[free] = -linalg.solve(A[np.ix_(free, free)], slope[free], assume_a="pos")
+        bound = np.where(step < 0, low, high)
+        beyond = (x + step < low) | (x + step > high)
+        if beyond.any():
+            part = np.where(beyond, (bound - x) / np.where(beyond, step, 1), np.inf)
+            first = np.where(part <= part.min(), bound, np.clip(x + part.min() * step, low, high))
+            # To cut off what is beyond may be better, and holds more values at once.
+            x = min(first, np.clip(x + step, low, high), key=change)
+            held |= (x == bound) & (step != 0)
+        else:
+            x = x + step
+        slope = gradient + A @ (x - start)
+        if not beyond.any():
+            wrong = held & np.where(x <= low, slope < 0, slope > 0)
+            if not wrong.any():
+                break
+            held &= ~wrong
+    return x, ~held
 
 
 class Equations(NamedTuple):
@@ -71,28 +115,15 @@ class Dense(Search):
     def bounded(self, gradient: np.ndarray, damping: np.ndarray) -> np.ndarray:
         """Where the quadratic of this gradient and of `times` is least within the bounds.
 
-        A step that is merely clipped leaves neighbours where they made up for what was cut off. Which values stay at
-        a bound is found by block principal pivoting (Judice and Pires 1994, Computers & Operations Research 21(5)): all
-        that are wrongly there or beyond change sides, or the last one alone, while they become no fewer.
+        A step that is merely clipped leaves neighbours where they made up for what was cut off.
         """
-        values, low, high = self.values, self.low, self.high
-        at_low, at_high = (values <= low) & (gradient > 0), (values >= high) & (gradient < 0)
-        fewest, in_vain = len(values) + 1, 0
-        for _ in range(ROUNDS):
-            self.free = free = ~(at_low | at_high)
-            bound = np.where(at_low, low - values, np.where(at_high, high - values, 0))
-            step = bound + self.solve(-gradient - self.times(bound) - damping * bound, damping)
-            slope = gradient + self.times(step) + damping * step
-            below, above = free & (values + step < low), free & (values + step > high)
-            wrong = below | above | at_low & (slope < 0) | at_high & (slope > 0)
-            count = int(wrong.sum())
-            if not count:
-                break
-            fewest, in_vain = (count, 0) if count < fewest else (fewest, in_vain + 1)
-            if in_vain > PATIENCE:
-                wrong = np.arange(len(values)) == np.flatnonzero(wrong)[-1]
-            at_low, at_high = np.where(wrong, (below, above), (at_low, at_high))
-        return np.clip(values + step, low, high)
+        values = self.values.reshape(-1, 3).copy()
+        self.free = np.ones(values.shape, bool)
+        by_value = (x.reshape(-1, 3) for x in (gradient, damping, self.low, self.high))
+        for c, (g, d, low, high) in enumerate(zip(*(x.T for x in by_value), strict=True)):
+            A = self.equations.matrix[c] + self.prior_matrix + np.diag(d)
+            values[:, c], self.free[:, c] = least_within(A, g, values[:, c], low, high)
+        return values.ravel()
 
     def solved(self, variance: np.ndarray | None = None) -> Equations:
         """Find the equations and their inverse; for errors (variance: of `sums`) with as many samples of J as it takes.

@@ -76,7 +76,7 @@ class Search:
         self.standard_errors = np.full(len(self.values), np.nan)
         self.halves: weights.Halves = []  # of all pixels, when they were surveyed last
         self.noise: weights.Noise | None = None
-        self.accepted: tuple[np.ndarray, float, float] | None = None  # values, what their image misses, its error
+        self.accepted: tuple[np.ndarray, np.ndarray] | None = None  # values, (N, 3) what their image misses, squared
         self.damping = 0.0
         self.sharp = PRODUCT_SPP  # samples that J needs, as far as known
         self.history: list[dict] = []
@@ -185,13 +185,15 @@ class Search:
         self.samples = samples
         target_part = self.render_part if self.target_part is None else self.target_part
         self.weights = usable / (variance * (self.render_part + target_part) + rounding)
-        missed = (usable * self.trust * a * b / variance).sum(-1)
-        mean, error = missed.mean(), missed.std() / np.sqrt(len(missed))
-        if self.accepted is not None and mean - self.accepted[1] > GROWN * np.hypot(error, self.accepted[2]):
+        # In the same units, though more samples may be spread more evenly, so that the noise of one is another.
+        pairs = a * b, self.accepted[1] if self.accepted else a * b
+        here, before = ((usable * self.trust * missed / variance).sum(-1) for missed in pairs)
+        error = np.sqrt((here.var() + before.var()) / len(here))
+        if here.mean() - before.mean() > GROWN * error:
             self.values, self.damping = self.accepted[0], max(10 * self.damping, DAMPING)
             a, b = self.render(samples)
         else:
-            self.accepted, self.damping = (self.values, mean, error), self.damping / 10
+            self.accepted, self.damping = (self.values, a * b), self.damping / 10
         self.residual = (a + b) / 2
         self.missed = float((usable * self.trust * a * b / variance).sum())
         self.loss = float((self.weights * self.trust * a * b).sum() / 2)
