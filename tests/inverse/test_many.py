@@ -1,5 +1,7 @@
 """Textures from images: recovery within stated errors, texels that no pixel sees, what is supposed, bad input."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import optimistix as optx
 import pytest
@@ -7,6 +9,7 @@ import pytest
 import pathjax as pj
 from pathjax.images import write_exr
 from pathjax.inverse import dense
+from pathjax.inverse.many import Search
 from pathjax.inverse.parameter_vector import ParameterVector
 from pathjax.inverse.prior import KINDS, Prior
 from pathjax.kinds.parameter import Parameter
@@ -128,6 +131,20 @@ def test_what_memory_has_no_room_for_is_refused(wall, target, monkeypatch):
 def test_smoothness_without_a_texture_is_refused(wall, target):
     with pytest.raises(pj.InputError, match="no.* is fitted"):
         pj.fit(wall, target, ["lamp.radiance"], smoothness=0.1)
+
+
+@pytest.mark.parametrize("misfit", [0.9, 1.1])
+def test_a_step_is_taken_back_if_it_misses_more_and_not_if_noise_turns_out_smaller(misfit):
+    search, shape, noise = object.__new__(Search), (8, 8, 3), 0.01 * np.random.default_rng(9).normal(size=(2, 64, 3))
+    search.problem = SimpleNamespace(targets=[SimpleNamespace(step=0.0, image=np.zeros(shape))])
+    search.products = SimpleNamespace(kept=lambda views: views[0].reshape(-1, 3))
+    search.usable, search.trust, search.accepted, search.damping = [np.ones(shape)], np.ones((64, 1)), None, 0.0
+    search.target_part, search.render_part = None, 1 / 8
+    for number, (missed, variance) in enumerate(((1.0, 4.0), (misfit, 0.01))):
+        search.values = np.array([float(number)])
+        search.render, search.variance = lambda _, m=missed: m + noise, lambda v=variance: [np.full(shape, v)]
+        search.look(8)
+    assert search.values == (misfit < 1) and (search.damping > 0) == (misfit > 1)
 
 
 # ---- the prior ------------------------------------------------------------------------------------------------------
