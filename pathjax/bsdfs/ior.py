@@ -2,7 +2,7 @@
 
 import numpy as np
 
-# The least one: derivatives hold fourth powers of the ratio of two, and of this the square of one is a number in float32.
+# The least one. Derivatives hold fourth powers of the ratio of two, which are numbers of float32 then.
 LEAST_IOR = float(np.finfo(np.float32).tiny) ** (1 / 8)
 
 IOR = {
