@@ -31,11 +31,11 @@ def search(
 ) -> tuple[Int[Array, ""], Float[Array, ""]]:
     """The last i < count with cdf[first + i] <= u, and where u lies between that and the next, in [0, 1).
 
-    most: that count may be, where that is not known.
+    most: that count may be, where it is traced.
     """
-    halvings = max((count if most is None else most) - 1, 0).bit_length()
+    halvings = max((int(count) if most is None else most) - 1, 0).bit_length()
 
-    def halve(k, i):
+    def halve(k: Int[Array, ""], i: Int[Array, ""]) -> Int[Array, ""]:
         further = i + jnp.left_shift(jnp.int32(1), halvings - 1 - k)
         return jnp.where((further < count) & (at(cdf, first + jnp.minimum(further, count)) <= u), further, i)
 
