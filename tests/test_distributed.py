@@ -130,6 +130,7 @@ from pathjax.inverse import normal as module
 scene = pj.load_scene("scenes/cornell_box.xml", res=12)
 names = ["white.reflectance", "light.radiance"]
 image, J = pj.jacobian(scene, names, spp=4, seed=1)
+many = dict(pj.jacobian(scene, [*names, "red.reflectance", "green.reflectance"], spp=4, seed=1)[1].derivatives)
 normal = pj.normal_equations(scene, names, 1.1 * np.asarray(image), spp=4)
 module.ITEMS_OF_A_PART, module.LEAST_PARTS, usual = 36, 4, (module.ITEMS_OF_A_PART, module.LEAST_PARTS)
 module._compiled.clear_cache()
@@ -145,7 +146,7 @@ name = next(n for n, x in pj.parameters(textured).items() if np.ndim(x) == 3)
 texels = pj.parameters(textured)[name]
 seen, pull = jax.vjp(lambda x: pj.render(pj.with_parameters(textured, {name: x}), 4, 1), texels)
 everything = {
-    "image": pj.render(scene, 4, 1), "jacobian": (image, J.derivatives), "J^T v of texels": pull(seen),
+    "image": pj.render(scene, 4, 1), "jacobian": (image, J.derivatives, many), "J^T v of texels": pull(seen),
     "in jit": jax.jit(jax.grad(loss))({name: pj.parameters(scene)[name] for name in names}),
     "normal": (normal.matrix, normal.gradient, normal.loss, normal.scatter, normal.residuals),
     "dealt normal": (dealt.matrix, dealt.gradient, dealt.loss, dealt.scatter, dealt.residuals),
