@@ -123,7 +123,7 @@ class _PixelMeans:
         self.options.check_differentiable()
         how = dict(self.how, ring=self.ring)
         image, derivatives, *_ = pixel_jacobians(scene, wanted, pixels, *numbers, self.options, **how)
-        return jax.tree.map(self._shaped, (image, derivatives))
+        return self._shaped(image), {name: self._shaped(derivatives[name]) for name in wanted}
 
     def matrix_free(self, scene, wanted):
         # Many colours, and textures always.
