@@ -19,7 +19,7 @@ from scipy import linalg
 
 from pathjax import distributed
 from pathjax.derivatives.jacobian import has_rows
-from pathjax.inverse.many import BATCHES, PRETENDED, PRODUCT_SPP, Search, whole
+from pathjax.inverse.many import BATCHES, CHECK_PART, PRETENDED, PRODUCT_SPP, Search, whole
 from pathjax.inverse.problem import Problem
 from pathjax.inverse.uncertainty import MAX_RELATIVE_ERROR
 
@@ -211,11 +211,10 @@ class Dense(Search):
 
     def check(self) -> float:
         """Look at where the last step led. Returns the variance of target and image, over that of one sample."""
-        equations = self.weights, self.render_part, self.samples, self.variances, self.renders, self.each
-        # With as many samples as J has, for half its cost: noise of so many would hide that of the target.
-        self.excess = self.look(whole(self.product_spp))
-        # Of more or fewer samples the noise is another, as they are spread otherwise: it is that of the renders before.
-        self.weights, self.render_part, self.samples, self.variances, self.renders, self.each = equations
+        equations = self.weights, self.render_part, self.samples, self.variances, self.renders
+        self.excess = self.look(whole(self.spp / CHECK_PART))
+        # Of few samples the noise is another, as they are spread less evenly: it is that of the renders before.
+        self.weights, self.render_part, self.samples, self.variances, self.renders = equations
         # As many values as the pixels determine are fitted to the noise of target and image: with H what that makes of
         # pixels, these miss (1 - H) times the noise of the target, and H times that of the image that was stepped from.
         used = (self.weights > 0) * self.trust
