@@ -197,6 +197,24 @@ def test_a_jacobian_in_many_colours_is_that_by_tangents(make_scene, monkeypatch)
         np.testing.assert_allclose(one, other, rtol=3e-6, atol=3e-6 * np.abs(other).max())
 
 
+def test_an_image_pulled_back_to_a_few_colours(make_scene):
+    """Too many for tangents, and few enough for a Jacobian, within a user's own jit."""
+    inside, res = patches(jacobian.MOST_TANGENTS, 8)
+    scene = limited(make_scene(inside, res=res, origin="0, 0, 2", fov=30), 3, 2)
+    values = {name: jnp.asarray(value) for name, value in pj.parameters(scene).items()}
+    assert jacobian.MOST_TANGENTS < len(values) <= backward.FEW
+    v = jnp.asarray(np.random.default_rng(1).normal(size=(res, res, 3)), jnp.float32)
+
+    @jax.jit
+    def pulled(values):
+        return jax.vjp(lambda x: pj.render(pj.with_parameters(scene, x), SPP, 3), values)[1](v)[0]
+
+    J = pj.jacobian(scene, list(values), SPP, 3)[1]
+    for name, found in pulled(values).items():
+        terms = J[name] * v[..., None]
+        np.testing.assert_allclose(found, terms.sum((0, 1, 2)), atol=ROUNDING * np.abs(terms).sum((0, 1, 2)).max())
+
+
 @pytest.mark.parametrize("near", [0, 1 << 30])
 def test_lanes_add_to_a_list_that_is_far_as_to_one_that_is_near(monkeypatch, near):
     """Several lanes to the same places, some nothing; the list may hold what is not finite."""
