@@ -36,6 +36,8 @@ class IndexOfRefraction(Number):
                 use = f"use a number or one of {', '.join(IOR)}{nearest(value, IOR)}"
                 raise fields.error(name, f'cannot be "{value[:40]}"; {use}')
             value = IOR[value.lower()]
+        if value < LEAST_IOR:
+            raise fields.error(name, f"must be at least {LEAST_IOR:g}, is {value:g}")
         return value
 
 

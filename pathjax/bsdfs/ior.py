@@ -2,8 +2,8 @@
 
 import numpy as np
 
-# The least one. Derivatives hold fourth powers of the ratio of two, which are numbers of float32 then.
-LEAST_IOR = float(np.finfo(np.float32).tiny) ** (1 / 8)
+# The least one. Derivatives hold eighth powers of the ratio of two, which are numbers of float32 then.
+LEAST_IOR = float(np.finfo(np.float32).tiny) ** (1 / 16)
 
 IOR = {
     "vacuum": 1.0,

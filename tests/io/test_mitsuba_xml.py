@@ -402,6 +402,7 @@ def test_conductor_is_an_ideal_mirror_unless_told_otherwise(read):
         ("diffuse", "<colour/>", "<colour> is not supported inside"),
         ("dielectric", '<float name="int_ior" value="0"/>', "must be above 0, is 0"),
         ("dielectric", '<float name="ext_ior" value="-1"/>', "must be above 0, is -1"),
+        ("dielectric", '<float name="int_ior" value="1e-3"/>', "must be at least 0.0042598, is 0.001"),
         ("dielectric", '<string name="int_ior" value="1.5"/>', "use a number or one of vacuum"),
         ("dielectric", '<string name="int_ior" value="diamonds"/>', 'did you mean "diamond"?'),
         ("dielectric", '<rgb name="specular_transmittance" value="1.1"/>', "between 0 and 1"),
