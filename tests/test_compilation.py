@@ -16,7 +16,7 @@ from pathjax.compile import native
 from pathjax.compile.lanes import lanes
 from pathjax.compile.lanes.interpreter import Interpreter
 from pathjax.compile.lanes.scheduling import from_queue
-from pathjax.derivatives import backward, ior_step, jacobian, tangents
+from pathjax.derivatives import backward, ior_step, jacobian, tangents, totals
 from pathjax.integrators import pixel
 from pathjax.integrators.options import DEFAULTS, Options
 from pathjax.rendering import aovs, bounces, query
@@ -152,11 +152,11 @@ def test_image_and_derivatives_are_one_native_kernel_and_finite(jacobian_kernel_
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("few", "near"), [(backward.FEW, backward.NEAR), (0, backward.NEAR), (0, 0)])
+@pytest.mark.parametrize(("few", "near"), [(totals.FEW, totals.NEAR), (0, totals.NEAR), (0, 0)])
 def test_a_sweep_is_native(monkeypatch, shipped, few, near):
     """The paths of a part, and its last sweep, of few entries, of lists in near caches and of larger ones."""
-    monkeypatch.setattr(backward, "FEW", few)
-    monkeypatch.setattr(backward, "NEAR", near)
+    monkeypatch.setattr(totals, "FEW", few)
+    monkeypatch.setattr(totals, "NEAR", near)
     backward.pullback.clear_cache()
     scene = shipped("cornell_box", res=16)
     pixels = jnp.arange(pixel_count(scene.film), dtype=jnp.int32)

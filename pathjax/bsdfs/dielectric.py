@@ -30,14 +30,12 @@ class IndexOfRefraction(Number):
     bounds: tuple[float, float] = (LEAST_IOR, math.inf)
 
     def read(self, loader, fields, name, owner):
-        value = fields.float_or_name(name, self.default)
+        value = fields.float_or_name(name, self.default, at_least=self.bounds[0])
         if isinstance(value, str):
             if value.lower() not in IOR:
                 use = f"use a number or one of {', '.join(IOR)}{nearest(value, IOR)}"
                 raise fields.error(name, f'cannot be "{value[:40]}"; {use}')
             value = IOR[value.lower()]
-        if value < LEAST_IOR:
-            raise fields.error(name, f"must be at least {LEAST_IOR:g}, is {value:g}")
         return value
 
 

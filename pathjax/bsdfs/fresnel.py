@@ -17,7 +17,8 @@ def dielectric(cos_i: Float[Array, ""], eta: Float[Array, ""]) -> tuple[Float[Ar
         eta: > 0, IOR of the far side over that of the near side.
     Returns:
         R, in [0, 1]; cos_t >= 0, 0 under total internal reflection, where R = 1.
-    Derivatives are finite everywhere: at and beyond the critical angle they are those of the constant 1.
+    Derivatives are finite, in float32 for eta up to 1e5: at and beyond the critical angle they are those of the
+    constant 1.
     """
     contrast, refracts, cos_t = _refraction(cos_i, eta)
     s, p = cos_i + eta * cos_t, eta * cos_i + cos_t

@@ -3,7 +3,7 @@
 A path's derivative has entries at the parameters of the vertices that it meets, and nowhere else. So each vertex is
 recorded as it is met (`record`, which has the equations), and when the path has ended its vertices are gone through
 again, the last one first. Times the adjoint of the pixel these are added to a list of derivatives, at the entries that
-the vertex looked up (`places`): one list for all pixels, or, without an adjoint, one for each.
+the vertex looked up (`places`, `totals`): one list for all pixels, or, without an adjoint, one for each.
 
 All lanes record at once, in one row of a ring of buffers, and are swept at once, every WINDOW trips: back from the last
 end of a path that they have recorded to the first vertex of a path that was swept before.
@@ -11,7 +11,7 @@ end of a path that they have recorded to the first vertex of a path that was swe
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
@@ -26,9 +26,10 @@ from pathjax import bsdfs, emitters
 from pathjax.compile import Rows, compute_once, is_traced, native_fold, native_rows, persistent_loop, together
 from pathjax.compile.lanes import flags
 from pathjax.core import sampler
-from pathjax.core.math import LUMINANCE, at
-from pathjax.derivatives import differentiated
-from pathjax.derivatives.record import Record, Slot, extend
+from pathjax.core.math import LUMINANCE
+from pathjax.derivatives import differentiated, totals
+from pathjax.derivatives.record import Record, extend
+from pathjax.derivatives.totals import Total
 from pathjax.emitters import Choice
 from pathjax.errors import InputError
 from pathjax.integrators import path, pixel
@@ -42,15 +43,6 @@ from pathjax.scene.scene import Scene
 WINDOW, RING, MOST_RING = 32, 1024, 1 << 14
 # Of paths that roulette may end, so many vertices later one in 1e20 is left.
 ROULETTE = 900
-# Entries of a list that every lane sums up by itself.
-FEW = 8
-# Bytes of a list that stay in near caches.
-NEAR = 1 << 19
-# Numbers of an entry of a list: three, and one more, so that they are added at once, and lie on one line of a cache.
-WIDTH = 4
-# Lanes that add to a list in one trip of a loop, which takes as long as some of them.
-AT_ONCE = 4
-
 # Bits of what a lane records.
 BEGINS, ENDS, HOLDS = 1, 2, 4
 
@@ -66,8 +58,7 @@ def columns_of(record: Record) -> list:
 
 
 class Memory(NamedTuple):
-    # Of few entries, a column for each number of theirs; or the list, of which whole vectors are added up.
-    total: list[Float[Array, " W"]] | Float[Array, "entries 4"]
+    total: Total
     clock: Int[Array, ""]  # trips
     swept: Int[Array, ""]  # trips before the last sweep
     lost: Int[Array, ""]  # 1: a path was longer than the ring
@@ -83,7 +74,7 @@ class Sweep(NamedTuple):
     complete: Int[Array, " W"]  # 1: has met the end of a path, so that it knows what arrives
     stopped: Int[Array, " W"]  # 1: all that is older has been swept before
     R: list[Float[Array, " W"]]
-    total: list[Float[Array, " W"]] | Float[Array, "entries 4"]
+    total: Total
 
 
 def start(scene: Scene, record: Record, entries: int, ring: int, lanes: int) -> Memory:
@@ -100,9 +91,7 @@ def start(scene: Scene, record: Record, entries: int, ring: int, lanes: int) -> 
             f"max_depth and rr_depth let paths have more than {MOST_RING - WINDOW} vertices, too many to be recorded "
             "for derivatives in many numbers; set a smaller max_depth or rr_depth"
         )
-    dtype = scene.camera.origin.dtype
-    few = entries <= FEW
-    total = [jnp.zeros((lanes,), dtype)] * (3 * entries) if few else jnp.zeros((entries, WIDTH), dtype)
+    total = totals.start(entries, lanes, scene.camera.origin.dtype)
     # No trip is read that was not written. On CPUs it is filled with zeros all the same, so it had better be short.
     buffers = [lax.empty((ring, lanes), x.dtype) for x in jax.eval_shape(columns_of, record)]
     zero = jnp.int32(0)
@@ -176,7 +165,7 @@ def sweep(structure: Record, memory: Memory, due: Bool[Array, ""]) -> Memory:
                 change = [a + b * x for a, b, x in zip(slot.now, slot.later, R, strict=True)]
             if slot.is_number:
                 change = [sum(change) * share for share in LUMINANCE]
-            total = add(total, slot, [jnp.where(here, x, 0) for x in change])
+            total = totals.add(total, slot, [jnp.where(here, x, 0) for x in change])
         R = [n + w * x for n, w, x in zip(record.gathered, record.weight, R, strict=True)]
         back = state.back + 1
         stopped = (state.stopped != 0) | ((back >= window) & (begins | ~complete))
@@ -200,66 +189,6 @@ def unflattened(structure: Record, numbers: list) -> Record:
         return [next(following) for _ in range(leaf.size)] if leaf.shape else next(following)
 
     return jax.tree.map(taken, structure._replace(begins=None, ends=None))
-
-
-def add(total, slot: Slot, change: list[Float[Array, " W"]]):
-    """The total to which each lane's change (3) is added."""
-    if isinstance(total, list):
-        for place, share in zip(slot.places, slot.shares or [None], strict=True):
-            total = [t + jnp.where(place == k // 3, _part(change, share)[k % 3], 0) for k, t in enumerate(total)]
-        return total
-
-    places, first = slot.places, 0
-    if total.size * total.dtype.itemsize > NEAR:
-        some = (change[0] != 0) | (change[1] != 0) | (change[2] != 0)
-        places = [jnp.where(some, place, 0) for place in places]
-        first = _read_ahead(total, places)
-
-    # XLA's own scatter would break the native kernel; a lane that adds nothing adds 0.
-    def one(lane, total):
-        of_lane = partial(jax.tree.map, lambda column: at(column, lane))
-        x = _as_entry(of_lane(change))
-        for place, share in of_lane(list(zip(places, slot.shares or [None], strict=True))):
-            where = place.astype(jnp.uint32), jnp.uint32(0)
-            more = x if share is None else x * (_as_entry(share) if isinstance(share, list) else share)
-            new = lax.dynamic_slice(total, where, more.shape, allow_negative_indices=False) + more
-            total = lax.dynamic_update_slice(total, new, where, allow_negative_indices=False)
-        return total
-
-    count = AT_ONCE if len(change[0]) % AT_ONCE == 0 else 1
-
-    def some(trip, total):
-        for k in range(count):
-            total = one(trip * count + k, total)
-        return total
-
-    return lax.fori_loop(first, len(change[0]) // count, some, total)
-
-
-def _as_entry(numbers: list[Float[Array, ""]]) -> Float[Array, "1 4"]:
-    """Three numbers as the list has them. Stacked, they would be laid side by side by branches, one after another."""
-    k = jnp.arange(WIDTH)
-    x = jnp.zeros_like(numbers[0])
-    for channel, number in enumerate(numbers):
-        x = jnp.where(k == channel, number, x)
-    return x[None]
-
-
-def _read_ahead(total: Float[Array, "entries 4"], places: Sequence[Int[Array, " W"]]) -> Int[Array, ""]:
-    """0, when all places have been read, and so are in a near cache.
-
-    Processors read far memory many places at a time, but add to few: each add holds the ones behind it up. The result
-    depends on what was read, so that no compiler leaves the reading out.
-    """
-    read = sum(total.at[place.astype(jnp.uint32), 0].get(mode="promise_in_bounds") * 0 for place in places)
-    return jnp.where(jnp.sum(read) > 0, 1, 0)
-
-
-def _part(change, share):
-    """Three numbers times their share, which is one for all, or one of each; None: all of them."""
-    if share is None:
-        return change
-    return [s * x for s, x in zip(share if isinstance(share, list) else [share] * 3, change, strict=True)]
 
 
 def all_set(of_lanes: Bool[Array, " W"]) -> Bool[Array, ""]:
@@ -314,9 +243,7 @@ def pixel_sweep(
 
 def finish(structure: Record, memory: Memory) -> Float[Array, "entries 4"]:
     memory = sweep(structure, memory, jnp.bool_(True))
-    total = memory.total
-    if isinstance(total, list):
-        total = jnp.pad(jnp.stack([jnp.sum(x) for x in total]).reshape(-1, 3), [(0, 0), (0, WIDTH - 3)])
+    total = totals.finish(memory.total)
     # A loop of no trip, where a choice would copy what may be most of the memory.
     return lax.fori_loop(0, memory.lost, lambda _, total: jnp.full_like(total, jnp.nan), total)
 
@@ -368,7 +295,6 @@ def pullback(
         adjoint, work = work
         return sweep_of(work, scene, choice, adjoint, lambda place: place, memory)[1]
 
-
     def end(memory):
         # The sums of parts are those of three numbers.
         return finish(structure, memory)[:, :3]
@@ -396,8 +322,7 @@ def rows(
     scene, choice, structure, entries, sweep_of = _kernel(scene, paths, options)
 
     def of_pixel(work, number, scene, choice, memory):
-        size = len(memory.total) // 3 if isinstance(memory.total, list) else len(memory.total)
-        pixels = size // entries
+        pixels = totals.count(memory.total) // entries
         ones = jnp.ones_like(scene.camera.origin)
         return sweep_of(work, scene, choice, ones, lambda place: pixels * place + number, memory)
 
@@ -405,7 +330,7 @@ def rows(
         return start(scene, structure, pixels * entries, ring, lanes)
 
     def end(memory):
-        return finish(structure, memory).reshape(entries, -1, WIDTH)
+        return finish(structure, memory).reshape(entries, -1, totals.WIDTH)
 
     work = pixels, first_sample, spp, seed
     return native_rows(of_pixel, work, scene, choice, start=begin, finish=end, form=form, devices=devices)

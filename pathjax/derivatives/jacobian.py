@@ -23,7 +23,7 @@ from pathjax import emitters
 from pathjax.bsdfs import dielectric
 from pathjax.compile import is_symbolic_zero, is_traced, native, on_all_devices, register_dataclass, usual_promotion
 from pathjax.core.types import Number
-from pathjax.derivatives import backward, differentiated, ior, ior_difference, ior_step, rules, tangents
+from pathjax.derivatives import backward, differentiated, ior, ior_difference, ior_step, rules, tangents, totals
 from pathjax.derivatives.color_slopes import ColorSlopes
 from pathjax.errors import InputError
 from pathjax.integrators import pixel
@@ -256,7 +256,7 @@ def _swept_jvp(wanted, options, ring, how, primals, changes):
     _, (moves, by_color) = jax.jvp(of, ([leaves[k] for k in moved],), ([changes[k] for k in moved],))
     number_of = {row: k for k, (_, row) in enumerate(slopes.places)}
     rows = jnp.stack([by_color[:, number_of[row]] for row in range(len(number_of))])
-    rows = jnp.pad(rows, [(0, 0), (0, 0), (0, backward.WIDTH - 3)])
+    rows = jnp.pad(rows, [(0, 0), (0, 0), (0, totals.WIDTH - 3)])
     return (image, slopes), (moves, replace(slopes, rows=slopes.rows.like(rows)))
 
 

@@ -114,11 +114,11 @@ class Fields:
             raise self.error(name, f'cannot be "{text[:40]}"; use {" or ".join(choices)}{nearest(text, choices)}')
         return text.lower()
 
-    def float_or_name(self, name: str, default: str | float):
+    def float_or_name(self, name: str, default: str | float, *, at_least: float):
         """A number, or the text of a <string>."""
         if self.has(name) and self._values[name].tag == "string":
             return self.string(name)
-        return self.float(name, default, above=0)
+        return self.float(name, default, at_least=at_least)
 
     def point(self, name: str, default=REQUIRED):
         """(3,) float64, written as x, y, z attributes or as value="x, y, z"."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -13,7 +12,7 @@ from pathjax.compile import register_dataclass
 from pathjax.core.types import Ray
 from pathjax.core.warp import square_to_disk
 from pathjax.description.fields import Fields
-from pathjax.kinds import Direction, Unused
+from pathjax.kinds import Direction
 from pathjax.sensors.film import HDRFilm
 from pathjax.sensors.radiancemeter import OneRay
 from pathjax.sensors.sensor import Sensor
@@ -45,7 +44,6 @@ class Distant(Sensor):
     radius: float
 
     one_pixel: ClassVar[bool] = True
-    unused: ClassVar[Mapping[str, Unused]] = Sensor.unused
 
     @classmethod
     def read(cls, loader, fields: Fields) -> Distant:

@@ -10,7 +10,7 @@ import pytest
 
 import pathjax as pj
 from pathjax.compile import mapping
-from pathjax.derivatives import backward, jacobian, matrix_free, record
+from pathjax.derivatives import backward, jacobian, matrix_free, record, totals
 from pathjax.errors import InputError
 from pathjax.images import write_exr
 from pathjax.integrators.options import Options
@@ -202,7 +202,7 @@ def test_an_image_pulled_back_to_a_few_colours(make_scene):
     inside, res = patches(jacobian.MOST_TANGENTS, 8)
     scene = limited(make_scene(inside, res=res, origin="0, 0, 2", fov=30), 3, 2)
     values = {name: jnp.asarray(value) for name, value in pj.parameters(scene).items()}
-    assert jacobian.MOST_TANGENTS < len(values) <= backward.FEW
+    assert jacobian.MOST_TANGENTS < len(values) <= totals.FEW
     v = jnp.asarray(np.random.default_rng(1).normal(size=(res, res, 3)), jnp.float32)
 
     @jax.jit
@@ -218,18 +218,18 @@ def test_an_image_pulled_back_to_a_few_colours(make_scene):
 @pytest.mark.parametrize("near", [0, 1 << 30])
 def test_lanes_add_to_a_list_that_is_far_as_to_one_that_is_near(monkeypatch, near):
     """Several lanes to the same places, some nothing; the list may hold what is not finite."""
-    monkeypatch.setattr(backward, "NEAR", near)
+    monkeypatch.setattr(totals, "NEAR", near)
     random = np.random.default_rng(4)
     places = random.integers(0, 50, (4, 64)).astype(np.int32)
     shares, change = (random.random((n, 64)).astype(np.float32) for n in (4, 3))
     change[:, ::3] = 0
-    total = np.zeros((60, backward.WIDTH), np.float32)
+    total = np.zeros((60, totals.WIDTH), np.float32)
     total[55, :3] = np.nan, np.inf, -np.inf
     expected = total.copy()
     for place, share in zip(places, shares, strict=True):
         np.add.at(expected[:, :3], place, (share * change).T)
     slot = record.Slot(tuple(jnp.asarray(places)), tuple(jnp.asarray(shares)), None, None)
-    found = jax.jit(lambda *args: backward.add(*args))(jnp.asarray(total), slot, list(jnp.asarray(change)))
+    found = jax.jit(lambda *args: totals.add(*args))(jnp.asarray(total), slot, list(jnp.asarray(change)))
     np.testing.assert_allclose(found, expected, rtol=1e-5)  # sums in another order
 
 
