@@ -35,7 +35,8 @@ class HG(Phase):
         side = jnp.where(p.g < 0, -1, 1).astype(wo.dtype)
         size = side * p.g
         squared = (1 - size) * (1 - size) + 2 * size * larger(1 + side * wo[2], 0)
-        return (1 - size) * (1 + size) / ((4 * math.pi) * squared * jnp.sqrt(squared))
+        # In two quotients: derivatives divide by squares of denominators, and that of the whole is 0 where g is near 1.
+        return (1 - size) / squared * ((1 + size) / ((4 * math.pi) * jnp.sqrt(squared)))
 
     @staticmethod
     def sample(p: Row, u: Float[Array, "2"]) -> Float[Array, "3"]:
