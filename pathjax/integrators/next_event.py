@@ -13,7 +13,7 @@ from pathjax.core.types import EmitterSample
 from pathjax.emitters import Choice
 from pathjax.integrators.options import Options
 from pathjax.integrators.random_numbers import Bounce
-from pathjax.integrators.shadow import Dimmed, Passed, none_dimmed, none_passed, transmitted
+from pathjax.integrators.shadow import Arrival, none_dimmed, none_passed, transmitted
 from pathjax.integrators.vertex import Vertex, evaluate, is_smooth, leaving
 from pathjax.scene.scene import Scene
 from pathjax.shapes import geometry
@@ -51,7 +51,7 @@ def light_sample(
     options: Options,
     medium: Int[Array, ""] | None = None,
     drawn: EmitterSample | None = None,
-) -> tuple[Float[Array, "3"], Int[Array, ""] | None, Passed | None, Dimmed | None]:
+) -> Arrival:
     """One sample of what a vertex reflects of direct light: the integral over all lights of f Le |cos theta| V.
 
     Args:
@@ -60,9 +60,6 @@ def light_sample(
         depth: vertices so far.
         medium: in which the path came; None in scenes without media.
         drawn: of `draw_or_meet`, where that is known.
-    Returns:
-        The sample, how many vertices its light passed straight, None where there are no such, one of these, and a
-        point of its way.
     """
     materials = scene.materials
     smooth = is_smooth(scene, vertex)
@@ -81,14 +78,14 @@ def light_sample(
         shadow_ray = spawn_ray(vertex.surface, drawn.d, vertex.hit.primitive)._replace(t_max=reach)
         if passes or medium is not None:
             most, start = scene.max_depth - 1 - depth, leaving(scene, vertex, medium, drawn.d)
-            found = transmitted(scene, shadow_ray, drawn.primitive, most, options.derivative, start, u.along)
-            share, passed, nudged, dimmed = found
-            return jnp.where(useful, contribution * share, 0), passed if passes else None, nudged, dimmed
+            arrival = transmitted(scene, shadow_ray, drawn.primitive, most, options.derivative, start, u.along)
+            return arrival._replace(light=jnp.where(useful, contribution * arrival.light, 0))
         visible = useful & ~geometry.occluded(scene.geometry, shadow_ray, drawn.primitive)
-        return jnp.where(visible, contribution, 0), None, None, None
+        return Arrival(jnp.where(visible, contribution, 0))
 
-    nothing = jnp.int32(0) if passes else None, none_passed(scene), none_dimmed(scene, u.along)
-    return lax.cond(smooth, sample, lambda: (jnp.zeros_like(vertex.wi), *nothing))
+    passed = jnp.int32(0) if passes else None
+    nothing = Arrival(jnp.zeros_like(vertex.wi), passed, none_passed(scene), none_dimmed(scene, u.along))
+    return lax.cond(smooth, sample, lambda: nothing)
 
 
 def _weight(drawn: EmitterSample, pdf_bsdf: Float[Array, ""], options: Options) -> Float[Array, ""] | int:

@@ -30,7 +30,7 @@ from pathjax.emitters import Choice
 from pathjax.integrators import next_event, roulette, splitting
 from pathjax.integrators.options import Options
 from pathjax.integrators.random_numbers import Bounce
-from pathjax.integrators.shadow import Dimmed, Passed
+from pathjax.integrators.shadow import Arrival, Dimmed, Passed
 from pathjax.integrators.vertex import Vertex, leaving, sample, vertex, within
 from pathjax.scene.scene import Scene
 from pathjax.shapes import geometry
@@ -229,8 +229,8 @@ def scatter(
         path = _scaled(path, lambda carried: carried * here.weight)
     if next_event.occurs(scene, choice, options):
         medium, depth = path.medium, path.depth
-        direct, *passed = next_event.light_sample(scene, choice, here, u, goes_on, depth, options, medium, light)
-        path = path._replace(L=_with_light(path.L, _carried(path) * direct, *passed))
+        direct = next_event.light_sample(scene, choice, here, u, goes_on, depth, options, medium, light)
+        path = path._replace(L=_with_light(path.L, direct._replace(light=_carried(path) * direct.light)))
     drawn, d = compute_once(sample(scene, here, u.bsdf))
     if path.pending is not None:
         splits = splitting.takes_place(scene, here, path)
@@ -284,6 +284,5 @@ def _with_emission(L, emitted):
     return L._replace(emission=emitted, light=jnp.zeros_like(emitted)) if isinstance(L, Gain) else L + emitted
 
 
-def _with_light(L, light, passed, nudged, dimmed):
-    more = dict(light=light, passed=passed, nudged=nudged, dimmed=dimmed)
-    return L._replace(**more) if isinstance(L, Gain) else L + light
+def _with_light(L, direct: Arrival):
+    return L._replace(**direct._asdict()) if isinstance(L, Gain) else L + direct.light

@@ -73,9 +73,9 @@ def radiance(scene: Scene, choice: Choice | None, ray: Ray, numbers: Callable) -
             shadow_ray = spawn_ray(here.surface, light.d, hit.primitive)._replace(t_max=light.distance)
             lit = goes_on & is_smooth(scene, here) & (light.pdf > 0) & (pdf_bsdf > 0)
             start, most = leaving(scene, here, medium, light.d), scene.max_depth - 1 - depth
-            arrives, *_ = transmitted(scene, shadow_ray, light.primitive, most, False, start)
+            arrival = transmitted(scene, shadow_ray, light.primitive, most, False, start)
             direct = f * light.Le / jnp.where(lit, light.pdf, 1) * share(jnp.where(lit, light.density, 1), pdf_bsdf)
-            L = L + jnp.where(lit, throughput * arrives * direct, 0)
+            L = L + jnp.where(lit, throughput * arrival.light * direct, 0)
 
         # Bsdf sample.
         drawn, d = sample(scene, here, u.bsdf)

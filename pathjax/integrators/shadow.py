@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -34,10 +35,19 @@ class Dimmed(NamedTuple):
     u: Float[Array, ""]  # uniform in [0, 1): chooses among them
 
 
+class Arrival(NamedTuple):
+    """Light at the end of a shadow ray, and what derivatives ask of its way."""
+
+    light: Float[Array, ""] | Float[Array, "3"]  # share of it that arrives; of a light sample, what is reflected of it
+    passed: Int[Array, ""] | None = None  # vertices that it took to pass surfaces straight; None: nothing lets it pass
+    nudged: Passed | None = None  # None: nothing asks for it
+    dimmed: Dimmed | None = None  # likewise
+
+
 class _Way(NamedTuple):
-    ray: Ray
-    share: Float[Array, ""] | Float[Array, "3"]
-    passes: Int[Array, ""]
+    ray: Ray  # what is left of the shadow ray
+    share: Float[Array, ""] | Float[Array, "3"]  # of light that gets through what lies behind
+    passed: Int[Array, ""]  # surfaces so far
     goes_on: Bool[Array, ""]
     medium: Int[Array, ""] | None
     nudged: tuple[Surface, Int[Array, "held 2"]] | None
@@ -52,13 +62,11 @@ def transmitted(
     differentiated: bool,
     medium: Int[Array, ""] | None = None,
     along: Float[Array, "3"] | None = None,
-) -> tuple[Float[Array, ""] | Float[Array, "3"], Int[Array, ""], Passed | None, Dimmed | None]:
-    """Share of light that a shadow ray finds, how many vertices it takes to pass surfaces straight, and one of these.
+) -> Arrival:
+    """The share of light that a shadow ray finds.
 
-    And a point of its way, if derivatives ask for it.
-
-    The share is the probability that paths pass them all: what light samples and bsdf samples find is the same. In a
-    scene with media it is one of each colour.
+    It is the probability that paths pass all surfaces on the way: what light samples and bsdf samples find is the same.
+    In a scene with media it is one of each colour.
 
     Args:
         ray: up to the light; of negative length: no share is asked for.
@@ -68,59 +76,73 @@ def transmitted(
         medium: in which the ray starts; None in scenes without media.
         along: of `Bounce`.
     """
-    unseen = none_dimmed(scene, along)
+    passes = bsdfs.occurs(scene.materials, "passes")
+    nobody = none_passed(scene)
+    way = _Way(
+        ray,
+        jnp.ones_like(ray.t_max if medium is None else ray.o),
+        jnp.int32(0),
+        ray.t_max >= 0,
+        medium,
+        None if nobody is None else (nobody.surface, nobody.held),
+        none_dimmed(scene, along),
+    )
+    if passes:
+        # A line meets no primitive more than twice: rounding that found one again and again comes to an end.
+        ever = jnp.int32(2 * scene.geometry.shape.shape[0])
+        most = ever if scene.free_passes else jnp.minimum(most, ever)
+        beyond = partial(_beyond, scene, target, most, differentiated, along)
+        way = lax.while_loop(lambda way: way.goes_on, beyond, way)
+    else:
+        visible = way.goes_on & ~geometry.occluded(scene.geometry, ray, target)
+        way = _flown(scene, way._replace(share=jnp.where(visible, way.share, 0)), larger(ray.t_max, 0), along)
+    share = way.share if way.dimmed is None else way.share * media.nudged_shadow(scene.media, way.dimmed.medium)
+    vertices = None if not passes else jnp.int32(0) if scene.free_passes else way.passed
+    nudged = None if nobody is None else Passed(way.passed, *way.nudged)
+    return Arrival(jnp.where(ray.t_max >= 0, share, 0), vertices, nudged, way.dimmed)
 
-    def dimmed(medium, share, ray, distance):
-        return share if medium is None else share * media.transmittance(scene.media, medium, ray, distance)
 
-    def looked_at(seen, medium, ray, distance):
-        return None if seen is None else _looked_at(scene, seen, medium, ray, distance, along[2])
+def _beyond(scene, target, most, differentiated, along, way: _Way) -> _Way:
+    """The way beyond the next surface, or its end at the light or at what lets nothing pass."""
+    hit = geometry.closest_hit(scene.geometry, way.ray)
+    arrives = (hit.primitive < 0) | (hit.primitive == target)
+    surface = geometry.surface(scene.geometry, way.ray, hit)
+    front = dot(shading_frame(surface).n, way.ray.d) < 0
+    nudges = None
+    if way.nudged is not None:
+        number, nudges = scene.materials.nudged
+        mine = way.passed == number
+        nudges = jnp.where(mine, nudges, 0)
+        code = bsdfs.select(scene.materials, hit.shape, front)
+        held = jnp.stack([jnp.stack(each) for each in tree.on_the_way(scene.materials, code, front)])
+        way = way._replace(
+            nudged=jax.tree.map(lambda new, old: jnp.where(mine & ~arrives, new, old), (surface, held), way.nudged)
+        )
+    free = bsdfs.passing(scene.materials, hit.shape, surface, front, nudges)
+    through = jnp.where(way.passed < most, free, 0)
+    maybe = bsdfs.is_tree(scene.materials, hit.shape, front) if differentiated else False
+    on = ~arrives & (way.passed < most) & ((through > 0) | maybe)
+    way = way._replace(share=jnp.where(arrives, way.share, way.share * through))
+    way = _flown(scene, way, smaller(hit.t, way.ray.t_max), along)
+    within = way.medium
+    if within is not None:
+        within = media.beyond(scene.media, within, hit.shape, surface.n, way.ray.d)
+    return way._replace(
+        ray=spawn_ray(surface, way.ray.d, hit.primitive)._replace(t_max=way.ray.t_max - hit.t),
+        passed=way.passed + on.astype(jnp.int32),
+        goes_on=on,
+        medium=within,
+    )
 
-    def nudged_by(seen, share):
-        return share if seen is None else share * media.nudged_shadow(scene.media, seen.medium)
 
-    if not bsdfs.occurs(scene.materials, "passes"):
-        visible = (ray.t_max >= 0) & ~geometry.occluded(scene.geometry, ray, target)
-        share, length = visible.astype(ray.t_max.dtype), larger(ray.t_max, 0)
-        seen = looked_at(unseen, medium, ray, length)
-        return nudged_by(seen, dimmed(medium, share, ray, length)), jnp.int32(0), None, seen
-    # A line meets no primitive more than twice: rounding that found one again and again comes to an end.
-    ever = jnp.int32(2 * scene.geometry.shape.shape[0])
-    most = ever if scene.free_passes else jnp.minimum(most, ever)
-
-    def step(way):
-        hit = geometry.closest_hit(scene.geometry, way.ray)
-        arrives = (hit.primitive < 0) | (hit.primitive == target)
-        surface = geometry.surface(scene.geometry, way.ray, hit)
-        front = dot(shading_frame(surface).n, way.ray.d) < 0
-        nudges, nudged = None, way.nudged
-        if nudged is not None:
-            number, nudges = scene.materials.nudged
-            mine = way.passes == number
-            nudges = jnp.where(mine, nudges, 0)
-            code = bsdfs.select(scene.materials, hit.shape, front)
-            held = jnp.stack([jnp.stack(each) for each in tree.on_the_way(scene.materials, code, front)])
-            nudged = jax.tree.map(lambda new, old: jnp.where(mine & ~arrives, new, old), (surface, held), nudged)
-        free = bsdfs.passing(scene.materials, hit.shape, surface, front, nudges)
-        through = jnp.where(way.passes < most, free, 0)
-        share = jnp.where(arrives, way.share, way.share * through)
-        length = smaller(hit.t, way.ray.t_max)
-        share, seen = dimmed(way.medium, share, way.ray, length), looked_at(way.dimmed, way.medium, way.ray, length)
-        within = way.medium
-        if within is not None:
-            within = media.beyond(scene.media, within, hit.shape, surface.n, way.ray.d)
-        beyond = spawn_ray(surface, way.ray.d, hit.primitive)._replace(t_max=way.ray.t_max - hit.t)
-        maybe = bsdfs.is_tree(scene.materials, hit.shape, front) if differentiated else False
-        on = ~arrives & (way.passes < most) & ((through > 0) | maybe)
-        return _Way(beyond, share, way.passes + on.astype(jnp.int32), on, within, nudged, seen)
-
-    one, nobody = jnp.ones_like(ray.t_max if medium is None else ray.o), none_passed(scene)
-    nudged = None if nobody is None else (nobody.surface, nobody.held)
-    start = _Way(ray, one, jnp.int32(0), ray.t_max >= 0, medium, nudged, unseen)
-    end = lax.while_loop(lambda way: way.goes_on, step, start)
-    passed = None if nobody is None else Passed(end.passes, *end.nudged)
-    share = jnp.where(ray.t_max >= 0, nudged_by(end.dimmed, end.share), 0)
-    return share, jnp.int32(0) if scene.free_passes else end.passes, passed, end.dimmed
+def _flown(scene, way: _Way, distance, along) -> _Way:
+    """The way after so far through its medium."""
+    if way.medium is None:
+        return way
+    share = way.share * media.transmittance(scene.media, way.medium, way.ray, distance)
+    if way.dimmed is None:
+        return way._replace(share=share)
+    return way._replace(share=share, dimmed=_looked_at(scene, way.dimmed, way.medium, way.ray, distance, along[2]))
 
 
 def _looked_at(scene, seen, medium, ray, distance, u):
