@@ -37,7 +37,7 @@ class Number(Declared):
     listed: bool = True
 
     def read(self, loader, fields, name, owner):
-        if self.textured and (made := loader.texture(fields, name, owner)) is not None:
+        if self.textured and (made := loader.texture(fields, name, owner, of_number=True)) is not None:
             return _in_range(fields, name, made, self.bounds)
         low, high = self.bounds
         if self.textured and fields.gives_color(name):

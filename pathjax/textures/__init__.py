@@ -7,6 +7,7 @@ compiled.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -20,6 +21,7 @@ from jaxtyping import Array, Float, Int
 from pathjax.compile import register_dataclass
 from pathjax.core.math import at
 from pathjax.core.types import Surface
+from pathjax.errors import InputError
 from pathjax.kinds import Instance, Parameters, Row, Table, ordered
 from pathjax.kinds import register as register_kind
 from pathjax.textures.bitmap import Bitmap
@@ -39,6 +41,7 @@ __all__ = [
     "Uniform",
     "alike",
     "build",
+    "of_number",
     "register",
 ]
 
@@ -160,11 +163,24 @@ def _uv(p: Row, surface: Surface) -> Float[Array, "2"]:
     return uv if m is None else m[:, 0] * uv[0] + m[:, 1] * uv[1] + m[:, 2]
 
 
+def of_number(texture: Instance, known: dict[Instance, Instance]) -> Instance:
+    """The texture as it is where it stands for a number. known: those that were asked for before."""
+    if texture not in known:
+        known[texture] = texture.kind.of_number(texture, partial(of_number, known=known))
+    return known[texture]
+
+
 def build(instances: list[Instance], dtype, path: tuple, parameters: Parameters) -> tuple[Textures | None, dict]:
     """Textures, or None where there are none, and the code (kind, row) of each instance and of those that they hold."""
     tables, codes, levels = [], {}, {}
     for instance in instances:
         _enter_level(instance, levels)
+    for (_, name), count in Counter((each.kind, each.name) for each in levels).items():
+        if count > 1:
+            raise InputError(
+                f'the texture "{name}" stands for a colour and for a number, whose squares differ in colour; '
+                "give each a texture of its own"
+            )
     for level in sorted(set(levels.values())):
         for kind, rows in ordered([each for each in levels if levels[each] == level], KINDS).items():
             codes |= {each: (len(tables), row) for row, each in enumerate(rows)}

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
+
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from pathjax.core.types import Surface
-from pathjax.kinds import Color, Row
+from pathjax.kinds import Color, Instance, Row
 from pathjax.textures.texture import Texture
 
 
 class Checkerboard(Texture):
-    """Squares of two colours; the first one lies at uv = (0, 0)."""
+    """Squares of two colours; the first one lies at uv = (0, 0), and the second one where it stands for a number."""
 
     color0 = Color(0.4)
     color1 = Color(0.2)
@@ -19,6 +23,13 @@ class Checkerboard(Texture):
     @staticmethod
     def look_up(p: Row, uv: Float[Array, "2"], surface: Surface) -> Float[Array, "3"]:
         return jnp.where(_first(uv), p.color0, p.color1)
+
+    @classmethod
+    def of_number(cls, texture: Instance, held: Callable[[Instance], Instance]) -> Instance:
+        """The board shifted by a square: Mitsuba's begins with `color1` there, and files rely on it."""
+        values = {key: held(x) if isinstance(x, Instance) else x for key, x in texture.values.items()}
+        to_uv = np.eye(2, 3) if values["to_uv"] is None else values["to_uv"]
+        return replace(texture, values=values | {"to_uv": to_uv + np.array([[0, 0, 0.5], [0, 0, 0]])})
 
     @staticmethod
     def entries(p: Row, uv: Float[Array, "2"], surface: Surface) -> list[tuple[str, Int[Array, ""] | None, Array]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -65,6 +65,11 @@ class Texture(Kind):
     def colors(cls, texture: Instance) -> list:
         """What its colours are, (3,) or one number each, or textures."""
         return [texture.values[key] for key, declared in cls.declared.items() if isinstance(declared, Color)]
+
+    @classmethod
+    def of_number(cls, texture: Instance, held: Callable[[Instance], Instance]) -> Instance:
+        """The texture as it is where it stands for a number; held: the same of a texture inside it."""
+        return texture
 
     @classmethod
     def resolution(cls, texture: Instance) -> tuple[int, int]:

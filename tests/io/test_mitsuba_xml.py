@@ -14,6 +14,7 @@ from pathjax.errors import InputError
 from pathjax.images import write_exr, write_png
 from pathjax.io.mitsuba.loader import load
 from pathjax.kinds import Instance
+from pathjax.scene import build
 from pathjax.sensors.filters import Box, Gaussian
 from pathjax.shapes import Cube, Disk, Rectangle
 
@@ -502,6 +503,17 @@ def test_a_texture_that_is_referenced_twice_is_read_once(read, picture):
     )
     assert scene.shapes[0].bsdf.values["reflectance"] is scene.shapes[1].bsdf.values["reflectance"]
     assert first_bsdf(scene).values["reflectance"].name == "t"
+
+
+def test_a_board_that_stands_for_a_number_and_for_a_colour_is_refused(read):
+    """It is two boards, and the names of its parameters would mean one."""
+    board = '<texture type="checkerboard" id="board"/>'
+    twice = with_bsdf("plastic", '<ref name="diffuse_reflectance" id="board"/>')
+    both = twice + with_bsdf("mask", '<ref name="opacity" id="board"/><bsdf type="diffuse"/>')
+    build(read(board + twice + twice))
+    build(read(board + both.replace(twice, "") * 2))
+    with pytest.raises(InputError, match='"board" stands for a colour and for a number'):
+        build(read(board + both))
 
 
 @pytest.mark.parametrize(

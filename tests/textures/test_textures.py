@@ -21,9 +21,9 @@ def bitmap(h, w, seed=0, to_uv=None, **how):
     return Bitmap.instance(f"b{seed}", texels=texels, to_uv=to_uv, **how)
 
 
-def checkerboard(to_uv=None):
+def checkerboard(to_uv=None, name="c"):
     colors = {"color0": np.array([0.1, 0.2, 0.3]), "color1": np.array([0.9, 0.8, 0.7])}
-    return Checkerboard.instance("c", to_uv=to_uv, **colors)
+    return Checkerboard.instance(name, to_uv=to_uv, **colors)
 
 
 def wrapped(i, n, wrap):
@@ -112,6 +112,30 @@ def test_checkerboard_starts_with_color0_and_repeats():
     np.testing.assert_allclose(colors[:, 0], np.float32([0.1, 0.9, 0.9, 0.1, 0.9, 0.1]))
 
 
+@pytest.mark.parametrize("holds", ["numbers", "a board"])
+def test_a_board_of_numbers_is_that_of_mitsuba(holds):
+    """Whose `eval_1` begins with the other colour than its `eval`."""
+    mi = pytest.importorskip("mitsuba")
+    mi.set_variant("scalar_rgb")
+    inner, theirs = 0.7, 0.7
+    if holds == "a board":
+        inner = Checkerboard.instance("inner", color0=0.2, color1=0.3, to_uv=np.diag([3.0, 3.0, 1.0])[:2])
+        scaled = mi.ScalarTransform3f(np.diag([3.0, 3, 1]))
+        theirs = {"type": "checkerboard", "color0": 0.2, "color1": 0.3, "to_uv": scaled}
+    ours = Checkerboard.instance("outer", color0=0.1, color1=inner, to_uv=TO_UV)
+    transform = mi.ScalarTransform3f(np.concatenate([TO_UV, [[0, 0, 1]]]))
+    theirs = mi.load_dict({"type": "checkerboard", "color0": 0.1, "color1": theirs, "to_uv": transform})
+    uv = np.random.default_rng(8).random((300, 2))
+    si = mi.SurfaceInteraction3f()
+    expected = []
+    for si.uv in uv.tolist():
+        expected.append(theirs.eval_1(si))
+    known = {}
+    found = lookup_all([textures.of_number(ours, known)], uv)[0][:, 0]
+    assert (np.abs(found - expected) < 1e-6).mean() > 0.99  # but for rounding at the borders
+    assert textures.of_number(ours, known) is known[ours]
+
+
 def nested():
     """A board of an image and of a board of another board."""
     inner = Checkerboard.instance("inner", color0=checkerboard(), color1=0.5, to_uv=np.diag([5.0, 3.0, 1.0])[:2])
@@ -124,7 +148,7 @@ def test_a_board_of_textures_looks_them_up_at_the_uv_of_the_surface():
     board = nested()
     image, inner = board.values["color0"], board.values["color1"]
     uv = random_uv()
-    found = lookup_all([checkerboard(TO_UV), inner, board, image], uv)
+    found = lookup_all([checkerboard(TO_UV, "other"), inner, board, image], uv)
     plain = {"color0": np.zeros(3), "color1": np.ones(3)}
     where = reference(Checkerboard.instance("", to_uv=board.values["to_uv"], **plain), uv)
     where_inner = reference(Checkerboard.instance("", to_uv=inner.values["to_uv"], **plain), uv)

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from pathjax import description as d
-from pathjax import emitters, sensors
+from pathjax import emitters, sensors, textures
 from pathjax.description.elements import Document, Element, nearest
 from pathjax.description.fields import VALUES, Fields, is_one_color
 from pathjax.errors import InputError
@@ -77,6 +77,7 @@ class _Loader:
         self.named: set[tuple[str, str]] = set()  # types and names of bsdfs and textures
         self.making: set[Element] = set()
         self.made: dict[Element, object] = {}
+        self.of_numbers: dict[Instance, Instance] = {}  # textures, as they are where they stand for numbers
         self.copied = 0  # triangles of instances
         self.placed: tuple[d.Shape, ...] = ()  # all of the scene, once they are known
         self.on_shapes: dict[Element, Element] = {}  # a light by reference, and the shape that it shines from
@@ -282,10 +283,13 @@ class _Loader:
         """Name of an emitter outside of shapes that has no id."""
         return self.unique(emitters.usual_name(element.attributes.get("type", "")))
 
-    def texture(self, fields: Fields, parameter: str, owner: str) -> Instance | None:
+    def texture(self, fields: Fields, parameter: str, owner: str, of_number: bool = False) -> Instance | None:
         """The texture that sets a parameter; None where it is something else. `owner` names one without an id."""
         element = fields.texture(parameter)
-        return None if element is None else self.shared(element, owner)
+        if element is None:
+            return None
+        made = self.shared(element, owner)
+        return textures.of_number(made, self.of_numbers) if of_number else made
 
     def find(self, fields: Fields, parameter: str) -> Path:
         """The file that a parameter names."""
