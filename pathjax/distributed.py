@@ -34,8 +34,9 @@ from pathjax.system.output import say
 from pathjax.system.watch import BEAT, PATIENCE, Relay, Watch
 
 T = TypeVar("T")
-# Seconds for which processes wait for each other at first.
-MEETING = 60
+# Seconds for which processes wait for each other at first, as of a large job some begin minutes after others; and then,
+# by JAX's own watch, which is the slower one.
+MEETING, SILENCE = 300, 60
 # Calls of each device between two exchanges: all wait for the slowest, so the fewer exchanges the better; but signals
 # are heard then.
 _CALLS = 2
@@ -78,11 +79,11 @@ def start(coordinator: str | None = None, processes: int | None = None, process:
             _threads.append(Relay(coordinator, MEETING))
             coordinator = _threads[-1].address
         jax.config.update("jax_cpu_collectives_implementation", "gloo")
-        patience = {"initialization_timeout": MEETING, "heartbeat_timeout_seconds": MEETING}
+        patience = {"initialization_timeout": MEETING, "heartbeat_timeout_seconds": SILENCE}
         jax.distributed.initialize(coordinator, processes, process, devices, **patience)
     except InputError:
         raise
-    except (RuntimeError, ValueError) as error:
+    except (RuntimeError, ValueError, OSError) as error:
         said = str(error).partition("\n")[0]
         raise InputError(f"this process could not join the others ({said}); start each of them anew") from None
     atexit.register(_leave)

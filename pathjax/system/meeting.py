@@ -3,16 +3,23 @@
 from __future__ import annotations
 
 import json
+import selectors
 import socket
 import time
 from collections.abc import Mapping
 from contextlib import ExitStack, suppress
 
 from pathjax.errors import InputError
+from pathjax.system.output import say
 
 # Bytes of a message at most, and seconds for which a caller may keep the first process waiting.
 _LONGEST, _SLOWEST = 1 << 16, 5.0
 _PAUSE = 0.1
+# Seconds of waiting after which it is told for whom; and for which the first process tells those who come late that
+# there is nothing to come to.
+_TOLD, _LATE = 10.0, 5.0
+# What the first process says at once to each that comes, who then knows of its end.
+_SEEN = "seen"
 
 
 def meet(
@@ -28,21 +35,20 @@ def meet(
         connections, by the number of the process at the other end: of the first one with all others, of each of them
         with the first.
     Raises:
-        InputError: the address is none, or in use; nobody is there; processes are missing, two have one number, or they
-            differ in a fact.
+        InputError: the address is none, or in use; nobody is there; processes are missing, one has ended meanwhile, two
+            have one number, or they differ in a fact.
     """
     host, _, port = address.rpartition(":")
     if not host or not port.isdecimal() or not 0 < int(port) < 1 << 16:
         raise InputError(f"{address!r} is no address of the form HOST:PORT")
     facts = {"number of processes": str(processes), **facts}
     own = {"process": process, "host": socket.gethostname(), "facts": facts}
-    until = time.monotonic() + seconds
     if process:
-        return {0: _call(host, int(port), address, own, until)}
-    return _welcome(int(port), address, own, until)
+        return {0: _call(host, int(port), address, own, seconds)}
+    return _welcome(int(port), address, own, seconds)
 
 
-def _welcome(port: int, address: str, own: dict, until: float) -> dict[int, socket.socket]:
+def _welcome(port: int, address: str, own: dict, seconds: float) -> dict[int, socket.socket]:
     """Connections with all others, who are told what keeps the processes from working together, if anything does."""
     try:
         dual = socket.has_dualstack_ipv6()
@@ -53,33 +59,61 @@ def _welcome(port: int, address: str, own: dict, until: float) -> dict[int, sock
             f"process 0 cannot be found at {address}: {error.strerror}; if no other process has the number 0 too, stop "
             "what uses the port, or name another"
         ) from None
-    with server, ExitStack() as opened:
+    with server, selectors.DefaultSelector() as selector, ExitStack() as opened:
+        selector.register(server, selectors.EVENT_READ, 0)
         came, calls, problem = {0: own}, [], ""
         count = int(own["facts"]["number of processes"])
+        until, told = time.monotonic() + seconds, time.monotonic() + _TOLD
         while not problem and len(came) < count:
-            server.settimeout(max(until - time.monotonic(), 0.01))
-            try:
-                call, _ = server.accept()
-            except TimeoutError:
-                missing = ", ".join(str(number) for number in range(count) if number not in came)
+            missing = ", ".join(str(number) for number in range(count) if number not in came)
+            if (now := time.monotonic()) >= until:
                 problem = f"of {count} processes {missing} did not come to {address}; start all of them"
                 break
-            call.settimeout(_SLOWEST)
-            try:
-                other = json.loads(_line(call))
-                problem = _problem(own, came, other)
-            except (OSError, ValueError, KeyError, TypeError):  # somebody else, who is not of us
-                call.close()
-                continue
-            came[other["process"]] = other
-            calls.append((other["process"], opened.enter_context(call)))
+            if now >= told:
+                say(f"process 0 waits at {address} for {missing}, {until - now:.0f} s more")
+                told = until
+            # Nobody speaks before all have come, so what can be read of one who has come is his end.
+            readable = {key.data for key, _ in selector.select(min(told, until) - now)}
+            if gone := sorted(readable - {0}):
+                problem = f"process {gone[0]} has ended before all had come"
+            elif readable:
+                call, _ = server.accept()
+                call.settimeout(_SLOWEST)
+                try:
+                    other = json.loads(_line(call))
+                    problem = _problem(own, came, other)
+                    _tell(call, _SEEN)
+                except (OSError, ValueError, KeyError, TypeError):  # somebody else, who is not of us
+                    call.close()
+                    continue
+                number = other["process"]
+                came[number] = other
+                calls.append((number, opened.enter_context(call)))
+                selector.register(call, selectors.EVENT_READ, number)
         for _, call in calls:
             with suppress(OSError):
-                call.sendall((json.dumps(problem) + "\n").encode())
+                _tell(call, problem)
         if problem:
+            _turn_away(server, problem, count - len(came), min(until, time.monotonic() + _LATE))
             raise InputError(problem)
         opened.pop_all()
     return dict(calls)
+
+
+def _turn_away(server: socket.socket, problem: str, missing: int, until: float) -> None:
+    """Tell those who come a little later, too, who else would look for the first process for long."""
+    for _ in range(missing):
+        with suppress(OSError):
+            server.settimeout(max(until - time.monotonic(), 0.01))
+            with server.accept()[0] as call:
+                call.settimeout(_SLOWEST)
+                _line(call)
+                _tell(call, _SEEN)
+                _tell(call, problem)
+
+
+def _tell(call: socket.socket, what: object) -> None:
+    call.sendall((json.dumps(what) + "\n").encode())
 
 
 def _line(call: socket.socket) -> bytes:
@@ -98,20 +132,30 @@ def _problem(own: dict, came: dict, other: dict) -> str:
     return ""
 
 
-def _call(host: str, port: int, address: str, own: dict, until: float) -> socket.socket:
+def _call(host: str, port: int, address: str, own: dict, seconds: float) -> socket.socket:
     """The connection with the first process, which has said that nothing keeps them from working together."""
-    why = "it does not answer"
-    while (left := until - time.monotonic()) > 0:
+    why, begun, told = "it does not answer", time.monotonic(), False
+    while (left := begun + seconds - time.monotonic()) > 0:
+        if left <= seconds - _TOLD and not told:
+            say(f"process {own['process']} finds no process 0 at {address} ({why}), and tries for {left:.0f} s more")
+            told = True
         with ExitStack() as opened:
             try:
                 call = opened.enter_context(socket.create_connection((host, port), timeout=left))
-                call.sendall((json.dumps(own) + "\n").encode())
-                call.settimeout(max(until + _SLOWEST - time.monotonic(), 0.01))
-                problem = json.loads(_line(call))
+                _tell(call, own)
+                why = "who is there is another program, or has met all others already"
+                if json.loads(_line(call)) != _SEEN:
+                    raise ValueError
             except (OSError, ValueError) as error:
                 why = getattr(error, "strerror", None) or why
                 time.sleep(_PAUSE)
                 continue
+            # For as long as the first process, which may have begun later, waits for the others.
+            call.settimeout(seconds + _SLOWEST)
+            try:
+                problem = json.loads(_line(call))
+            except (OSError, ValueError):
+                problem = f"process 0, at {address}, has ended before all had come"
             if problem:
                 raise InputError(problem)
             opened.pop_all()

@@ -9,7 +9,7 @@ JAX, too, ends a process whose first one is lost, at once and without a name. So
 
 from __future__ import annotations
 
-import select
+import selectors
 import socket
 import threading
 import time
@@ -31,8 +31,10 @@ class Watch:
         self._heard = dict.fromkeys(peers, b"")  # of each, the line that it has begun
         self._silent = dict.fromkeys(peers, 0)  # beats since it was heard
         self._speaking = threading.Lock()
-        for peer in peers.values():
+        self._selector = selectors.DefaultSelector()
+        for number, peer in peers.items():
             peer.setblocking(False)
+            self._selector.register(peer, selectors.EVENT_READ, number)
         self._thread = threading.Thread(target=self._watch, daemon=True)
         self._thread.start()
 
@@ -40,6 +42,7 @@ class Watch:
         """Watch no longer: a thread that goes on while Python ends ends it badly."""
         self._watched.clear()
         self._thread.join()
+        self._selector.close()
 
     def end(self, reason: str = "") -> None:
         """Tell the others that this process ends: as it should, or why not."""
@@ -57,11 +60,8 @@ class Watch:
     def _listen(self) -> None:
         until = time.monotonic() + BEAT
         while self._watched and (left := until - time.monotonic()) > 0:
-            peers = dict(self._watched)
-            readable, *_ = select.select(list(peers.values()), [], [], left)
-            for number, peer in peers.items():
-                if peer in readable:
-                    self._hear(number, peer)
+            for key, _ in self._selector.select(left):
+                self._hear(key.data, self._peers[key.data])
         for number in list(self._watched):
             # In beats and not in seconds, during which this process may have been stopped itself.
             self._silent[number] += 1
@@ -83,6 +83,7 @@ class Watch:
             if line not in (_BEAT, _END):
                 raise _Loss(line.decode(errors="replace"))
         if _END in lines:
+            self._selector.unregister(peer)
             self._watched.pop(number, None)
 
     def _say(self, line: bytes) -> None:
@@ -118,19 +119,24 @@ class Relay:
     def _serve(self) -> None:
         others: dict[socket.socket, socket.socket] = {}  # where to pass on what comes
         calls: list[socket.socket] = []  # which are closed when nobody holds them
-        while not self._closed:
-            readable, *_ = select.select([self._server, *others], [], [], BEAT)
-            for source in readable:
-                if source is self._server:
-                    call, _ = self._server.accept()
-                    if target := self._connected():
-                        calls.append(call)
-                        others |= {call: target, target: call}
-                elif source in others and not _passed(source, others[source]):
-                    target = others.pop(source)
-                    if source in calls:
-                        others.pop(target, None)
-                        target.close()
+        with selectors.DefaultSelector() as selector:
+            selector.register(self._server, selectors.EVENT_READ)
+            while not self._closed:
+                for source in [key.fileobj for key, _ in selector.select(BEAT)]:
+                    if source is self._server:
+                        call, _ = self._server.accept()
+                        if target := self._connected():
+                            calls.append(call)
+                            others |= {call: target, target: call}
+                            selector.register(call, selectors.EVENT_READ)
+                            selector.register(target, selectors.EVENT_READ)
+                    elif source in others and not _passed(source, others[source]):
+                        selector.unregister(source)
+                        target = others.pop(source)
+                        if source in calls and target in others:
+                            del others[target]
+                            selector.unregister(target)
+                            target.close()
 
     def _connected(self) -> socket.socket | None:
         until = time.monotonic() + self._seconds
