@@ -18,7 +18,6 @@ from pathjax.errors import InputError
 from pathjax.io import picture
 from pathjax.io.load import load_scene
 from pathjax.rendering.progressive.until import Render
-from pathjax.scene.ladder import padded
 from pathjax.scene.parameters import with_parameters
 from pathjax.scene.scene import Scene
 from pathjax.system.interrupts import Interrupts
@@ -121,7 +120,7 @@ def _outcome(job: Job, output: Path, loading: Future | None, interrupts: Interru
         scene, load_seconds = loading.result()
         no_limit = job.spp is None and job.error is None and job.time is None
         spp = scene.about.description.view.spp if no_limit else job.spp
-        render = Render(padded(scene), job.error, job.time, spp, job.seed, job.strategy, None)
+        render = Render(scene, job.error, job.time, spp, job.seed, job.strategy, None)
         render.compile()
         result = render.run()
     except Exception as error:  # whatever it is, the other jobs are not to blame

@@ -20,6 +20,7 @@ from pathjax.integrators.options import Options, check_counts
 from pathjax.rendering.progressive import error_estimate, passes, replicates
 from pathjax.rendering.progressive.checkpoint import Checkpoint, identity
 from pathjax.scene.alike import fingerprint
+from pathjax.scene.ladder import padded
 from pathjax.scene.scene import Scene
 from pathjax.sensors import film
 from pathjax.system.interrupts import Interrupts
@@ -106,7 +107,8 @@ class Render:
         self.options = Options(strategy)
         check_counts(MAX_SPP if spp is None else spp, seed)
         self.options.check_strategy(scene)
-        self.scene, self.seed = scene, operator.index(seed)
+        # So the kernel that one scene has left in the cache is another one's too, of a batch or not.
+        self.scene, self.seed = padded(scene), operator.index(seed)
         self.target_error, self.time_limit = target_error, time_limit
         self.spp = MAX_SPP if spp is None else int(spp)
         self.compile_seconds = 0.0
