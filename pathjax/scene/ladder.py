@@ -1,10 +1,10 @@
 """Scenes of one structure as scenes of the same array sizes, so that they share compiled kernels.
 
 A kernel is compiled for the sizes of a scene's arrays. What is counted in thousands (triangles, nodes and leaves of
-hierarchies, texels) and what is counted in pieces (shapes, bsdfs, textures, lights) is padded up to rungs of a coarse
-ladder here. Whatever is read is found by number, and nothing holds the number of a padded entry: no ray searches it, no
-light is chosen there, and images are those of the scene itself. Their last bits may differ, as the kernel is another
-program: so `render_until` pads every scene, of a batch or not.
+hierarchies, texels, cells of volumes) and what is counted in pieces (shapes, bsdfs, textures, lights) is padded up to
+rungs of a coarse ladder here. Whatever is read is found by number, and nothing holds the number of a padded entry: no
+ray searches it, no light is chosen there, and images are those of the scene itself. Their last bits may differ, as the
+kernel is another program: so `render_until` pads every scene, of a batch or not.
 
 What stays as it is, and so tells kernels apart: whether lights are so many that a tree chooses among them, backgrounds,
 and shapes of a kind of which there are so few that rays test them all.
@@ -21,6 +21,7 @@ from jaxtyping import Int, Shaped
 from pathjax.compile import SELECTED_ROWS
 from pathjax.emitters import Lights, light_tree
 from pathjax.kinds import Color, Table
+from pathjax.media.grids import Grids
 from pathjax.scene.scene import Scene
 from pathjax.shapes import Geometry
 from pathjax.shapes.shape import Table as ShapeTable
@@ -51,8 +52,7 @@ def padded(scene: Scene) -> Scene:
     if media is not None:
         phases = tuple(map(_kind, media.phases))
         phase, sides = (_rows(values, _few(len(values))) for values in (media.phase, media.sides))
-        varying = {"extinctions": media.extinctions, "albedos": media.albedos}
-        varying = {key: x and replace(x, of=_rows(x.of, _few(len(x.of)))) for key, x in varying.items()}
+        varying = {"extinctions": _grids(media.extinctions), "albedos": _grids(media.albedos)}
         media = replace(media, table=_kind(media.table), phases=phases, phase=phase, sides=sides, **varying)
     lit, emitters = _emitters(scene.emitters, np.asarray(scene.geometry.light))
     geometry = _geometry(replace(scene.geometry, light=lit))
@@ -176,6 +176,14 @@ def _kind(table: Table) -> Table:
         return replace(column, values=_rows(column.values, rows), texture=texture)
 
     return replace(table, columns=tuple(map(of, table.kind.declared.values(), table.columns)))
+
+
+def _grids(grids: Grids | None) -> Grids | None:
+    """Cells, which grids share; what there is of each grid, and of each medium."""
+    if grids is None:
+        return None
+    few = {key: _rows(x, _few(len(x))) for key, x in vars(grids).items() if key != "values"}
+    return replace(grids, values=_many_rows(grids.values), **few)
 
 
 def _rows(values: Shaped[np.ndarray, "R ..."], rows: int) -> Shaped[np.ndarray, "rows ..."]:

@@ -15,6 +15,7 @@ import trimesh
 import pathjax as pj
 from pathjax.images import read_exr, read_rgb, write_exr
 from pathjax.io.load import load_scene
+from pathjax.media.gridvolume import write_vol
 from pathjax.rendering.progressive import passes
 from pathjax.scene.ladder import padded
 from pathjax.scene.parameters import nameless
@@ -91,6 +92,50 @@ def test_images_are_those_of_single_renders_and_one_kernel_makes_them(folder, tm
     single = pj.render_until(scene, spp=8, seed=5).image
     np.testing.assert_array_equal(read_rgb(tmp_path / "1.exr"), single)
     assert (tmp_path / "deep/er/2.exr").exists()
+
+
+def things(kind, count, folder):
+    """Bodies of scenes of one structure that differ in their numbers; and what makes them so."""
+    diffuse = '<bsdf type="diffuse" id="{}"/>'
+    ball = '<shape type="ply"><string name="filename" value="2.ply"/>{}{}</shape>'
+    place = '<transform name="to_world"><scale value="0.3"/><translate x="{}"/></transform>'
+    match kind:
+        case "meshes and lights":
+            intensity = '<rgb name="intensity" value="{}"/>'
+            placed = (f'<point name="position" x="{n - 3}" y="3" z="2"/>{intensity.format(n)}' for n in range(count))
+            return FLOOR + "".join(f'<emitter type="point">{light}</emitter>' for light in placed)
+        case "instances":
+            group = f'<shape type="shapegroup" id="group">{ball.format(diffuse.format("it"), "")}</shape>'
+            placed = (place.format(n / 2 - 1) for n in range(count))
+            return group + "".join(f'<shape type="instance"><ref id="group"/>{each}</shape>' for each in placed)
+        case "bsdfs":
+            return "".join(ball.format(diffuse.format(f"b{n}"), place.format(n / 2 - 1)) for n in range(count))
+        case "grids":
+            write_vol(folder / f"{count}.vol", np.random.default_rng(0).uniform(0, 3, (count, 3, 4, 1)))
+            volume = f'<volume name="sigma_t" type="gridvolume"><string name="filename" value="{count}.vol"/></volume>'
+            medium = f'<medium type="heterogeneous" name="interior">{volume}</medium>'
+            return f'<shape type="cube"><bsdf type="null"/>{medium}</shape>'
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["meshes and lights", "instances", "bsdfs", "grids"])
+def test_images_of_every_structure_are_those_of_single_renders(folder, tmp_path, kind, run):
+    """To the bit, of the command line too; numbers of things differ, and the kernel does not."""
+    for place, count in enumerate((6, 7)):
+        text = SCENE.format(mesh=f"{place}.ply", image=f"{place}.exr", more=things(kind, count, folder))
+        text = text.replace('"path"', '"volpath"') if kind == "grids" else text
+        (folder / f"{kind}{place}.xml").write_text(text)
+    jobs = [{"scene": f"{kind}{place}.xml", "output": f"{place}.exr", "spp": 8, "seed": 2} for place in range(2)]
+    before = passes._sums_of_replicates._cache_size()
+    outcomes = pj.render_batch(write_jobs(folder / f"{kind}.jsonl", jobs), tmp_path)
+    assert [outcome.status for outcome in outcomes] == ["done"] * 2
+    assert passes._sums_of_replicates._cache_size() - before <= 1
+    for place in range(2):
+        scene, image = folder / f"{kind}{place}.xml", tmp_path / f"{place}.exr"
+        assert run("render", scene, "-o", tmp_path / "single.exr", "--spp", 8, "--seed", 2)[0] == 0
+        for single in (read_rgb(tmp_path / "single.exr"), pj.render_until(load_scene(scene), spp=8, seed=2).image):
+            assert single.any()
+            np.testing.assert_array_equal(read_rgb(image), single)
 
 
 def test_what_fails_is_told_by_line_and_ends_nothing_else(folder, tmp_path, run):

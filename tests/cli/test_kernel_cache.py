@@ -4,6 +4,7 @@ import subprocess
 import sys
 
 import pytest
+import trimesh
 
 from pathjax.images import read_exr
 
@@ -32,12 +33,13 @@ sys.exit(status)
 
 @pytest.fixture
 def counted(root, environment, tmp_path):
-    """(*options, **environment) -> a process that renders the furnace to a file of its own, and that file."""
+    """(*options, scene, **environment) -> a process that renders the furnace, or a scene, to a file, and that file."""
     numbers = iter(range(100))
 
-    def start(*more, **variables):
+    def start(*more, scene=None, **variables):
         output = tmp_path / f"{next(numbers)}.exr"
-        arguments = ("render", FURNACE, *SMALL, "-o", output, "--spp", 4, *more)
+        given = (FURNACE, *SMALL) if scene is None else (scene,)
+        arguments = ("render", *given, "-o", output, "--spp", 4, *more)
         command = [sys.executable, "-c", COUNTED, *map(str, arguments)]
         plain = {name: value for name, value in environment.items() if not name.startswith(("JAX_", "PATHJAX_"))}
         variables = {name: str(value) for name, value in variables.items()}
@@ -63,6 +65,24 @@ def entries(folder):
 
 
 linux = pytest.mark.skipif(sys.platform != "linux", reason="kernels are kept on Linux only")
+
+
+@linux
+def test_scenes_of_one_structure_find_the_kernel_of_another(counted, tmp_path):
+    """With other numbers of triangles and bsdfs."""
+    scene = """<scene version="3.0.0"><sensor type="perspective"><transform name="to_world">
+        <lookat origin="0,1,4" target="0,0,0" up="0,1,0"/></transform><film type="hdrfilm"><rfilter type="box"/>
+        <integer name="width" value="8"/><integer name="height" value="8"/></film></sensor>
+        <emitter type="constant"/>{}</scene>"""
+    thing = '<shape type="ply"><string name="filename" value="{}.ply"/><bsdf type="diffuse"/></shape>'
+    told = []
+    for place, count in enumerate((3, 4)):
+        trimesh.creation.icosphere(subdivisions=count).export(tmp_path / f"{count}.ply")
+        file = tmp_path / f"{place}.xml"
+        file.write_text(scene.format(thing.format(count) * count))
+        wanted, found, traced, _ = end(counted(scene=file, XDG_CACHE_HOME=tmp_path / "cache"))
+        told.append((wanted > found, traced))
+    assert told == [(True, 1), (False, 0)]
 
 
 @linux
