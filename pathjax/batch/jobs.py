@@ -34,31 +34,32 @@ class Job:
 KEYS = tuple(f.name for f in fields(Job))[:-1]
 
 
-def read(file: str | os.PathLike) -> list[Job]:
+def read(file: str | os.PathLike, folder: str | os.PathLike) -> list[Job]:
     """Jobs of a JSON Lines file: on each line an object with the fields of `Job`; empty lines are left out.
 
+    folder: for outputs.
     Raises:
         InputError: the file cannot be read, a line is no job, or two jobs have one output; with file and lines.
     """
     file = Path(file)
     try:
-        text = file.read_text(encoding="utf-8")
+        text = file.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         why = getattr(error, "strerror", None) or "it is not UTF-8"
         raise InputError(f"{file}: the jobs cannot be read: {why}") from None
     # Not `splitlines`, which also ends lines within strings, at U+2028.
     numbered = ((f"{file}:{number}", line) for number, line in enumerate(text.split("\n"), 1) if line.strip())
-    return checked((place, _decoded(place, line)) for place, line in numbered)
+    return checked(((place, _decoded(place, line)) for place, line in numbered), folder)
 
 
-def checked(numbered: Iterable[tuple[str, object]]) -> list[Job]:
-    """Jobs of mappings with the fields of `Job`, and of each the place where it stands."""
+def checked(numbered: Iterable[tuple[str, object]], folder: str | os.PathLike) -> list[Job]:
+    """Jobs of mappings with the fields of `Job`, and of each the place where it stands. folder: for outputs."""
     jobs = [_job(place, values) for place, values in numbered]
     if not jobs:
         raise InputError("the batch is empty; give at least one job, such as " + _EXAMPLE)
     first: dict[str, Job] = {}
     for job in jobs:
-        other = first.setdefault(os.path.normpath(job.output), job)
+        other = first.setdefault(os.path.abspath(os.path.join(folder, job.output)), job)
         if other is not job:
             raise InputError(f"{job.place}: {job.output} is the output of {other.place} too; give each its own")
     return jobs

@@ -8,7 +8,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,10 +20,14 @@ from pathjax.io.load import load_scene
 from pathjax.rendering.progressive.until import Render
 from pathjax.scene.parameters import with_parameters
 from pathjax.scene.scene import Scene
+from pathjax.system.files import check_room
 from pathjax.system.interrupts import Interrupts
+from pathjax.system.output import say
 
 # Scenes that are loaded ahead.
 _AHEAD = 2
+# Seconds between lines of progress, where there is no bar.
+_TELLS = 60
 
 
 @dataclass(frozen=True)
@@ -33,7 +37,7 @@ class Outcome:
     job: Job
     output: Path
     status: str  # "done"; "skipped", as the output was there; "failed"; "unwritten"; "waiting", as the batch ended
-    message: str = ""  # why it failed, or what it has not reached; with the place of the job
+    message: str = ""  # why it failed, what it has not reached, or that it is old; with the place of the job
     spp: float = 0.0
     error: float = math.nan  # of `RenderResult`
     load_seconds: float = 0.0
@@ -50,11 +54,10 @@ def render_batch(
 ) -> list[Outcome]:
     """Render many scenes to image files. Those of one structure share a kernel, however many triangles each has.
 
-    Images are those that `render_until` gives with the limits of the job, up to rounding, and the same bits each time
-    (of the scenes that pathjax ships and is tested with all but one are the same bits). An output that exists is kept,
-    and its job skipped, so that a batch which was stopped, or killed, goes on when it is called again; outputs appear
-    whole or not at all. A job that fails does not end the others; but an output that cannot be written does, as the
-    rest would be lost too.
+    Images are those that `render_until` gives with the limits of the job, bit for bit. An output that exists is kept,
+    and its job skipped, so that a batch which was stopped, or killed, goes on when it is called again; of one that is
+    older than its scene's file it is told. Outputs appear whole or not at all. A job that fails does not end the
+    others; but an output that cannot be written does, as the rest would be lost too.
 
     Args:
         jobs: a file of JSON Lines, or mappings: each with the keys of `Job`. Scenes are relative to the file's folder;
@@ -65,13 +68,13 @@ def render_batch(
     Returns:
         the outcome of each job of this part. Ctrl-C ends the batch, without the image that it is at.
     Raises:
-        InputError: the list of jobs is wrong, with the place of what is, or the folder cannot be made; nothing was
-            rendered then.
+        InputError: the list of jobs is wrong, with the place of what is, or the folder cannot be made or written to;
+            nothing was rendered then.
     """
     if isinstance(jobs, str | os.PathLike):
-        listed, beside = job_lists.read(jobs), Path(jobs).parent
+        listed, beside = job_lists.read(jobs, folder), Path(jobs).parent
     else:
-        listed, beside = job_lists.checked((f"job {number}", job) for number, job in enumerate(jobs)), Path()
+        listed, beside = job_lists.checked(((f"job {number}", job) for number, job in enumerate(jobs)), folder), Path()
     index, parts = part
     if not 0 <= index < parts:
         raise InputError(f"part = {part}; (I, N) is part I of N, from 0 to N - 1")
@@ -80,10 +83,11 @@ def render_batch(
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"{folder}: the folder cannot be made: {error.strerror or error}") from None
+    check_room(folder)
     outcomes: list[Outcome] = []
     with Interrupts() as interrupts, _told(progress, len(mine)) as tell, ThreadPoolExecutor(1) as thread:
         for job, output, scene in _loaded(mine, beside, folder, thread):
-            outcome = _outcome(job, output, scene, interrupts)
+            outcome = _outcome(job, output, scene, interrupts) if scene else _skipped(job, output, beside)
             if outcome is not None:
                 outcomes.append(outcome)
                 tell(outcome)
@@ -104,18 +108,25 @@ def _loaded(jobs: list[Job], beside: Path, folder: Path, thread: ThreadPoolExecu
     yield from waiting
 
 
+def _skipped(job: Job, output: Path, beside: Path) -> Outcome:
+    try:
+        old = output.stat().st_mtime < (beside / job.scene).stat().st_mtime
+    except OSError:  # one of them is gone, which is nothing to tell of a job that is done
+        old = False
+    told = f"{job.place}: {output} is older than {job.scene}, and kept; delete it to have it rendered anew"
+    return Outcome(job, output, "skipped", told if old else "")
+
+
 def _load(job: Job, beside: Path) -> tuple[Scene, float]:
     started = time.perf_counter()
     scene = load_scene(beside / job.scene, sensor=job.sensor, parameters=job.parameters)
     return with_parameters(scene, job.set), time.perf_counter() - started
 
 
-def _outcome(job: Job, output: Path, loading: Future | None, interrupts: Interrupts) -> Outcome | None:
+def _outcome(job: Job, output: Path, loading: Future, interrupts: Interrupts) -> Outcome | None:
     """Render a job and write its image; None: a signal came before the image was whole."""
     if interrupts.heard:
         return None
-    if loading is None:
-        return Outcome(job, output, "skipped")
     try:
         scene, load_seconds = loading.result()
         no_limit = job.spp is None and job.error is None and job.time is None
@@ -142,20 +153,37 @@ def _outcome(job: Job, output: Path, loading: Future | None, interrupts: Interru
 
 @contextmanager
 def _told(progress: bool | Callable[[Outcome], None], count: int) -> Iterator[Callable[[Outcome], None]]:
-    """A context with a function that shows outcomes as they come."""
+    """A context with a function that shows outcomes as they come: by a bar, or lines where stderr is no terminal."""
     if progress is not True:
         yield progress or (lambda outcome: None)
         return
     from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
-    columns = BarColumn(), MofNCompleteColumn(), TextColumn("{task.description}"), TimeRemainingColumn()
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task("", total=count)
+    started = told = time.monotonic()
+    seen, rendered = 0, 0
+    console = Console(stderr=True)
+    columns = BarColumn(), MofNCompleteColumn(), TextColumn("{task.description}")
+    bar = Progress(*columns, console=console, transient=True) if console.is_terminal else None
+    with bar or nullcontext():
+        task = bar and bar.add_task("", total=count)
 
         def tell(outcome: Outcome) -> None:
+            nonlocal told, seen, rendered
+            seen, rendered, now = seen + 1, rendered + (outcome.status != "skipped"), time.monotonic()
+            left = f"{_time((now - started) / max(rendered, 1) * (count - seen))} left"
             if outcome.message:
-                bar.console.print(f"pathjax: {outcome.message}", markup=False, highlight=False, soft_wrap=True)
-            bar.update(task, advance=1, description=outcome.output.name)
+                say(outcome.message)
+            if bar:
+                bar.update(task, advance=1, description=f"{outcome.output.name}  {left}")
+            elif now - told >= _TELLS:
+                told = now
+                say(f"{seen} of {count} jobs, about {left}")
 
         yield tell
+
+
+def _time(seconds: float) -> str:
+    units = (1, "s"), (60, "min"), (3600, "h")
+    size, unit = next((each for each in units if seconds < 120 * each[0]), units[-1])
+    return f"{seconds / size:.0f} {unit}"

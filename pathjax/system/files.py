@@ -50,6 +50,25 @@ def check_writable(path: str | Path, sources: Iterable[str | Path] = ()) -> None
                 raise InputError(f"{path}: is read by the same command; name another file to write")
 
 
+def check_room(folder: Path) -> None:
+    """Refuse a folder in which no file can be made, or no page of one: the rest of the disk is known when it is full.
+
+    Raises:
+        InputError
+    """
+    probe = folder / f".{os.getpid()}.part"
+    try:
+        try:
+            with open(probe, "wb") as file:
+                file.write(bytes(1 << 12))
+                file.flush()
+                os.fsync(file.fileno())
+        finally:
+            probe.unlink(missing_ok=True)
+    except OSError as error:
+        raise InputError(f"{folder}: nothing can be written there: {error.strerror or error}") from None
+
+
 @contextlib.contextmanager
 def _beside(path: Path) -> Iterator[Path]:
     """A file beside `path`, gone afterwards; any failure to write is an InputError that names `path`."""

@@ -1,7 +1,9 @@
 """Batches: scenes of one structure share a kernel, and nothing of a batch is lost, done twice or half done."""
 
 import errno
+import itertools
 import json
+import os
 import random
 import subprocess
 import sys
@@ -157,6 +159,23 @@ def test_outputs_that_are_there_are_kept(folder, tmp_path, run):
     assert "1 skipped" in err
 
 
+def test_outputs_that_are_older_than_their_scene_are_kept_and_told(folder, tmp_path, run):
+    for name in ("0.exr", "1.exr"):
+        (tmp_path / name).touch()
+    os.utime(tmp_path / "1.exr", (0, 0))
+    status, _, err = run("batch", write_jobs(folder / "old.jsonl", some_jobs(2)), "-o", tmp_path)
+    assert (status, (tmp_path / "1.exr").read_text()) == (0, "")
+    assert "old.jsonl:2: " in err and "1.exr is older than 1.xml" in err and "old.jsonl:1" not in err
+
+
+def test_progress_and_the_time_left_are_told_in_lines_where_there_is_no_terminal(folder, tmp_path, run, monkeypatch):
+    monkeypatch.setattr("pathjax.batch.run._TELLS", 0)
+    for number in range(3):
+        (tmp_path / f"{number}.exr").touch()
+    _, _, err = run("batch", write_jobs(folder / "lines.jsonl", some_jobs()), "-o", tmp_path)
+    assert "pathjax: 3 of 4 jobs, about" in err and "pathjax: 4 of 4 jobs, about 0 s left" in err
+
+
 def test_parts_share_the_jobs(folder, tmp_path):
     jobs = write_jobs(folder / "parts.jsonl", some_jobs(3))
     for number in range(3):
@@ -165,10 +184,21 @@ def test_parts_share_the_jobs(folder, tmp_path):
     assert [[outcome.output.name for outcome in part] for part in parts] == [["0.exr", "2.exr"], ["1.exr"]]
 
 
-def test_a_full_disk_ends_the_batch_and_leaves_nothing_half_written(folder, tmp_path, monkeypatch):
+def test_a_folder_that_is_full_is_refused_before_anything_is_rendered(folder, tmp_path, refused, monkeypatch):
     def full(_):
         raise OSError(errno.ENOSPC, "No space left on device")
 
+    monkeypatch.setattr("pathjax.system.files.os.fsync", full)
+    refused("batch", write_jobs(folder / "all.jsonl", some_jobs(1)), "-o", tmp_path, says=["No space left"])
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_disk_that_becomes_full_ends_the_batch_and_leaves_nothing_half_written(folder, tmp_path, monkeypatch):
+    def full(_):
+        if next(calls):
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+    calls = itertools.count()
     monkeypatch.setattr("pathjax.system.files.os.fsync", full)
     outcomes = pj.render_batch(write_jobs(folder / "no_room.jsonl", some_jobs(2)), tmp_path)
     assert [outcome.status for outcome in outcomes] == ["unwritten", "waiting"]
@@ -208,6 +238,12 @@ def test_wrong_lists_are_refused_before_anything_is_rendered(tmp_path, refused, 
     jobs = tmp_path / "jobs.jsonl"
     jobs.write_text(text)
     refused("batch", jobs, "-o", tmp_path, says=says)
+
+
+def test_two_names_of_one_output_are_refused(tmp_path):
+    jobs = [{"scene": "a.xml", "output": output} for output in ("a.exr", tmp_path / "a.exr")]
+    with pytest.raises(pj.InputError, match="job 1: .* is the output of job 0 too"):
+        pj.render_batch(jobs, tmp_path)
 
 
 def test_what_is_no_job_is_refused():
