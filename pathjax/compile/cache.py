@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import hashlib
 import itertools
 import os
@@ -159,6 +160,7 @@ def _key(function, arguments, static) -> str:
     return code.hexdigest()[:32]
 
 
+@functools.cache
 def _sources() -> list[tuple]:
     """What tells whether the package is the same, as Python tells whether a module is the one that it has compiled."""
     files = sorted(Path(__file__).parents[1].rglob("*.py"))

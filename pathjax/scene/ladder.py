@@ -57,7 +57,7 @@ def padded(scene: Scene) -> Scene:
     lit, emitters = _emitters(scene.emitters, np.asarray(scene.geometry.light))
     geometry = _geometry(replace(scene.geometry, light=lit))
     scene = replace(scene, geometry=geometry, materials=materials, media=media, emitters=emitters)
-    return jax.tree.map(jax.device_put, scene)  # which each call of a kernel would do again
+    return jax.device_put(scene)  # which each call of a kernel would do again
 
 
 def _geometry(geometry: Geometry) -> Geometry:
