@@ -1,7 +1,8 @@
 """Grids of volumes in kernels: their values at a point, and their integral along a ray.
 
 Between the planes through the centres of cells the interpolation is a polynomial of degree 3 along a ray, of which two
-points of Gauss's quadrature give the integral exactly. So the optical depth of a way is known without chance, as in a
+points of Gauss's quadrature give the integral exactly. Where values are not interpolated, but each fills its cell, the
+planes are the faces of cells. So the optical depth of a way is known without chance, as in a
 homogeneous medium, and so is where it reaches a given one ("regular tracking": Novak et al. 2018, "Monte Carlo Methods
 for Volumetric Light Transport Simulation", section 4.1). The price is a step for each plane.
 """
@@ -36,8 +37,9 @@ class Grids:
     values: Float[Array, "T C"]  # of one after the other, x running fastest
     first: Int[Array, " G"]  # cell of each
     size: Int[Array, "G 3"]  # cells along x, y, z
-    to_grid: Float[Array, "G 3 4"]
+    to_grid: Float[Array, "G 3 4"]  # to where the planes lie at integers
     box: Float[Array, "G 2 3"]
+    nearest: Bool[Array, " G"] | None = None  # which are not interpolated; None: none of them
 
 
 class _Line(NamedTuple):
@@ -45,7 +47,8 @@ class _Line(NamedTuple):
 
     o: Float[Array, "3"]
     d: Float[Array, "3"]
-    last: Float[Array, "3"]  # cell coordinates of the last centres
+    last: Float[Array, "3"]  # those of the last planes
+    varies: Bool[Array, "3"]  # along which axes values vary between planes
 
 
 class _March(NamedTuple):
@@ -63,10 +66,13 @@ def build(of: list[GridVolume | None], dtype) -> Grids:
     cells = [np.broadcast_to(grid.data, (*grid.data.shape[:3], channels)).reshape(-1, channels) for grid in present]
     first = np.cumsum([0, *map(len, cells[:-1])])
     size = [grid.data.shape[2::-1] for grid in present]
-    numbers = np.concatenate(cells), np.stack([x.to_grid for x in present]), np.stack([x.box for x in present])
+    nearest = np.array([grid.nearest for grid in present])
+    to_grid = np.stack([x.to_grid for x in present])
+    to_grid[nearest, :, 3] += 0.5
+    numbers = np.concatenate(cells), to_grid, np.stack([x.box for x in present])
     values, to_grid, box = (np.asarray(x, dtype) for x in numbers)
     rows, first, size = (np.asarray(x, np.int32) for x in ([number[each] for each in of], first, size))
-    return Grids(rows, values, first, size, to_grid, box)
+    return Grids(rows, values, first, size, to_grid, box, nearest if nearest.any() else None)
 
 
 def look_up(grids: Grids, grid: Int[Array, ""], p: Float[Array, "3"]) -> Float[Array, " C"]:
@@ -154,8 +160,17 @@ def _follow(grids, grid, ray, distance, target) -> _March:
 
 def _line(grids, grid, ray) -> _Line:
     to_grid = at(grids.to_grid, grid)
-    last = (at(grids.size, grid) - 1).astype(ray.o.dtype)
-    return _Line(to_grid[:, :3] @ ray.o + to_grid[:, 3], to_grid[:, :3] @ ray.d, last)
+    last, varies = _planes(grids, grid, ray.o.dtype)
+    return _Line(to_grid[:, :3] @ ray.o + to_grid[:, 3], to_grid[:, :3] @ ray.d, last, varies)
+
+
+def _planes(grids, grid, dtype):
+    """`last` and `varies` of a line."""
+    last = (at(grids.size, grid) - 1).astype(dtype)
+    if grids.nearest is None:
+        return last, last > 0
+    nearest = at(grids.nearest, grid)
+    return jnp.where(nearest, last + 1, last), (last > 0) & ~nearest
 
 
 def _ends(grids, grid, ray):
@@ -194,19 +209,22 @@ def _integral(line, corners, low, t, length):
     middle, off = t + length / 2, length / (2 * np.sqrt(3.0).astype(length.dtype))
 
     def value(x):
-        return _interpolated(corners, _clipped(line.o + x * line.d - low, line.last))
+        return _interpolated(corners, _clipped(line.o + x * line.d - low, line.varies))
 
     return (value(middle - off) + value(middle + off)) * (length / 2)
 
 
-def _clipped(share, last):
+def _clipped(share, varies):
     """Beyond the outermost centres nothing changes; along an axis of one cell neither."""
-    return jnp.where(last > 0, jnp.clip(share, 0, 1), 0)
+    return jnp.where(varies, jnp.clip(share, 0, 1), 0)
 
 
 def _lowest(grids, grid, x):
     """The lowest corner (3,) of the cell of eight centres around cell coordinates."""
-    most = jnp.maximum(at(grids.size, grid) - 2, 0)
+    size = at(grids.size, grid)
+    most = jnp.maximum(size - 2, 0)
+    if grids.nearest is not None:
+        most = jnp.where(at(grids.nearest, grid), size - 1, most)
     return jnp.clip(jnp.floor(x).astype(jnp.int32), 0, most)
 
 
@@ -216,7 +234,7 @@ def _corners(grids, grid, x):
 
 def _shares(grids, grid, x):
     low = _lowest(grids, grid, x).astype(x.dtype)
-    return _clipped(x - low, (at(grids.size, grid) - 1).astype(x.dtype))
+    return _clipped(x - low, _planes(grids, grid, x.dtype)[1])
 
 
 def _corners_at(grids, grid, low):

@@ -24,7 +24,7 @@ UNIT = np.array([[0.0] * 3, [1.0] * 3])
 
 @dataclass(frozen=True, eq=False)
 class GridVolume(Stored):
-    """Values at the centres of the cells of a box, and between them the trilinear interpolation.
+    """Values at the centres of the cells of a box, and between them the trilinear interpolation, or none of it.
 
     Beyond the outermost centres they stay the same.
     """
@@ -33,6 +33,7 @@ class GridVolume(Stored):
     to_grid: np.ndarray  # (3, 4), from world space to where the centre of cell i lies at i; x, y, z
     box: np.ndarray  # (2, 3) lower and upper corner in world space of the box around it, beyond which nothing is
     repeats: bool = False  # instead: see `repeated`
+    nearest: bool = False  # each value fills its cell
     listed: bool = False  # its values are a parameter of the scene
     box_of_file: np.ndarray = field(default_factory=lambda: UNIT)  # (2, 3), which a file of its values states
 
@@ -40,7 +41,6 @@ class GridVolume(Stored):
         "accel": Unused("boolean"),
         "max_value": Unused("float", "it bounds Mitsuba's steps", at_least=0),
         "raw": Unused("boolean", "its colours are linear RGB"),
-        "filter_type": Unused("string", "values are interpolated", choices=("trilinear",)),
     }
 
     @classmethod
@@ -62,7 +62,8 @@ class GridVolume(Stored):
             raise fields.element.error(f"{path}: its values must {what}, and are {data.min():g} to {data.max():g}")
         repeats = fields.string("wrap_mode", "clamp", choices=("clamp", "mirror", "repeat")) == "repeat"
         placed = _placed(fields.transform("to_world"), box, data.shape[2::-1])
-        return cls(data, *placed, repeats, listed=not repeats, box_of_file=box)
+        nearest = fields.string("filter_type", "trilinear", choices=("trilinear", "nearest")) == "nearest"
+        return cls(data, *placed, repeats, nearest, listed=not repeats, box_of_file=box)
 
     def write(self, path: Path, data: np.ndarray) -> None:
         write_vol(path, data, self.box_of_file)
@@ -79,7 +80,7 @@ class GridVolume(Stored):
             raise InputError(f"a repeated grid fills its medium with {cells:.2g} cells, more than {MOST_CELLS:.2g}")
         x, y, z = (np.arange(low[k], high[k] + 1) % self.data.shape[2 - k] for k in range(3))
         moved = self.to_grid - np.pad(low[:, None], ((0, 0), (3, 0)))
-        return GridVolume(self.data[np.ix_(z, y, x)], moved, self.box)
+        return GridVolume(self.data[np.ix_(z, y, x)], moved, self.box, nearest=self.nearest)
 
 
 def boxed(value: np.ndarray, to_world: np.ndarray) -> GridVolume:

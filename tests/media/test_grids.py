@@ -27,11 +27,11 @@ def volume(data, to_world=CUBE, **more):
     return {"type": "gridvolume", "data": np.asarray(data, float), "to_world": to_world, **more}
 
 
-def record(data, to_world):
+def record(data, to_world, nearest=False):
     placed = boxed(np.ones(3), to_world).box  # of the same unit cube
     to_cells = np.diag([*data.shape[2::-1], 1.0])
     to_cells[:3, 3] = -0.5
-    return GridVolume(data, (to_cells @ np.linalg.inv(to_world))[:3], placed)
+    return GridVolume(data, (to_cells @ np.linalg.inv(to_world))[:3], placed, nearest=nearest)
 
 
 def rays(count, seed=0):
@@ -46,19 +46,22 @@ RNG = np.random.default_rng(5)
 TURNED = pj.Transform().rotate([1, 2, 3], 40).scale([2, 1.5, 1]).translate([-0.6, -0.5, -0.4]).matrix
 
 
-@pytest.fixture(scope="module")
-def two():
+@pytest.fixture(scope="module", params=["trilinear", "nearest", "one of each"])
+def two(request):
     """Grids of one number and of three."""
-    one, other = record(RNG.random((3, 4, 2, 1)) * 3, TURNED), record(RNG.random((1, 5, 3, 3)), CUBE)
-    return grids.build([one, other], np.float32)
+    data, filters = (RNG.random((3, 4, 2, 1)) * 3, RNG.random((1, 5, 3, 3))), request.param
+    one = record(data[0], TURNED, nearest=filters != "trilinear")
+    return grids.build([one, record(data[1], CUBE, nearest=filters == "nearest")], np.float32)
 
 
 @pytest.mark.parametrize("form", [pytest.param("lanes", marks=slow), "vmap"])
 def test_depths_are_integrals_of_what_is_looked_up(two, form):
-    """The midpoint rule is off by its own error alone, some 1e-3 of what it adds up."""
+    """The midpoint rule is off by its own error alone, some 1e-3 of what it adds up, and by half a step for each face
+    at which values jump by up to 3.
+    """
     o, d = rays(300)
     number = jnp.arange(300, dtype=jnp.int32) % 2
-    steps = 400
+    steps = 400 if two.nearest is None else 2000
 
     def both(item, two):
         o, d, number = item
@@ -125,6 +128,36 @@ def test_what_absorbs_in_a_grid_is_beers_law_and_so_is_its_derivative():
     image, J = pj.jacobian(made, ["cube_interior.scale"], spp=1)
     np.testing.assert_allclose(image, np.exp(-0.7 * depth), rtol=1e-5)
     np.testing.assert_allclose(J["cube_interior.scale"], -depth * np.exp(-0.7 * depth), rtol=1e-4)
+
+
+@slow
+def test_cells_that_are_not_interpolated_absorb_by_beers_law_and_so_do_derivatives_in_them():
+    """Each cell is 2/3 thick; of the image's derivative in it the share is drawn by points on the way."""
+    cells = np.reshape([1.0, 3, 2], (3, 1, 1))
+    fog = {"type": "heterogeneous", "albedo": 0.0, "sigma_t": volume(cells, filter_type="nearest")}
+    made = scene(fog)
+    through = np.exp(-2 * np.mean(cells))
+    np.testing.assert_allclose(pj.render(made, spp=1), through, rtol=1e-5)
+
+    def image(values):
+        return pj.render(pj.with_parameters(made, {NAME: values}), 1024).mean()
+
+    found = jax.grad(image)(pj.parameters(made)[NAME])
+    # Of 4096 points a third is expected in each cell: within 4 standard errors.
+    np.testing.assert_allclose(found.ravel() / (-2 * through), 1 / 3, atol=4 * np.sqrt(2 / 9 / 4096))
+
+
+def test_the_nearest_value_is_that_of_the_cell():
+    data = RNG.random((3, 4, 2, 1))
+    made = record(data, TURNED, nearest=True)
+    p = made.box[0] + RNG.random((50, 3)) * (made.box[1] - made.box[0])
+    cell = np.clip(np.rint(p @ made.to_grid[:, :3].T + made.to_grid[:, 3]).astype(int), 0, [1, 3, 2])
+    built = grids.build([made], np.float32)
+    found = jax.vmap(lambda p: grids.look_up(built, 0, p))(jnp.asarray(p, jnp.float32))
+    np.testing.assert_allclose(found, data[cell[:, 2], cell[:, 1], cell[:, 0]], rtol=1e-6)
+    entries = jax.vmap(lambda p: grids.entries(built, 0, p))(jnp.asarray(p, jnp.float32))
+    told = sum(share[:, None] * np.asarray(built.values)[place] for place, share in entries)
+    np.testing.assert_allclose(told, found, rtol=1e-6)
 
 
 @slow
@@ -269,8 +302,15 @@ BLEND = """<phase type="blendphase"><float name="weight" value="0.3"/>
 
 
 @slow
-@pytest.mark.parametrize(("wrap", "phase"), [("clamp", '<phase type="rayleigh"/>'), ("repeat", BLEND)])
-def test_clouds_agree_with_mitsuba(tmp_path, wrap, phase):
+@pytest.mark.parametrize(
+    ("wrap", "values", "phase"),
+    [
+        ("clamp", "trilinear", '<phase type="rayleigh"/>'),
+        ("repeat", "trilinear", BLEND),
+        ("repeat", "nearest", '<phase type="hg"/>'),
+    ],
+)
+def test_clouds_agree_with_mitsuba(tmp_path, wrap, values, phase):
     """Means over 16 seeds, of blocks of 4 x 4 pixels: of 192 numbers none is off by 5 errors (t-test, 1 in 1000)."""
     pytest.importorskip("mitsuba")
     write_vol(tmp_path / "sigma.vol", RNG.random((4, 3, 5, 1)) * 3)
@@ -279,7 +319,7 @@ def test_clouds_agree_with_mitsuba(tmp_path, wrap, phase):
     smaller = place.replace("<scale", '<scale value="0.4"/><rotate z="1" angle="20"/><scale')
     volumes = "".join(
         f'<volume name="{name}" type="gridvolume"><string name="filename" value="{file}.vol"/>{where}'
-        f'<string name="wrap_mode" value="{wrap}"/></volume>'
+        f'<string name="wrap_mode" value="{wrap}"/><string name="filter_type" value="{values}"/></volume>'
         for name, file, where in (("sigma_t", "sigma", place), ("albedo", "albedo", smaller))
     )
     (tmp_path / "clouds.xml").write_text(f"""<scene version="3.0.0"><integrator type="volpath"/>
@@ -361,7 +401,7 @@ def test_files_that_are_no_volumes_are_refused(tmp_path, content, says):
         ({"sigma_t": volume(np.ones((2, 2)))}, "must have the shape"),
         ({"sigma_t": volume(np.ones((1, 1, 1)), wrap_mode="black")}, 'cannot be "black"'),
         ({"type": "homogeneous", "albedo": volume(np.ones((1, 1, 1)), wrap_mode="repeat")}, "repeats without end"),
-        ({"sigma_t": volume(np.ones((1, 1, 1)), filter_type="nearest")}, 'cannot be "nearest"'),
+        ({"sigma_t": volume(np.ones((1, 1, 1)), filter_type="cubic")}, 'cannot be "cubic"'),
     ],
 )
 def test_grids_that_are_not_modelled_are_refused(inside, says):
