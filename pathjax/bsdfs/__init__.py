@@ -28,6 +28,8 @@ from pathjax.bsdfs.mask import Mask
 from pathjax.bsdfs.normalmap import NormalMap
 from pathjax.bsdfs.null import Null
 from pathjax.bsdfs.plastic import Plastic
+from pathjax.bsdfs.polarizer import Circular, Polarizer, Retarder
+from pathjax.bsdfs.pplastic import PPlastic
 from pathjax.bsdfs.principled import Principled
 from pathjax.bsdfs.principledthin import PrincipledThin
 from pathjax.bsdfs.roughconductor import RoughConductor
@@ -48,6 +50,7 @@ __all__ = [
     "BSDF",
     "BlendBSDF",
     "BumpMap",
+    "Circular",
     "Conductor",
     "Dielectric",
     "Diffuse",
@@ -55,9 +58,12 @@ __all__ = [
     "Materials",
     "NormalMap",
     "Null",
+    "PPlastic",
     "Plastic",
+    "Polarizer",
     "Principled",
     "PrincipledThin",
+    "Retarder",
     "RoughConductor",
     "RoughDielectric",
     "RoughPlastic",
@@ -79,9 +85,13 @@ KINDS: dict[str, type[BSDF]] = {
     "roughplastic": RoughPlastic,
     "principled": Principled,
     "principledthin": PrincipledThin,
+    "pplastic": PPlastic,
     "twosided": TwoSided,
     "blendbsdf": BlendBSDF,
     "mask": Mask,
+    "polarizer": Polarizer,
+    "circular": Circular,
+    "retarder": Retarder,
     "bumpmap": BumpMap,
     "normalmap": NormalMap,
 }

@@ -260,6 +260,8 @@ class Fields:
             match unused.tag:
                 case "float":
                     self.float(name, None, at_least=unused.at_least)
+                case "color":
+                    self.color(name, None)
                 case "integer":
                     self.integer(name, None, at_least=max(unused.at_least, 0), at_most=2**32 - 1)
                 case "boolean":

@@ -198,7 +198,7 @@ class Shared(Declared):
 class Unused:
     """A parameter that Mitsuba's plugin takes, and on which no image depends here."""
 
-    tag: str  # "float", "integer", "boolean", "string" or "transform"
+    tag: str  # "float", "color", "integer", "boolean", "string" or "transform"
     why: str = ""  # what the note adds
     choices: tuple[str, ...] = ()  # of a string; none: any
     at_least: float = -math.inf  # of a number; integers are never negative

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pathjax import bsdfs, testing
-from pathjax.bsdfs import Plastic, fresnel
+from pathjax.bsdfs import Plastic, PPlastic, fresnel
 
 COLORS = {"diffuse_reflectance": np.array([0.9, 0.3, 0.0]), "specular_reflectance": np.array([0.2, 0.5, 1.0])}
 slow = pytest.mark.slow
@@ -99,3 +99,36 @@ def test_values_and_densities_are_those_of_mitsuba(mitsuba_values, values):
     np.testing.assert_allclose(f, their_f, rtol=1e-4, atol=1e-6)
     np.testing.assert_allclose(pdf, their_pdf, rtol=1e-4, atol=1e-6)
     assert their_f.any()
+
+
+# ---- pplastic -------------------------------------------------------------------------------------------------------
+
+ADDED = [
+    {},
+    {**COLORS, "int_ior": 1.9, "alpha": 0.3, "distribution": "ggx"},
+    {"int_ior": 1.0, "ext_ior": 1.4, "alpha": 0.5},
+    {"alpha_u": 0.1, "alpha_v": 0.5, "distribution": "ggx"},
+]
+
+
+@slow
+@pytest.mark.parametrize("values", ADDED, ids=str)
+def test_plastic_of_added_lobes_passes_the_checks_of_all_kinds(values):
+    testing.check_bsdf(PPlastic, samples=50_000, **values)
+
+
+@pytest.mark.parametrize("values", ADDED, ids=str)
+def test_values_of_added_lobes_are_those_of_mitsuba(mitsuba_values, values):
+    """To 0.35 % of the part of Beckmann's shadows, by whose approximation both go."""
+    rng = np.random.default_rng(1)
+    wi, wo = (w / np.linalg.norm(w, axis=1, keepdims=True) for w in rng.normal(size=(2, 200, 3)))
+    wi[:, 2] = abs(wi[:, 2])
+    wo[:100] = wi[:100] * [-1, -1, 1] + 0.05 * wo[:100]  # near the mirror direction
+    wo /= np.linalg.norm(wo, axis=1, keepdims=True)
+    materials = testing.material(PPlastic, **values)
+
+    def ours(wi, wo):
+        return bsdfs.evaluate(materials, jnp.int32(0), jnp.int32(0), testing._SURFACE, wi, wo)[0]
+
+    f = jax.jit(jax.vmap(ours))(jnp.asarray(wi, jnp.float32), jnp.asarray(wo, jnp.float32))
+    np.testing.assert_allclose(f, mitsuba_values("pplastic", values, wi, wo)[0], rtol=2e-3, atol=1e-5)

@@ -201,6 +201,27 @@ def test_light_that_no_ray_meets_comes_through_masks(load_text, integrator, lit)
         assert image[depth - 1].any() == (depth == lit)
 
 
+@pytest.mark.parametrize("kind, share", [("polarizer", 0.5), ("circular", 0.5), ("retarder", 1)])
+def test_sheets_that_polarise_let_a_share_through_and_absorb_the_rest(make_scene, kind, share):
+    """Seen before the sky, within 5 standard errors; the derivative is that of the mean in each sample."""
+    sheet = f'<bsdf type="{kind}" id="it"><float name="transmittance" value="0.8"/></bsdf>'
+    scene = make_scene(PLATE.format(sheet) + SKY, res=8, fov=1)
+    image, J = pj.jacobian(scene, ["it.transmittance"], spp=1024)
+    p = 0.8 * share
+    assert np.asarray(image).mean() == pytest.approx(p, abs=5 * np.sqrt(p * (1 - p) / (64 * 1024)))
+    assert np.asarray(J["it.transmittance"]).mean() == pytest.approx(share, rel=0.03)
+
+
+def test_a_sheet_of_a_colour_is_refused_and_one_of_grey_is_not(make_scene):
+    inside = '<rgb name="transmittance" value="{}"/><spectrum name="theta" value="9"/>'
+    sheet = f'<bsdf type="polarizer" id="it">{inside}</bsdf>'
+    scene = make_scene(PLATE.format(sheet.format("0.4, 0.4, 0.4")) + SKY)
+    assert pj.parameters(scene)["it.transmittance"] == pytest.approx(0.4)
+    assert any("theta has no effect: light has no polarisation" in note for note in scene.about.description.notes)
+    with pytest.raises(InputError, match="transmittance.*has a colour; only a number, or a grey"):
+        make_scene(PLATE.format(sheet.format("0.4, 0.5, 0.4")) + SKY)
+
+
 @pytest.mark.slow
 def test_a_furnace_of_masks_stays_white(make_scene):
     white = '<bsdf type="diffuse"><rgb name="reflectance" value="1"/></bsdf>'

@@ -105,6 +105,8 @@ CASES = {
     "plastic, nonlinear": on_ball("plastic", '<boolean name="nonlinear" value="true"/>', rgb("diffuse_reflectance")),
     "roughplastic": on_ball("roughplastic", GLASS, SPECULAR, rgb("diffuse_reflectance"), numbers(alpha=0.2)),
     "roughplastic, ggx": on_ball("roughplastic", GGX, GLASS, rgb("diffuse_reflectance"), numbers(alpha=0.3)),
+    "pplastic": on_ball("pplastic", GLASS, SPECULAR, rgb("diffuse_reflectance"), numbers(alpha=0.2)),
+    "pplastic, brushed ggx": on_ball("pplastic", GGX, rgb("diffuse_reflectance"), numbers(alpha_u=0.4, alpha_v=0.2)),
     "null": on_pane("null"),
     "principled": on_ball(
         "principled",
@@ -127,6 +129,9 @@ CASES = {
     "twosided": LIGHT + PANE.format(f'<bsdf type="twosided">{bsdf("diffuse", rgb("reflectance"))}</bsdf>'),
     "blendbsdf": on_ball("blendbsdf", numbers(weight=0.4), GREY, '<bsdf type="roughconductor" id="around-metal"/>'),
     "mask": on_pane("mask", numbers(opacity=0.4), f'<bsdf type="twosided">{GREY}</bsdf>'),
+    "polarizer": on_pane("polarizer", numbers(transmittance=0.7)),
+    "circular": on_pane("circular", numbers(transmittance=0.8)),
+    "retarder": on_pane("retarder", numbers(transmittance=0.6)),
     "bumpmap": on_ball(
         "bumpmap",
         '<texture type="bitmap"><string name="filename" value="textures/heights.png"/></texture>',
@@ -155,6 +160,10 @@ CASES = {
     ),
     "uniform": on_ball(
         "diffuse", '<texture type="uniform" name="reflectance"><float name="value" value="0.4"/></texture>'
+    ),
+    "volume": on_ball("diffuse", f'<texture type="volume" name="reflectance">{grid("volume", "tints")}</texture>'),
+    "volume, in a number": on_ball(
+        "roughconductor", METAL, f'<texture type="volume" name="alpha">{grid("volume", "tints")}</texture>'
     ),
     "mesh_attribute": LIGHT
     + TINTED.format(

@@ -297,9 +297,21 @@ def test_sphere_composes_center_radius_and_transform(read):
     np.testing.assert_allclose(sphere.to_world[:3, :3], [[0, -1, 0], [1, 0, 0], [0, 0, 1]], atol=1e-15)
 
 
-@pytest.mark.parametrize("step", ['<scale x="2"/>', '<matrix value="1 .5 0 0 1 0 0 0 1"/>'])
-def test_a_sphere_must_stay_a_sphere(refused, step):
-    assert "must stay a sphere" in refused(shape(f'<transform name="to_world">{step}</transform>'))
+@pytest.mark.parametrize(
+    ("step", "radius"),
+    [('<scale x="2"/>', 2), ('<scale x="2" y="-3"/>', 2), ('<matrix value="1 .5 0 0 1 0 0 0 1"/>', 1)],
+)
+def test_a_sphere_stays_a_sphere_of_the_scale_along_x_as_in_mitsuba(read, step, radius):
+    made = read(shape(f'<transform name="to_world">{step}<translate y="7"/></transform>'))
+    sphere = made.shapes[0].geometry
+    assert sphere.radius == pytest.approx(radius) and sphere.mirrored == ("-" in step)
+    np.testing.assert_allclose(sphere.center, [0, 7, 0])
+    assert any("as in Mitsuba it stays a sphere" in note for note in made.notes)
+
+
+def test_a_sphere_that_is_not_finite_is_refused(refused):
+    small = '<float name="radius" value="1e-40"/><transform name="to_world"><scale x="1e-10"/></transform>'
+    assert "too large or too small" in refused(shape(small))
 
 
 @pytest.mark.parametrize("kind", ["sphere", "cylinder"])
@@ -382,8 +394,7 @@ def test_conductor_is_an_ideal_mirror_unless_told_otherwise(read):
     ("kind", "inside", "words"),
     [
         ("hair", "", "is not supported: it stands on curves, which no ray is tested against; use one of diffuse, "),
-        ("polarizer", "", "is not supported: polarisation is not modelled; use one of diffuse, conductor, "),
-        ("circular", "", "is not supported: polarisation is not modelled; use one of diffuse, conductor, "),
+        ("measured", "", "is not supported: files of measured reflectance are not read; use one of diffuse, "),
         ("difuse", "", 'did you mean "diffuse"?'),
         ("diffuse", '<rgb name="reflectence" value="1"/>', 'it has: reflectance; did you mean "reflectance"?'),
         ("diffuse", '<rgb name="reflectance" value="1.1"/>', "between 0 and 1"),
@@ -741,10 +752,12 @@ def test_what_holds_nothing_to_be_seen_has_a_camera_at_the_origin(read):
     assert any("one at the origin is used" in note for note in scene.notes)
 
 
-def test_a_sensor_on_a_shape_is_left_out_or_refused_where_there_is_no_other(read, refused):
-    meter = shape('<sensor type="irradiancemeter"/>', "rectangle")
-    assert any("it measures what falls on a shape" in note for note in read(meter).notes)
-    assert "add a <sensor> outside of the shapes" in refused(meter, sensor="")
+def test_a_sensor_on_a_shape_is_used_where_there_is_no_other(read, refused):
+    film = '<film type="hdrfilm"><integer name="width" value="1"/><integer name="height" value="1"/></film>'
+    meter = shape(f'<sensor type="irradiancemeter">{film}</sensor>', "rectangle")
+    assert any("is left out, as the sensor at" in note for note in read(meter).notes)
+    assert read(meter, sensor="").view.camera.shape.geometry.closed is False
+    assert "measures one number" in refused(meter.replace(film, ""), sensor="")
 
 
 def test_films_and_samplers_may_be_referred_to(read):

@@ -92,9 +92,10 @@ MESHES = ("obj", "ply", "stl", "glb", "gltf", "serialized")
 NEEDS = {
     **dict.fromkeys(("perspective", "projector"), ["", '<float name="fov" value="40"/>']),
     "thinlens": [f'<float name="aperture_radius" value="1"/>{fov}' for fov in ("", '<float name="fov" value="40"/>')],
+    "batch": ['<sensor type="perspective"/>'],
     "instance": ['<shape type="shapegroup"/>'],
     **dict.fromkeys(
-        ("radiancemeter", "distant"),
+        ("radiancemeter", "distant", "irradiancemeter"),
         ['<film type="hdrfilm"><integer name="width" value="1"/><integer name="height" value="1"/></film>'],
     ),
     **dict.fromkeys(("uniform", "constvolume"), ['<float name="value" value="1"/>']),
@@ -142,6 +143,8 @@ def refusal(root, tmp_path_factory):
         tag = "emitter" if place == "area light" else place
         name = {"texture": ' name="reflectance"', "volume": ' name="albedo"'}.get(tag, "")
         element = f'<{tag} type="{kind}"{name}>{inside}</{tag}>'
+        if kind == "irradiancemeter":
+            element = f'<shape type="disk">{element}</shape>'
         file = folder / "scene.xml"
         file.write_text(f'<scene version="3.0.0">{PLACES[place].format(element)}</scene>')
         with pytest.raises(InputError) as error:

@@ -25,24 +25,18 @@ PLUGINS = {
     }.items()
 }
 
-_POLARISED = "polarisation is not modelled"
+_MEASURED = "files of measured reflectance are not read"
 # Why some of these are not modelled; the others may come.
 REASONS = {
-    "circular": _POLARISED,
-    "measured_polarized": _POLARISED,
-    "polarizer": _POLARISED,
-    "pplastic": _POLARISED,
-    "retarder": _POLARISED,
+    "measured_polarized": _MEASURED,
     "specfilm": "images are linear RGB",
     "depth": "it shows distances, which `pathjax render --aov depth` writes",
     "volprim_rf_basic": "ellipsoids that emit are not modelled",
-    "batch": "sensors that stand directly in <scene> are views of it, and one of them is chosen",
     "hair": "it stands on curves, which no ray is tested against",
     "bsplinecurve": "rays are not tested against curves",
     "linearcurve": "rays are not tested against curves",
     "sdfgrid": "rays are not tested against grids of distances",
-    "measured": "files of measured reflectance are not read",
-    "irradiancemeter": "sensors see surfaces from outside; an <emitter> in its place shines where it would look",
+    "measured": _MEASURED,
     "directionalarea": "each point shines in one direction, which no path from the camera meets",
     "timed_sunsky": "light does not change with time; <emitter type=\"sunsky\"> is its sky at one time",
 }
