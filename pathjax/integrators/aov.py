@@ -44,6 +44,8 @@ def mean(work: Work, scene: Scene) -> FirstHit:
 def sample(scene: Scene, pixel: Int[Array, ""], stream: sampler.Word, number: sampler.Word) -> FirstHit:
     """One sample, at the film position of `pixel.camera_ray`."""
     ray, weight = camera_ray(scene, pixel, stream, number)
+    if scene.camera.gain != 1:  # which is of radiance
+        weight = weight / scene.camera.gain
     if not scene.geometry.tables:
         return _nothing(scene)
     ray, hit, passed = _first(scene, ray)

@@ -45,6 +45,8 @@ def camera_ray(
     """
     u_film, u_lens = compute_once(camera_numbers(scene, stream, number, points))
     position, weight = film.sample_position(scene.film, pixel, u_film)
+    if scene.camera.gain != 1:
+        weight = scene.camera.gain * weight
     return compute_once((scene.camera.sample_ray(position, u_lens), weight))
 
 

@@ -6,14 +6,27 @@ made of. A filter is a class of `filters`. One row in a table makes a kind exist
 
 from __future__ import annotations
 
+from pathjax.sensors.batch import Batch
 from pathjax.sensors.distant import Distant
+from pathjax.sensors.irradiancemeter import IrradianceMeter
 from pathjax.sensors.orthographic import Orthographic
 from pathjax.sensors.perspective import Perspective
 from pathjax.sensors.radiancemeter import RadianceMeter
 from pathjax.sensors.sensor import Camera, Sensor
 from pathjax.sensors.thinlens import ThinLens
 
-__all__ = ["KINDS", "Camera", "Distant", "Orthographic", "Perspective", "RadianceMeter", "Sensor", "ThinLens"]
+__all__ = [
+    "KINDS",
+    "Batch",
+    "Camera",
+    "Distant",
+    "IrradianceMeter",
+    "Orthographic",
+    "Perspective",
+    "RadianceMeter",
+    "Sensor",
+    "ThinLens",
+]
 
 # By the name that scene files give them.
 KINDS: dict[str, type[Sensor]] = {
@@ -22,4 +35,6 @@ KINDS: dict[str, type[Sensor]] = {
     "orthographic": Orthographic,
     "radiancemeter": RadianceMeter,
     "distant": Distant,
+    "irradiancemeter": IrradianceMeter,
+    "batch": Batch,
 }

@@ -21,6 +21,8 @@ class Camera(ABC):
 
     origin: Float[Array, "3"]  # in world space
 
+    gain: ClassVar[float] = 1  # what is measured over the mean radiance of its rays
+
     @abstractmethod
     def sample_ray(self, position: Float[Array, "2"], u_lens: Float[Array, "2"]) -> Ray:
         """Return the ray through a point of the film; it starts on no primitive.
@@ -36,6 +38,8 @@ class Sensor(ABC):
     """What a scene file says of a sensor, NumPy and numbers."""
 
     one_pixel: ClassVar[bool] = False  # measures one number, whatever the filter
+    parts: ClassVar[int] = 1  # of the film, side by side
+    inner: ClassVar[bool] = True  # may be such a part
     # Nothing moves while the shutter is open.
     unused: ClassVar[Mapping[str, Unused]] = {"shutter_open": Unused("float"), "shutter_close": Unused("float")}
 

@@ -144,6 +144,9 @@ class Spheres(Table):
         n, pdf = outward * at(self.sign, row), _pdf(ball, one_minus_cos, outside, outward, d, distance)
         return LampSample(*compute_once((d, distance, n, pdf)), row)
 
+    def sample(self, row, u):
+        return self.from_square(row, u)
+
     def lamp_density(self, lamps, lamp, first, ray, hit, surface):
         ball = at(self.balls, hit.primitive - first)
         one_minus_cos, outside = _one_minus_cos(ball, ray.o)
@@ -189,9 +192,14 @@ class Sphere(Shape):
         local = np.eye(4)
         local[:3, 3] = fields.point("center", np.zeros(3))
         local[:3, :3] *= fields.float("radius", 1.0, above=0)
-        made = cls.of(fields.transform("to_world") @ local)
+        to_world = fields.transform("to_world") @ local
+        made = cls.of(to_world)
         if made is None:
-            raise fields.error("to_world", "scales unevenly or shears; a sphere must stay a sphere")
+            made = cls.of(_rounded(to_world))
+            if made is None:
+                raise fields.error("to_world", "makes a sphere that is too large or too small")
+            why = "scales unevenly or shears; as in Mitsuba it stays a sphere, of the scale along x"
+            loader.note(fields.where("to_world"), f"{why}; textures lie on it as on any other")
         return made
 
     @classmethod
@@ -215,6 +223,16 @@ class Sphere(Shape):
         rotation = linear / np.linalg.norm(linear, axis=0)
         balls = np.array([[*self.center, self.radius]])
         return Ball(balls, rotation.T[None], np.array([-1.0 if flip else 1.0]))
+
+
+def _rounded(to_world):
+    """What turns and moves like it, and scales all axes as it scales x."""
+    with np.errstate(all="ignore"):
+        u, _, vt = np.linalg.svd(to_world[:3, :3])
+        made = np.eye(4)
+        made[:3, :3] = u @ vt * np.linalg.norm(to_world[:3, 0])
+        made[:3, 3] = to_world[:3, 3]
+        return made
 
 
 def bounds(balls):

@@ -37,6 +37,8 @@ class ShapeGroup:
             shapes = loader.shapes(element)
             if any(shape.emitter is not None for shape in shapes):
                 raise element.error(f"{element} emits light, which instances cannot; put it outside of the group")
+            if any(on is element for on, _ in loader.on_surfaces.values()):
+                raise element.error(f"{element} holds a sensor, which instances cannot; put it outside of the group")
             made += shapes
         return made
 

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from pathjax import description as d
-from pathjax import emitters, sensors, textures
+from pathjax import emitters, media, sensors, textures
 from pathjax.description.elements import Document, Element, nearest
 from pathjax.description.fields import VALUES, Fields, is_one_color
 from pathjax.errors import InputError
@@ -24,7 +24,9 @@ from pathjax.io.mitsuba import dict_reader, instances, integrators, samplers
 from pathjax.io.mitsuba.plugins import PLUGINS, REASONS
 from pathjax.io.mitsuba.xml_reader import read
 from pathjax.kinds import Instance, Unused
-from pathjax.sensors import film
+from pathjax.media.gridvolume import GridVolume, boxed
+from pathjax.media.homogeneous import BoxedVolume
+from pathjax.sensors import Sensor, film
 from pathjax.shapes import KINDS as SHAPES
 from pathjax.shapes import Mesh
 from pathjax.textures import mesh_attribute
@@ -81,7 +83,8 @@ class _Loader:
         self.copied = 0  # triangles of instances
         self.placed: tuple[d.Shape, ...] = ()  # all of the scene, once they are known
         self.on_shapes: dict[Element, Element] = {}  # a light by reference, and the shape that it shines from
-        self.on_surfaces: list[Element] = []  # sensors inside of shapes
+        # Sensors inside of shapes, and the element and the shape that each is on; None: nothing of that is left.
+        self.on_surfaces: dict[Element, tuple[Element, d.Shape | None]] = {}
 
     def description(self, file: str, sensor: int | str = 0) -> d.Description:
         scene: dict[str, list[Element]] = {tag: [] for tag in TOP_LEVEL}
@@ -115,11 +118,8 @@ class _Loader:
         )
         shapes = tuple(shape for element in scene["shape"] for shape in self.shapes(element))
         self.placed = shapes
-        for element in self.on_surfaces:
-            if not scene["sensor"]:
-                raise element.error(f"{element} measures what falls on a shape; add a <sensor> outside of the shapes")
-            self.note(element, "is left out: it measures what falls on a shape")
-        sensors = scene["sensor"] or [self.camera(shapes)]
+        # In Mitsuba, too, those that stand on shapes come last.
+        sensors = [*scene["sensor"], *self.on_surfaces] or [self.camera(shapes)]
         names = [element.id or str(number) for number, element in enumerate(sensors)]
         name = d.chosen(names, sensor, sensors[0].file)
         seen = sensors[names.index(name)]
@@ -151,6 +151,24 @@ class _Loader:
             views,
             name,
         )
+
+    def measured(self, sensor: Element) -> d.Shape | None:
+        """The shape that a sensor stands on; None: it is on none."""
+        return self.on_surfaces.get(sensor, (None, None))[1]
+
+    def surface(self, element: Element) -> d.Shape:
+        """The one shape that an element stands for, which need not be in the scene."""
+        if element.attributes.get("type") in instances.KINDS:
+            raise element.error(f"{element} is not one shape")
+        if element not in self.made:
+            self.shapes(element)
+        if self.made[element] is None:
+            raise element.error(f"{element} has no area")
+        return self.made[element]
+
+    def inner_sensor(self, element: Element) -> Sensor:
+        """A sensor that is part of another, whose film and sampler it shares."""
+        return self.make(element, {key: kind for key, kind in sensors.KINDS.items() if kind.inner}, read=_inner_sensor)
 
     def camera(self, shapes: tuple[d.Shape, ...]) -> Element:
         """A sensor that frames the shapes, for a scene without one; it becomes part of the document."""
@@ -291,6 +309,13 @@ class _Loader:
         made = self.shared(element, owner)
         return textures.of_number(made, self.of_numbers) if of_number else made
 
+    def volume(self, fields: Fields, parameter: str, default: float) -> GridVolume:
+        """The volume that sets a parameter, of whatever values; a colour as one that is the same everywhere."""
+        element = fields.texture(parameter, "volume")
+        if element is None:
+            return boxed(fields.color(parameter, np.full(3, default)), np.eye(4))
+        return self.make(element, media.VOLUMES | {"constvolume": BoxedVolume}, np.inf)
+
     def find(self, fields: Fields, parameter: str) -> Path:
         """The file that a parameter names."""
         return self.document.find(fields.string(parameter), fields.where(parameter))
@@ -329,7 +354,7 @@ def _shape(loader: _Loader, fields: Fields, name: str) -> d.Shape | None:
         if other is not fields.element:
             raise fields.element.error(f"{element} shines from {other} already, at {other.place}; give each its own")
         emitter = loader.emitter(element, element.id or name, inside=True)
-    loader.on_surfaces += fields.objects("sensor")
+    meters = fields.objects("sensor")
     inherited = fields.element.id or None
     (nested,) = fields.objects("bsdf") or [_usual_bsdf(fields.element, lit=emitter is not None)]
     bsdf = loader.bsdf(nested, nested.id or inherited or loader.numbered("bsdf"))
@@ -341,11 +366,13 @@ def _shape(loader: _Loader, fields: Fields, name: str) -> d.Shape | None:
         _note_boundary(loader, fields.element, geometry, bsdf)
     if why := mesh_attribute.fault(bsdf, geometry.attributes):
         raise fields.element.error(f"{fields.element} {why}")
+    made = d.Shape(name, geometry, bsdf, emitter, flip_normals, interior, exterior)
     if geometry.empty:
         light = "" if emitter is None else ", and its light too"
         loader.note(fields.element, f"is left out, as no triangle has an area{light}")
-        return None
-    return d.Shape(name, geometry, bsdf, emitter, flip_normals, interior, exterior)
+        made = None
+    loader.on_surfaces.update(dict.fromkeys(meters, (fields.element, made)))
+    return made
 
 
 def _side(loader: _Loader, fields: Fields, name: str, side: str) -> Instance | None:
@@ -384,11 +411,22 @@ def _sensor(loader: _Loader, fields: Fields) -> d.View:
             place = films[0] if films else fields.element
             raise place.error(f"{fields.element} measures one number: its film must have width and height 1")
         made = replace(made, filter=sensors.filters.Box())
+    if made.width % camera.parts:
+        place = films[0] if films else fields.element
+        raise place.error(f"{fields.element} has {camera.parts} sensors; the width must be a multiple of that")
     spp = loader.make(drawn[0], samplers.KINDS) if drawn else samplers.DEFAULT_COUNT
     sampler = drawn[0].attributes["type"] if drawn else "independent"
     around = fields.objects("medium")
     medium = loader.shared(around[0], around[0].id or "sensor_medium") if around else None
     return d.View(camera, made, spp, sampler, medium)
+
+
+def _inner_sensor(loader: _Loader, fields: Fields) -> Sensor:
+    for tag, kinds in (("film", film.KINDS), ("sampler", samplers.KINDS)):
+        for element in fields.objects(tag):
+            loader.make(element, kinds)
+            loader.note(element, "has no effect inside a sensor that is part of another")
+    return sensors.KINDS[fields.type].read(loader, fields)
 
 
 def _kind_of_light(element: Element) -> type[emitters.Emitter]:
