@@ -250,8 +250,11 @@ def check_texture(kind: type[Texture], **values):
     made, code = jax.device_put(made), jnp.zeros(2, jnp.int32)
     uv = jnp.asarray(np.random.default_rng(0).uniform(-3, 3, (2000, 2)), jnp.float32)
 
+    def surface(uv):
+        return SimpleNamespace(uv=uv, p=jnp.stack([uv[0], uv[1], uv[0] * uv[1]]))
+
     def look_up(textures, uv):
-        return jax.vmap(lambda uv: textures.look_up(code, SimpleNamespace(uv=uv)))(uv)
+        return jax.vmap(lambda uv: textures.look_up(code, surface(uv)))(uv)
 
     colors = np.asarray(jax.jit(look_up)(made, uv))
     low, high = kind.span(instance)
@@ -260,7 +263,7 @@ def check_texture(kind: type[Texture], **values):
     assert (low - rounding <= colors).all() and (colors <= high + rounding).all(), (
         f"colours lie in [{colors.min()}, {colors.max()}], where `span` says [{low}, {high}]"
     )
-    slopes = jax.jit(jax.vmap(jax.jacfwd(lambda uv: made.look_up(code, SimpleNamespace(uv=uv)))))(uv)
+    slopes = jax.jit(jax.vmap(jax.jacfwd(lambda uv: made.look_up(code, surface(uv)))))(uv)
     assert np.isfinite(slopes).all(), "a derivative in uv is not finite"
     for name, tangent in _tangents(made.tables[0]).items():
         tangent = Textures((tangent,))

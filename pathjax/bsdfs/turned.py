@@ -18,7 +18,11 @@ class Heights(Number):
     listed: bool = False
 
     def read(self, loader, fields, name, owner):
-        return loader.shared(fields.only_texture(), owner)
+        element = fields.only_texture()
+        made = loader.shared(element, owner)
+        if not made.kind.follows_uv(made):
+            raise element.error(f"{element} has no slope along u and v, by which heights turn normals; use a bitmap")
+        return made
 
 
 class Mapped(Turning):

@@ -118,7 +118,7 @@ class Parameters:
             self.refused[first] = f"{first} is an image that stands in {name}, too, which is no parameter"
         elif first not in self.refused:
             color = self.textures[texture]
-            shape = color.shape if declared.shape == (3,) else color.shape[:2]
+            shape = color.shape if declared.shape == (3,) else color.shape[:-1]
             bounds = declared.bounds[0], max(declared.bounds[1], texture.kind.span(texture)[1])
             now = self.known.get(first, replace(color, shape=shape, bounds=bounds))
             low, high = zip(now.bounds, bounds, strict=True)

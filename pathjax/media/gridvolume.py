@@ -32,7 +32,7 @@ class GridVolume(Stored):
     data: np.ndarray  # (Z, Y, X, C), C being 1 or 3
     to_grid: np.ndarray  # (3, 4), from world space to where the centre of cell i lies at i; x, y, z
     box: np.ndarray  # (2, 3) lower and upper corner in world space of the box around it, beyond which nothing is
-    repeats: bool = False  # instead: see `repeated`
+    wrap: str = "clamp"  # what is beyond the box for surfaces; of "repeat" see `repeated`, too
     nearest: bool = False  # each value fills its cell
     listed: bool = False  # its values are a parameter of the scene
     box_of_file: np.ndarray = field(default_factory=lambda: UNIT)  # (2, 3), which a file of its values states
@@ -60,10 +60,14 @@ class GridVolume(Stored):
         if not ((data >= 0) & (data <= high)).all():  # also where one is NaN
             what = "not be negative" if high == np.inf else f"lie between 0 and {high:g}"
             raise fields.element.error(f"{path}: its values must {what}, and are {data.min():g} to {data.max():g}")
-        repeats = fields.string("wrap_mode", "clamp", choices=("clamp", "mirror", "repeat")) == "repeat"
+        wrap = fields.string("wrap_mode", "clamp", choices=("clamp", "mirror", "repeat"))
         placed = _placed(fields.transform("to_world"), box, data.shape[2::-1])
         nearest = fields.string("filter_type", "trilinear", choices=("trilinear", "nearest")) == "nearest"
-        return cls(data, *placed, repeats, nearest, listed=not repeats, box_of_file=box)
+        return cls(data, *placed, wrap, nearest, listed=wrap != "repeat", box_of_file=box)
+
+    @property
+    def repeats(self) -> bool:
+        return self.wrap == "repeat"
 
     def write(self, path: Path, data: np.ndarray) -> None:
         write_vol(path, data, self.box_of_file)

@@ -29,6 +29,7 @@ from pathjax.textures.checkerboard import Checkerboard
 from pathjax.textures.mesh_attribute import MeshAttribute
 from pathjax.textures.texture import Texture
 from pathjax.textures.uniform import Uniform
+from pathjax.textures.volume import Volume
 
 __all__ = [
     "KINDS",
@@ -39,6 +40,7 @@ __all__ = [
     "Texture",
     "Textures",
     "Uniform",
+    "Volume",
     "alike",
     "build",
     "of_number",
@@ -51,6 +53,7 @@ KINDS: dict[str, type[Texture]] = {
     "checkerboard": Checkerboard,
     "mesh_attribute": MeshAttribute,
     "uniform": Uniform,
+    "volume": Volume,
 }
 
 

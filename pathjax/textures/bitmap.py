@@ -119,7 +119,7 @@ def _corners(p, uv):
     low = jnp.floor(place)
     fraction = jnp.where(p.nearest, 0, place - low)
     # Twelve numbers are read at these places.
-    corners = _wrapped(low, size, p.wrap), _wrapped(low + 1, size, p.wrap)
+    corners = wrapped(low, size, p.wrap), wrapped(low + 1, size, p.wrap)
     corners, fraction = compute_once((corners, fraction))
 
     def index(i, j):
@@ -142,8 +142,8 @@ def _entries(index, fraction):
     return [("texels", index(i, j), shares[0][i] * shares[1][j]) for i in (0, 1) for j in (0, 1)]
 
 
-def _wrapped(low, size, wrap):
-    """Row and column (2,) int32 in the image; low: whole numbers, as floats, any."""
+def wrapped(low, size, wrap):
+    """Row and column (2,) int32 in the image, or places along three axes; low: whole numbers, as floats, any."""
     size = jnp.maximum(size, 1)
     folded = _modulo(low, jnp.where(wrap == 1, 2 * size, size))
     folded = jnp.where(folded < size, folded, 2 * size - 1 - folded)

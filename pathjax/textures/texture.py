@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
+from typing import ClassVar
 
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -20,6 +21,7 @@ class Texture(Kind):
     """
 
     to_uv = Transform2()
+    over_uv: ClassVar[bool] = True  # colours follow from uv, so that they slope along it
 
     @staticmethod
     @abstractmethod
@@ -70,6 +72,12 @@ class Texture(Kind):
     def of_number(cls, texture: Instance, held: Callable[[Instance], Instance]) -> Instance:
         """The texture as it is where it stands for a number; held: the same of a texture inside it."""
         return texture
+
+    @classmethod
+    def follows_uv(cls, texture: Instance) -> bool:
+        """Whether it, and all that it holds, is `over_uv`."""
+        held = [x for x in texture.values.values() if isinstance(x, Instance)]
+        return cls.over_uv and all(x.kind.follows_uv(x) for x in held)
 
     @classmethod
     def resolution(cls, texture: Instance) -> tuple[int, int]:

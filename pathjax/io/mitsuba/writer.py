@@ -254,14 +254,18 @@ def _changed_images(made: Iterable[object], values: Mapping[str, np.ndarray]) ->
 def _changed_arrays(
     made: Iterable[object], values: Mapping[str, np.ndarray]
 ) -> dict[Stored, tuple[str, np.ndarray]]:
-    """The same of volumes."""
+    """The same of volumes, of media and of textures."""
+    owners = [owner for owner in made if isinstance(owner, Instance)]
+    volumes = [(x, f"{owner.name}.{key}") for owner in owners for key, x in owner.values.items()]
+    volumes += [(v, name) for x, name in volumes if isinstance(x, Instance) for v in x.values.values()]
     found = {}
-    for owner in made:
-        for key, x in owner.values.items() if isinstance(owner, Instance) else ():
-            name = f"{owner.name}.{key}"
-            if isinstance(x, Stored) and name in values:
-                if not np.array_equal(x.data.astype(values[name].dtype), values[name]):
-                    found[x] = name, values[name]
+    for volume, name in volumes:
+        if isinstance(volume, Stored) and name in values:
+            value = values[name][..., None] if values[name].ndim == 3 else values[name]
+            read = volume.data.astype(value.dtype)
+            read = luminance(read)[..., None] if value.shape[3] < read.shape[3] else read
+            if not np.array_equal(np.broadcast_to(read, value.shape), value):
+                found[volume] = name, value
     return found
 
 
