@@ -102,7 +102,7 @@ def traverse(tree: Tree, leaf, prepared, entry, t, found, result=lambda t, found
         return lax.dynamic_update_slice(stack, entry[None], (free.astype(jnp.uint32),), allow_negative_indices=False)
 
     def begin():
-        stack = jnp.zeros((tree.depth + 1,), jnp.int32)
+        stack = jnp.zeros((tree.depth + 2,), jnp.int32)
         root = entry.astype(jnp.int32)
         child = first_child(root)
         # A search begins by opening a node: if a leaf comes first, by opening the root again.
@@ -115,10 +115,12 @@ def traverse(tree: Tree, leaf, prepared, entry, t, found, result=lambda t, found
         # Of a search that is done no child is met, nothing is pushed, and the 0 at the bottom is popped for ever.
         below = _hit_children(tree, child, ray, _weights(octant, entry != 0), t)
         rest, some = rest_of(entry)
-        # Push the rest, unless it is empty; then go below, or pop.
+        # Push the rest, then what is met below, unless they are empty; then pop.
         stack = push(stack, rest, free)
-        free = jnp.maximum(free + some.astype(jnp.int32) - (below == 0).astype(jnp.int32), 0)
-        entry = jnp.where(below != 0, child << WIDTH | below, at(stack, free))
+        free = free + some.astype(jnp.int32)
+        stack = push(stack, jnp.where(below != 0, child << WIDTH | below, 0), free)
+        free = jnp.maximum(free - (below == 0).astype(jnp.int32), 0)
+        entry = at(stack, free)
         return _State(free, entry, first_child(entry), stack, t, found)
 
     def visit_leaf(state):
