@@ -151,6 +151,36 @@ def test_interleaved_searches_of_lanes_end_each_with_its_own_result(width):
     np.testing.assert_array_equal(found, STEPS / 2)
 
 
+def test_a_search_may_hold_numbers_of_any_type_and_arrays():
+    """Digits of n in base 3, with signs that alternate: the last two, and which there are."""
+
+    def digits(n):
+        sign = jnp.where(n % 2 == 1, jnp.float32(1), -1)
+
+        def begin():
+            return n, jnp.uint32(0), sign, n < 0, jnp.zeros((2,), jnp.float32), jnp.zeros((1, 3), jnp.int8)
+
+        def third(state):
+            n, steps, sign, odd, last, seen = state
+            last = jnp.stack([last[1], sign * (n % 3)])
+            return n // 3, steps + 1, -sign, ~odd, last, seen.at[0, n % 3].set(1)
+
+        def goes_on(odd):
+            return lambda state: (state[0] > 0) & (state[3] == odd)
+
+        return interleaved(Search(begin, goes_on(False), third, goes_on(True), third, lambda state: state[1:]))
+
+    steps, sign, odd, last, seen = jax.jit(lanes(digits, 8))(NUMBERS)
+    for k, n in enumerate(NUMBERS):
+        found = [int(digit) for digit in np.base_repr(n, 3)]
+        assert steps[k] == len(found) and odd[k] == len(found) % 2
+        first = 1 if n % 2 else -1
+        signed = [digit * first * (-1) ** place for place, digit in enumerate(found[::-1])]
+        assert sign[k] == first * (-1) ** len(found)
+        np.testing.assert_array_equal(last[k], ([0] + signed)[-2:])
+        np.testing.assert_array_equal(seen[k, 0], [digit in found for digit in range(3)])
+
+
 def test_interleaved_searches_run_for_active_lanes_alone():
     def some(n):
         return lax.cond(n % 3 == 0, lambda: collatz(n, n.astype(jnp.float32))["steps"], lambda: jnp.float32(-1))

@@ -3,13 +3,13 @@
 A search reads one node after another, each of which says what the next is: the processor waits most of the time. So a
 few lanes search at once, each in a slot. Every trip of one loop opens a node of each slot; visits and the change to the
 next lane stand in loops of their own, of any number of trips. (XLA writes down where all that a loop carries is, in
-every trip of the loop around it, so all numbers of one type that a lane searches with are one array; and a branch in
-place of such a loop costs more.)
+every trip of the loop around it, so all numbers of one size that a lane searches with are one array, and those of its
+search's state another; and a branch in place of such a loop costs more.)
 """
 
 from __future__ import annotations
 
-from typing import Any
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +18,8 @@ from jax import lax
 from pathjax.compile.jax_compat import ClosedJaxpr
 from pathjax.compile.lanes import flags
 from pathjax.compile.lanes.columns import differs, entry, split, with_entry
-from pathjax.compile.primitives import Part, Search
+from pathjax.compile.lanes.words import Words
+from pathjax.compile.primitives import Part, Search, column_p
 
 # As measured: with more the processor waits less, and each costs instructions in every trip.
 SLOTS = 3
@@ -28,7 +29,7 @@ def in_slots(interpreter, program: ClosedJaxpr, search: Search[Part], inputs: li
     """Results of a search of each lane that is active; program: the same of one lane."""
     width = interpreter.width
     active = jnp.ones((width,), bool) if interpreter.active is None else interpreter.active
-    words = flags.packed(active)
+    are_active = flags.packed(active)
     nobody, nothing = jnp.int32(width), jnp.int32(width + 1)  # where what no lane has left goes; an empty slot
 
     def enlist(lane, state):
@@ -36,55 +37,70 @@ def in_slots(interpreter, program: ClosedJaxpr, search: Search[Part], inputs: li
         return count + 1, with_entry(order, lane, count)
 
     empty = jnp.int32(0), jnp.zeros((width,), jnp.int32)
-    count, order = flags.for_each_lane(words, enlist, empty)
+    count, order = flags.for_each_lane(are_active, enlist, empty)
 
-    columns: dict[Any, list] = {}
-    places: dict[int, slice] = {}
-    for number, (x, aval) in enumerate(zip(inputs, program.in_avals, strict=True)):
-        if differs(x):
-            mine = columns.setdefault(aval.dtype, [])
-            places[number] = slice(len(mine), len(mine) + x.size)
-            mine += [jnp.broadcast_to(item, (width,)) for item in x.flat]
-    tables = {dtype: jnp.stack(items, -1) for dtype, items in columns.items()}
+    own = [number for number, x in enumerate(inputs) if differs(x)]
+    kept = Words(program.in_avals[number] for number in own)
+    tables = [
+        jnp.stack([jnp.broadcast_to(item, (width,)) for item in items], -1)
+        for items in kept.of([inputs[number].flat for number in own])
+    ]
 
     def rows_of(lane):
-        return {dtype: entry(table, lane) for dtype, table in tables.items()}
+        return [entry(table, lane) for table in tables]
 
     def inputs_of(rows):
         """Inputs of a lane, from its rows of the tables."""
-        avals = program.in_avals
-        return [
-            rows[avals[number].dtype][places[number]].reshape(avals[number].shape) if number in places else x
-            for number, x in enumerate(inputs)
-        ]
+        mine = dict(zip(own, kept.values(rows), strict=True))
+        return [mine.get(number, x) for number, x in enumerate(inputs)]
 
-    def visit(slot):
-        lane, rows, state = slot
+    # A slot holds a lane, its rows, and the state of its search: numbers as words, lane first, and arrays.
+    nowhere = [jnp.zeros_like(table[0]) for table in tables]
+    avals = jax.eval_shape(search.begin, inputs_of(nowhere))
+    numbers = [k for k, aval in enumerate(avals) if not aval.shape]
+    words = Words([nobody, *(avals[k] for k in numbers)])
 
-        def visits(state):
-            return search.visits(inputs_of(rows), *state)[0]
+    def slot_of(lane, rows, state):
+        mine = [lane, *(state[k] for k in numbers)]
+        # Each is computed by itself: as part of a concatenation all would be computed for each.
+        items = words.of([[column_p.bind(x)[None]] for x in mine])
+        return rows, [jnp.concatenate(each) for each in items], [x for x in state if x.shape]
 
-        return lane, rows, lax.while_loop(visits, lambda state: search.visit(inputs_of(rows), *state), state)
+    def held(slot):
+        """Lane, inputs and state of a slot."""
+        rows, packed, arrays = slot
+        lane, *mine = words.values(packed)
+        of, others = dict(zip(numbers, mine, strict=True)), iter(arrays)
+        return lane, inputs_of(rows), [of[k] if k in of else next(others) for k in range(len(avals))]
+
+    def step(part, slot):
+        lane, mine, state = held(slot)
+        return slot_of(lane, slot[0], part(mine, *state))
+
+    def visits(slot):
+        _, mine, state = held(slot)
+        return search.visits(mine, *state)[0]
 
     def is_done(state):
-        _, (lane, rows, state), _ = state
-        mine = inputs_of(rows)
+        lane, mine, state = held(state[1])
         return (lane < nothing) & ~(search.opens(mine, *state)[0] | search.visits(mine, *state)[0])
 
     def next_lane(state):
         """Put away how the search of a slot ended, and begin that of the next lane in it."""
-        taken, (lane, rows, state), ends = state
+        taken, slot, ends = state
+        lane, _, state = held(slot)
         ends = [with_entry(end, state[k], lane) for end, k in zip(ends, read, strict=True)]
         more = taken < count
         lane = jnp.where(more, entry(order, jnp.minimum(taken, width - 1)), nothing)
         rows = rows_of(lane)
         state = [jnp.where(more, x, jnp.zeros_like(x)) for x in search.begin(inputs_of(rows))]
-        return taken + 1, (lane, rows, state), ends
+        return taken + 1, slot_of(lane, rows, state), ends
 
     def trip(state):
         taken, slots, ends = state
-        slots = [(lane, rows, search.open(inputs_of(rows), *state)) for lane, rows, state in slots]
-        for number, slot in enumerate(list(map(visit, slots))):
+        slots = [step(search.open, slot) for slot in slots]
+        slots = [lax.while_loop(visits, partial(step, search.visit), slot) for slot in slots]
+        for number, slot in enumerate(slots):
             taken, slots[number], ends = lax.while_loop(is_done, next_lane, (taken, slot, ends))
         return taken, slots, ends
 
@@ -96,12 +112,11 @@ def in_slots(interpreter, program: ClosedJaxpr, search: Search[Part], inputs: li
         found = search.result(inputs_of(rows_of(lane)), *mine)
         return [with_entry(result, y, lane) for result, y in zip(results, found, strict=True)]
 
-    rows = {dtype: jnp.zeros_like(table[0]) for dtype, table in tables.items()}
-    state = [jnp.zeros(x.shape, x.dtype) for x in jax.eval_shape(search.begin, inputs_of(rows))]
+    state = [jnp.zeros(aval.shape, aval.dtype) for aval in avals]
     read = search.result.reads()
     ends = [jnp.zeros((width + 1, *state[k].shape), state[k].dtype) for k in read]
-    start = jnp.int32(0), [(nobody, rows, state)] * SLOTS, ends
+    start = jnp.int32(0), [slot_of(nobody, nowhere, state)] * SLOTS, ends
     # A number is taken by each slot at the end of each search, and once before its first.
     *_, ends = lax.while_loop(lambda state: state[0] < count + SLOTS, trip, start)
     results = [jnp.zeros((width, *aval.shape), aval.dtype) for aval in program.out_avals]
-    return list(map(split, flags.for_each_lane(words, put_result, results)))
+    return list(map(split, flags.for_each_lane(are_active, put_result, results)))

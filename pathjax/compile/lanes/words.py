@@ -1,0 +1,46 @@
+"""Values of one lane side by side in few arrays, as a loop pays for each that it carries."""
+
+from __future__ import annotations
+
+import math
+
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+
+class Words:
+    """Where values of these shapes and types lie: their bits, in one array for each size of number."""
+
+    def __init__(self, avals):
+        self._avals = list(avals)
+        self._places: list[slice] = []
+        self._counts: dict[np.dtype, int] = {}
+        for aval in self._avals:
+            word = _word(aval.dtype)
+            start = self._counts.get(word, 0)
+            self._counts[word] = start + math.prod(aval.shape)
+            self._places.append(slice(start, self._counts[word]))
+
+    def of(self, values) -> list[list]:
+        """The bits of all numbers of such values, given as (list of numbers) each: a list for each array."""
+        lists: dict[np.dtype, list] = {word: [] for word in self._counts}
+        for aval, numbers in zip(self._avals, values, strict=True):
+            word = _word(aval.dtype)
+            lists[word] += [lax.bitcast_convert_type(x, word) if x.dtype != word else x for x in numbers]
+        return list(lists.values())
+
+    def values(self, arrays) -> list:
+        """What lies in such arrays."""
+        words = dict(zip(self._counts, arrays, strict=True))
+        found = []
+        for aval, place in zip(self._avals, self._places, strict=True):
+            x = words[_word(aval.dtype)][place].reshape(aval.shape)
+            found.append(lax.bitcast_convert_type(x, aval.dtype) if x.dtype != aval.dtype else x)
+        return found
+
+
+def _word(dtype) -> np.dtype:
+    """The type of number as which values of a type are kept: an unsigned integer, or a flag."""
+    dtype = jnp.dtype(dtype)
+    return dtype if dtype.kind == "b" else np.dtype(f"u{dtype.itemsize}")
