@@ -19,7 +19,7 @@ from scipy import linalg
 
 from pathjax import distributed
 from pathjax.derivatives.jacobian import has_rows
-from pathjax.inverse.many import BATCHES, CHECK_PART, PRETENDED, PRODUCT_SPP, Search, whole
+from pathjax.inverse.many import BATCHES, PRETENDED, PRODUCT_SPP, Search, whole
 from pathjax.inverse.problem import Problem
 from pathjax.inverse.uncertainty import MAX_RELATIVE_ERROR
 
@@ -32,6 +32,8 @@ MOST_SAMPLES, RAISED = 4, 2
 # What noise of J pretends to know is found with so many signs drawn for each pixel, and is to be small for all but this
 # part of the texels that are known.
 SIGNS, LEFT_OUT = 16, 0.05
+# Where the last step led is looked at with this part of the samples.
+CHECK_PART = 4
 # How often a step solves its equations, at most, to find which values stay at a bound: some 50 rounds are usual.
 ROUNDS = 500
 

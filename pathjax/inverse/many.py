@@ -32,14 +32,14 @@ from pathjax.system.interrupts import Interrupts
 
 # The samples of each level, as parts of those of the last.
 LEVELS = 16, 4, 1
-# Samples of the products of J: at least, and at most as a part of those of the image. Noise of J adds to J' W J what no
-# pixel knows, as if texels were known apart that share a pixel: it may pretend to know this part of what pixels do.
-PRODUCT_SPP, PRODUCT_PART, PRETENDED = 8, 4, 0.1
+# Samples of the products of J: at least, and at most those of the image. Noise of J adds to J' W J what no pixel knows,
+# as if texels were known apart that share a pixel: it may pretend to know this part of what pixels do.
+PRODUCT_SPP, PRETENDED = 8, 0.1
 MAX_STEPS, MAX_ITERATIONS, TOLERANCE = 4, 30, 0.03
 # A level is left when what the image misses is no more than this part of the variance of noise.
 SETTLED = 1.0
-# Where the last step led is looked at with this part of the samples.
-CHECK_PART = 4
+# What pixels miss tells the target's noise if numbers leave so much of it; else it is at least the image's.
+LEAST_LEFT = 0.1
 # A step is taken back if what the image misses has grown by so many standard errors.
 GROWN, DAMPING = 4, 0.1
 # Steps are made with other weights, if the target's noise turns out so many times what it was taken for.
@@ -112,12 +112,16 @@ class Search:
     def check(self) -> float:
         """Look at where the last step led. Returns the variance of target and image, over that of one sample."""
         equations = self.weights, self.render_part
-        self.excess = self.look(whole(self.spp / CHECK_PART))
+        self.excess = self.look(whole(self.spp))
         self.weights, self.render_part = equations
         # The expectation of this square is the number of parameters that the pixels determine: so many values are
         # fitted to noise, and the others miss the noise of the target.
-        left = max(((self.weights > 0) * self.trust).sum() - self.told.sum(), 1)
-        self.target_part = float(np.clip(self.missed / left, 0, 1))
+        used = ((self.weights > 0) * self.trust).sum()
+        left = used - self.told.sum()
+        # Numbers that explain nearly all of what pixels tell leave little that speaks of the target's noise alone, and
+        # noise of J may count more of them than there are pixels.
+        least = 0.0 if left > LEAST_LEFT * used else self.render_part
+        self.target_part = float(np.clip(self.missed / max(left, LEAST_LEFT * used), least, 1))
         return self.render_part + self.target_part
 
     # ---- pixels -----------------------------------------------------------------------------------------------------
@@ -215,7 +219,7 @@ class Search:
         """Gauss-Newton at the values, with what was looked at."""
         products, prior, values, w = self.products, self.prior, self.values, self.weights
         draw, n = products.next_draw(), len(values)
-        spp = self.product_spp = max(min(self.sharp, self.samples // PRODUCT_PART), PRODUCT_SPP)
+        spp = self.product_spp = max(min(self.sharp, self.samples), PRODUCT_SPP)
         self.pull = lambda adjoint: products.pull(values, adjoint, spp, draw)
         self.push = lambda change: products.push(values, change, spp, draw)
         gradient = self.pull(w * self.residual) + prior.gradient(values)
