@@ -182,7 +182,7 @@ def _grids(grids: Grids | None) -> Grids | None:
     """Cells, which grids share; what there is of each grid, and of each medium."""
     if grids is None:
         return None
-    few = {key: _rows(x, _few(len(x))) for key, x in vars(grids).items() if key != "values"}
+    few = {key: _rows(x, _few(len(x))) for key, x in vars(grids).items() if key != "values" and x is not None}
     return replace(grids, values=_many_rows(grids.values), **few)
 
 

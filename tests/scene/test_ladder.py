@@ -9,6 +9,7 @@ import pathjax as pj
 from pathjax import emitters
 from pathjax.compile import SELECTED_ROWS
 from pathjax.emitters.selection import choose, probability
+from pathjax.media.gridvolume import write_vol
 from pathjax.scene.ladder import padded
 from pathjax.scene.parameters import nameless
 
@@ -48,6 +49,27 @@ def key(scene):
 def test_scenes_that_differ_in_their_numbers_of_lights_share_kernels(lit, one, other):
     a, b = lit(*one), lit(*other)
     assert key(a) != key(b) and key(padded(a)) == key(padded(b))
+
+
+@pytest.mark.parametrize("filter_type", ["trilinear", "nearest"])
+def test_fogs_that_differ_in_their_cells_share_kernels_and_keep_their_depths(make_scene, tmp_path, filter_type):
+    def fog(*size):
+        write_vol(tmp_path / "fog.vol", np.random.default_rng(0).random((*size, 1)))
+        scene = make_scene(
+            f"""<shape type="cube"><bsdf type="null"/><medium name="interior" type="heterogeneous">
+            <volume name="sigma_t" type="gridvolume"><string name="filename" value="{tmp_path}/fog.vol"/>
+            <string name="filter_type" value="{filter_type}"/><transform name="to_world"><scale value="2"/>
+            <translate x="-1" y="-1" z="-1"/></transform></volume>
+            <rgb name="albedo" value="0"/></medium></shape><emitter type="constant"/>""",
+            res=4,
+            integrator="volpath",
+        )
+        return scene, np.asarray(pj.render(scene, spp=1))
+
+    (a, dark), (b, _) = fog(3, 4, 5), fog(6, 2, 3)
+    assert key(a) != key(b) and key(padded(a)) == key(padded(b))
+    np.testing.assert_allclose(pj.render(padded(a), spp=1), dark, rtol=1e-6)
+    assert dark.min() < 0.9
 
 
 @pytest.mark.parametrize("counts", [pytest.param((3, 2, 2), marks=pytest.mark.slow), (11, 10, 3)])
