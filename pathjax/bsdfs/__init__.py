@@ -21,6 +21,7 @@ from pathjax.bsdfs import tree
 from pathjax.bsdfs.blendbsdf import BlendBSDF
 from pathjax.bsdfs.bsdf import BSDF
 from pathjax.bsdfs.bumpmap import BumpMap
+from pathjax.bsdfs.circular import Circular
 from pathjax.bsdfs.conductor import Conductor
 from pathjax.bsdfs.dielectric import Dielectric
 from pathjax.bsdfs.diffuse import Diffuse
@@ -28,10 +29,11 @@ from pathjax.bsdfs.mask import Mask
 from pathjax.bsdfs.normalmap import NormalMap
 from pathjax.bsdfs.null import Null
 from pathjax.bsdfs.plastic import Plastic
-from pathjax.bsdfs.polarizer import Circular, Polarizer, Retarder
+from pathjax.bsdfs.polarizer import Polarizer
 from pathjax.bsdfs.pplastic import PPlastic
 from pathjax.bsdfs.principled import Principled
 from pathjax.bsdfs.principledthin import PrincipledThin
+from pathjax.bsdfs.retarder import Retarder
 from pathjax.bsdfs.roughconductor import RoughConductor
 from pathjax.bsdfs.roughdielectric import RoughDielectric
 from pathjax.bsdfs.roughplastic import RoughPlastic

@@ -1,76 +1,19 @@
-"""Sheets that change the polarisation of light, which here has none: a share of it goes straight on."""
+"""Linear polarisers, at whatever angle."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import ClassVar
 
-import numpy as np
-
-from pathjax.bsdfs.bsdf import BSDF
-from pathjax.bsdfs.null import Null
-from pathjax.bsdfs.wrapper import Choosing
-from pathjax.kinds import Number, Row, Unused
-
-_WHY = "light has no polarisation here"
-
-
-class Opaque(BSDF):
-    """What absorbs all light."""
-
-    @classmethod
-    def sides(cls, instance):
-        return None, None
-
-
-@dataclass(frozen=True)
-class Transmittance(Number):
-    """A number from 0 to 1, or a grey."""
-
-    bounds: tuple[float, float] = (0, 1)
-
-    def read(self, loader, fields, name, owner):
-        if not fields.gives_color(name):
-            return super().read(loader, fields, name, owner)
-        color = fields.color(name, at_most=1)
-        if np.ptp(color):
-            raise fields.error(name, "has a colour; only a number, or a grey, is modelled here")
-        return float(color[0])
-
-
-class Sheet(Choosing):
-    """Lets the share `transmittance` times `passes_of` it straight on, and absorbs the rest."""
-
-    nested = 0
-    passes_of: ClassVar[float]
-    transmittance = Transmittance(1.0)
-
-    @classmethod
-    def holding(cls, name, *held, **values):
-        return super().holding(name, Opaque.instance("opaque"), Null.instance("straight"), **values)
-
-    @classmethod
-    def share(cls, p: Row):
-        return cls.passes_of * p.transmittance
+from pathjax.bsdfs.sheet import UNPOLARISED, Sheet
+from pathjax.kinds import Unused
 
 
 class Polarizer(Sheet):
-    """A linear polariser, at whatever angle."""
+    """Half of the light goes straight on: light has no polarisation here."""
 
     passes_of = 0.5
-    unused: ClassVar[Mapping[str, Unused]] = {"theta": Unused("color", _WHY), "polarizing": Unused("boolean", _WHY)}
-
-
-class Circular(Sheet):
-    """A circular polariser, of whatever hand."""
-
-    passes_of = 0.5
-    unused: ClassVar[Mapping[str, Unused]] = {"left_handed": Unused("boolean", _WHY)}
-
-
-class Retarder(Sheet):
-    """A wave plate, of whatever delay."""
-
-    passes_of = 1.0
-    unused: ClassVar[Mapping[str, Unused]] = {"theta": Unused("color", _WHY), "delta": Unused("color", _WHY)}
+    unused: ClassVar[Mapping[str, Unused]] = {
+        "theta": Unused("color", UNPOLARISED),
+        "polarizing": Unused("boolean", UNPOLARISED),
+    }

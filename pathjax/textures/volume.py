@@ -55,11 +55,11 @@ class Volume(Texture):
 
     @staticmethod
     def look_up(p: Row, uv: Float[Array, "2"], surface: Surface) -> Float[Array, "3"]:
-        return sum(at(p.volume, number) * share for number, share in _corners(p, surface))
+        return Volume.with_entries(p, uv, surface)[0]
 
     @staticmethod
     def entries(p: Row, uv: Float[Array, "2"], surface: Surface) -> list[tuple[str, Int[Array, ""] | None, Array]]:
-        return [("volume", number, share) for number, share in _corners(p, surface)]
+        return Volume.with_entries(p, uv, surface)[1]
 
     @classmethod
     def with_entries(cls, p, uv, surface):

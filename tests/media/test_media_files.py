@@ -128,6 +128,16 @@ def test_what_looks_like_an_oversight_is_told(read, body, says):
     assert any(says in note for note in read(body).notes)
 
 
+@pytest.mark.parametrize("bounded", [True, False])
+def test_light_of_a_sky_does_not_get_through_fog_without_end_which_is_told(file, bounded):
+    """In Mitsuba its light samples are dimmed over a finite way."""
+    inside = '<bsdf type="null"/><ref name="interior" id="fog"/>' if bounded else ""
+    body = f"""<medium type="homogeneous" id="fog"/><emitter type="constant" id="sky"/>
+        <shape type="sphere"><float name="radius" value="9"/>{inside}</shape>"""
+    notes = load(file(body, inside='<ref id="fog"/>')).notes
+    assert any("sky is infinitely far" in note for note in notes) != bounded
+
+
 def test_meshes_are_open_where_an_edge_has_one_triangle_alone():
     trimesh = pytest.importorskip("trimesh")
     box = trimesh.creation.box()

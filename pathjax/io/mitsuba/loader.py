@@ -138,7 +138,7 @@ class _Loader:
                 self.make(element, dict_reader.rooms()[element.tag])
             else:
                 self.shared(element, element.id or element.tag)
-        self.check_media(scene["integrator"], integrator, shapes, views[name].medium)
+        self.check_media(scene["integrator"], integrator, shapes, lights, views[name].medium)
         return d.Description(
             file,
             views[name],
@@ -205,6 +205,7 @@ class _Loader:
         elements: list[Element],
         integrator: d.Integrator,
         shapes: tuple[d.Shape, ...],
+        lights: tuple[Instance, ...],
         medium: Instance | None,
     ) -> None:
         """Tell whether media are rendered; elements: the integrator, if there is one."""
@@ -217,6 +218,10 @@ class _Loader:
             self.note(root, 'takes no notice of media, as in Mitsuba; <integrator type="volpath"> renders them')
         elif present and not shapes:
             raise root.error(f"{root}: a medium without a shape around it never ends; add a <shape>")
+        elif medium is not None and not any(shape.interior is medium for shape in shapes):
+            for light in (each for each in lights if each.kind.distant):
+                never = "the medium around the sensor never ends and lets none of its light through"
+                self.notes.append(f"{light.name} is infinitely far: {never}; put the medium inside a <shape>")
 
     def note(self, element: Element, text: str) -> None:
         """What `info` should tell of an element."""
