@@ -38,7 +38,8 @@ PRODUCT_SPP, PRETENDED = 8, 0.1
 MAX_STEPS, MAX_ITERATIONS, TOLERANCE = 4, 30, 0.03
 # A level is left when what the image misses is no more than this part of the variance of noise.
 SETTLED = 1.0
-# What pixels miss tells the target's noise if numbers leave so much of it; else it is at least the image's.
+# What pixels miss tells the target's noise where numbers leave at least this part of what pixels tell unexplained;
+# elsewhere the noise is taken to be no less than that of the image.
 LEAST_LEFT = 0.1
 # A step is taken back if what the image misses has grown by so many standard errors.
 GROWN, DAMPING = 4, 0.1

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import replace
 from itertools import count
 from pathlib import Path
 
@@ -20,16 +19,15 @@ from pathjax.description.elements import Document, Element, nearest
 from pathjax.description.fields import VALUES, Fields, is_one_color
 from pathjax.errors import InputError
 from pathjax.io import bare, mesh
-from pathjax.io.mitsuba import dict_reader, instances, integrators, samplers
+from pathjax.io.mitsuba import dict_reader, instances, integrators, objects
 from pathjax.io.mitsuba.plugins import PLUGINS, REASONS
 from pathjax.io.mitsuba.xml_reader import read
 from pathjax.kinds import Instance, Unused
 from pathjax.media.gridvolume import GridVolume, boxed
 from pathjax.media.homogeneous import BoxedVolume
-from pathjax.sensors import Sensor, film
+from pathjax.sensors import Sensor
 from pathjax.shapes import KINDS as SHAPES
 from pathjax.shapes import Mesh
-from pathjax.textures import mesh_attribute
 
 
 def load(path: str | Path, sensor: int | str = 0, /, **parameters: object) -> d.Description:
@@ -69,7 +67,7 @@ def read_again(document: Document, element: Element, name: str) -> Instance:
 
 
 class _Loader:
-    """What the handlers below share: names given so far, objects made so far, notes."""
+    """What `objects` and the readers of kinds share: names given so far, objects made so far, notes."""
 
     def __init__(self, document: Document):
         self.document = document
@@ -168,7 +166,8 @@ class _Loader:
 
     def inner_sensor(self, element: Element) -> Sensor:
         """A sensor that is part of another, whose film and sampler it shares."""
-        return self.make(element, {key: kind for key, kind in sensors.KINDS.items() if kind.inner}, read=_inner_sensor)
+        kinds = {key: kind for key, kind in sensors.KINDS.items() if kind.inner}
+        return self.make(element, kinds, read=objects.inner_sensor)
 
     def camera(self, shapes: tuple[d.Shape, ...]) -> Element:
         """A sensor that frames the shapes, for a scene without one; it becomes part of the document."""
@@ -189,10 +188,10 @@ class _Loader:
     def view(self, element: Element, seen: Element) -> d.View | InputError:
         """What a sensor sees. One that is not used may be of a kind that is not supported, and gets one note alone."""
         if element is seen:
-            return self.make(element, sensors.KINDS, read=_sensor)
+            return self.make(element, sensors.KINDS, read=objects.sensor)
         notes = list(self.notes)
         try:
-            view = self.make(element, sensors.KINDS, read=_sensor)
+            view = self.make(element, sensors.KINDS, read=objects.sensor)
         except InputError as error:
             view = error
             self.making.clear()
@@ -273,7 +272,7 @@ class _Loader:
         if kind is not None and inside and not kind.on_surfaces:
             raise element.error(f"{element} shines from no surface; it stands directly in <scene>")
         kinds = {key: kind for key, kind in emitters.KINDS.items() if kind.on_surfaces == inside}
-        return self.make(element, kinds, name, read=_emitter)
+        return self.make(element, kinds, name, read=objects.emitter)
 
     def shapes(self, element: Element) -> list[d.Shape]:
         """What an element of a scene or a group stands for: nothing, one, or those that an instance shows."""
@@ -286,7 +285,7 @@ class _Loader:
                 return self.make(element, kinds)
             case instances.Instance:
                 return self.make(element, kinds, element.id or self.numbered("shape"))
-        made = self.make(element, kinds, element.id or self.numbered("shape"), read=_shape)
+        made = self.make(element, kinds, element.id or self.numbered("shape"), read=objects.shape)
         return [] if made is None else [made]
 
     def group(self, element: Element) -> list[d.Shape]:
@@ -347,91 +346,6 @@ class _Loader:
             return self.numbered(name)
         self.names.add(name)
         return name
-
-
-def _shape(loader: _Loader, fields: Fields, name: str) -> d.Shape | None:
-    """None where nothing of a mesh is left, as all its triangles are degenerate: no ray meets it, nor does it emit."""
-    geometry = SHAPES[fields.type].read(loader, fields)
-    flip_normals = fields.boolean("flip_normals", False) != geometry.mirrored
-    emitter = None
-    for element in fields.objects("emitter"):
-        other = loader.on_shapes.setdefault(element, fields.element)
-        if other is not fields.element:
-            raise fields.element.error(f"{element} shines from {other} already, at {other.place}; give each its own")
-        emitter = loader.emitter(element, element.id or name, inside=True)
-    meters = fields.objects("sensor")
-    inherited = fields.element.id or None
-    (nested,) = fields.objects("bsdf") or [_usual_bsdf(fields.element, lit=emitter is not None)]
-    bsdf = loader.bsdf(nested, nested.id or inherited or loader.numbered("bsdf"))
-    interior, exterior = (_side(loader, fields, name, side) for side in ("interior", "exterior"))
-    for medium in fields.objects("medium", limit=1):
-        sides = '<medium name="interior"> and one <medium name="exterior">'
-        raise medium.error(f"{fields.element} takes one {sides}, themselves or by <ref>, and no other <medium>")
-    if interior or exterior:
-        _note_boundary(loader, fields.element, geometry, bsdf)
-    if why := mesh_attribute.fault(bsdf, geometry.attributes):
-        raise fields.element.error(f"{fields.element} {why}")
-    made = d.Shape(name, geometry, bsdf, emitter, flip_normals, interior, exterior)
-    if geometry.empty:
-        light = "" if emitter is None else ", and its light too"
-        loader.note(fields.element, f"is left out, as no triangle has an area{light}")
-        made = None
-    loader.on_surfaces.update(dict.fromkeys(meters, (fields.element, made)))
-    return made
-
-
-def _side(loader: _Loader, fields: Fields, name: str, side: str) -> Instance | None:
-    """The medium on one side of a shape."""
-    element = fields.object("medium", side)
-    return None if element is None else loader.shared(element, element.id or f"{name}_{side}")
-
-
-def _note_boundary(loader: _Loader, shape: Element, geometry: object, bsdf: Instance) -> None:
-    """Tell what looks like an oversight where a medium begins."""
-    if not geometry.closed:
-        loader.note(shape, "bounds a medium and is open: paths that go around it stay in the medium that they were in")
-    if not any(leaf.kind.passes or leaf.kind.sided for leaf in bsdf.kind.leaves(bsdf)):
-        loader.note(shape, 'bounds a medium and lets no light in; <bsdf type="null"/> inside lets it pass')
-
-
-def _emitter(loader: _Loader, fields: Fields, name: str) -> Instance:
-    for medium in fields.objects("medium"):
-        loader.note(medium, f"has no effect inside {fields.element}: paths come from the camera")
-    return emitters.KINDS[fields.type].read(loader, fields, name)
-
-
-def _usual_bsdf(shape: Element, lit: bool) -> Element:
-    """What Mitsuba takes for the bsdf that a shape lacks: grey, or what reflects nothing where light comes from it."""
-    reflectance = Element("float", {"name": "reflectance", "value": "0" if lit else "0.5"}, shape.file, shape.line)
-    shape.children.append(Element("bsdf", {"type": "diffuse"}, shape.file, shape.line, [reflectance]))
-    return shape.children[-1]
-
-
-def _sensor(loader: _Loader, fields: Fields) -> d.View:
-    camera = sensors.KINDS[fields.type].read(loader, fields)
-    films, drawn = fields.objects("film"), fields.objects("sampler")
-    made = loader.make(films[0], film.KINDS) if films else film.HDRFilm()
-    if camera.one_pixel:
-        if (made.width, made.height) != (1, 1):
-            place = films[0] if films else fields.element
-            raise place.error(f"{fields.element} measures one number: its film must have width and height 1")
-        made = replace(made, filter=sensors.filters.Box())
-    if made.width % camera.parts:
-        place = films[0] if films else fields.element
-        raise place.error(f"{fields.element} has {camera.parts} sensors; the width must be a multiple of that")
-    spp = loader.make(drawn[0], samplers.KINDS) if drawn else samplers.DEFAULT_COUNT
-    sampler = drawn[0].attributes["type"] if drawn else "independent"
-    around = fields.objects("medium")
-    medium = loader.shared(around[0], around[0].id or "sensor_medium") if around else None
-    return d.View(camera, made, spp, sampler, medium)
-
-
-def _inner_sensor(loader: _Loader, fields: Fields) -> Sensor:
-    for tag, kinds in (("film", film.KINDS), ("sampler", samplers.KINDS)):
-        for element in fields.objects(tag):
-            loader.make(element, kinds)
-            loader.note(element, "has no effect inside a sensor that is part of another")
-    return sensors.KINDS[fields.type].read(loader, fields)
 
 
 def _kind_of_light(element: Element) -> type[emitters.Emitter]:
