@@ -863,9 +863,9 @@ def test_wrong_arguments_are_refused(plane, names, how, message):
         pj.jacobian(plane, names, **how)
 
 
-def test_bitmaps_are_refused_by_name(stage):
+def test_bitmaps_beside_the_ior_of_glass_are_refused_by_name(stage):
     with pytest.raises(pj.InputError, match="screen.reflectance is a texture"):
-        pj.jacobian(stage(), ["screen.reflectance"])
+        pj.jacobian(stage(), ["screen.reflectance", GLASS])
 
 
 def test_scenes_without_names_are_refused(plane):

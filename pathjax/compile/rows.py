@@ -30,6 +30,11 @@ class Rows:
         """Of the parts."""
         return self.of_parts[0].ndim - len(self.shape) - 2
 
+    @property
+    def count(self) -> int:
+        """M."""
+        return self.of_parts[0].shape[self._axis + 1]
+
     def __getitem__(self, row) -> Array:
         """(N, ...)."""
         axis = self._axis
@@ -44,9 +49,6 @@ class Rows:
     def here(self) -> Rows:
         """The same on one device, if nothing has to be copied for that; what is read of it is not on all of them."""
         return Rows(sum((on_one_device(x, self._axis) for x in self.of_parts), ()), self.shape)
-
-    def taken(self, rows: list[int]) -> Rows:
-        return Rows(tuple(jnp.take(x, jnp.asarray(rows), axis=self._axis + 1) for x in self.of_parts), self.shape)
 
     def like(self, rows: Array) -> Rows:
         """Rows (M, N, ...) in parts of as many items as these, of one piece."""

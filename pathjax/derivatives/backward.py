@@ -28,6 +28,7 @@ from pathjax.compile.lanes import flags
 from pathjax.core import sampler
 from pathjax.core.math import LUMINANCE
 from pathjax.derivatives import differentiated, totals
+from pathjax.derivatives.kept import Kept
 from pathjax.derivatives.record import Record, extend
 from pathjax.derivatives.totals import Total
 from pathjax.emitters import Choice
@@ -311,26 +312,26 @@ def pullback(
     return [of_array(path) for path in paths]
 
 
-@partial(jax.jit, static_argnames=("paths", "options", "ring", "form", "devices"))
+@partial(jax.jit, static_argnames=("paths", "kept", "options", "ring", "form", "devices"))
 def rows(
-    scene: Scene, pixels, first_sample, spp, seed, *, paths, options: Options, ring, form=None, devices=None
+    scene: Scene, pixels, first_sample, spp, seed, *, paths, kept: Kept, options: Options, ring, form=None, devices=None
 ) -> tuple[Float[Array, "N 3"], Rows]:
-    """Means of pixels, and their derivatives in each of the list of colours, of each channel in its own.
+    """Means of pixels, and their derivatives in each of the colours that are kept, of each channel in its own.
 
     Arguments as for `pullback`; the arrays hold colours alone. A row is (N, 4), and the last number is none.
     """
-    scene, choice, structure, entries, sweep_of = _kernel(scene, paths, options)
+    scene, choice, structure, _, sweep_of = _kernel(scene, paths, options)
 
     def of_pixel(work, number, scene, choice, memory):
-        pixels = totals.count(memory.total) // entries
+        pixels = totals.count(memory.total) // kept.count
         ones = jnp.ones_like(scene.camera.origin)
-        return sweep_of(work, scene, choice, ones, lambda place: pixels * place + number, memory)
+        return sweep_of(work, scene, choice, ones, lambda entry: pixels * kept.place(entry) + number, memory)
 
     def begin(lanes, pixels, scene, choice):
-        return start(scene, structure, pixels * entries, ring, lanes)
+        return start(scene, structure, pixels * kept.count, ring, lanes)
 
     def end(memory):
-        return finish(structure, memory).reshape(entries, -1, totals.WIDTH)
+        return finish(structure, memory).reshape(kept.count, -1, totals.WIDTH)
 
     work = pixels, first_sample, spp, seed
     return native_rows(of_pixel, work, scene, choice, start=begin, finish=end, form=form, devices=devices)

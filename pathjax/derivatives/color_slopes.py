@@ -5,35 +5,50 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property, partial
+from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from pathjax.compile import Rows, register_dataclass
 from pathjax.derivatives import tangents
+from pathjax.derivatives.kept import of_parameter
+from pathjax.kinds.parameter import Parameter
+
+
+class Place(NamedTuple):
+    """Where the derivatives in a parameter stand; static."""
+
+    rows: range
+    parameter: Parameter
+    array: tuple[int, ...]  # shape of what it lives in
 
 
 @register_dataclass
 @dataclass(frozen=True, eq=False)
 class ColorSlopes(Mapping[str, Array]):
-    """Derivatives by the names of colours, (*shape, 3, 3) each, which are made when they are read.
+    """Derivatives by the names of colours and textures, (*shape, 3, ..., 3) each, which are made when they are read.
 
     Light keeps its channel, so a third of their numbers says all.
     """
 
     rows: Rows  # (N, 4), of each channel in its own; the last number is none
-    places: tuple[tuple[str, int], ...] = field(metadata={"static": True})  # name -> row
+    places: tuple[tuple[str, Place], ...] = field(metadata={"static": True})  # by name
     shape: tuple[int, ...] = field(metadata={"static": True})  # of the N pixels
 
-    def __getitem__(self, name: str) -> Float[Array, "... 3 3"]:
-        return _slope(self._rows, self._place[name], self.shape)
+    def __getitem__(self, name: str) -> Float[Array, "... 3"]:
+        place = self._place[name]
+        if place.parameter.is_texture:
+            return _slopes(self._rows, place, self.shape)
+        return _slope(self._rows, place.rows.start, self.shape)
 
     @cached_property
     def _rows(self) -> Rows:
         return self.rows.here()
 
     @cached_property
-    def _place(self) -> dict[str, int]:
+    def _place(self) -> dict[str, Place]:
         return dict(self.places)
 
     def __contains__(self, name: object) -> bool:
@@ -50,3 +65,14 @@ class ColorSlopes(Mapping[str, Array]):
 def _slope(rows: Rows, number, shape: tuple[int, ...]) -> Float[Array, "... 3 3"]:
     row = rows[number][..., :3]
     return tangents.by_channel(row.reshape(*row.shape[:-2], *shape, 3))
+
+
+@partial(jax.jit, static_argnames=("place", "shape"))
+def _slopes(rows: Rows, place: Place, shape: tuple[int, ...]) -> Float[Array, "... 3"]:
+    found = rows.all()[..., place.rows.start : place.rows.stop, :, :3]  # (..., entries, N, 3)
+    found = jnp.moveaxis(found, -3, -2)
+    before = *found.shape[:-3], *shape
+    by_pixel = jax.vmap(partial(of_parameter, place.parameter, place.array))(found.reshape(-1, *found.shape[-2:]))
+    texels = place.parameter.shape[:-1]
+    same = jnp.eye(3, dtype=found.dtype).reshape(3, *[1] * len(texels), 3)
+    return by_pixel.reshape(*before, 1, *texels, 3) * same

@@ -24,7 +24,9 @@ from pathjax.bsdfs import dielectric
 from pathjax.compile import is_symbolic_zero, is_traced, native, on_all_devices, register_dataclass, usual_promotion
 from pathjax.core.types import Number
 from pathjax.derivatives import backward, differentiated, ior, ior_difference, ior_step, rules, tangents, totals
-from pathjax.derivatives.color_slopes import ColorSlopes
+from pathjax.derivatives.color_slopes import ColorSlopes, Place
+from pathjax.derivatives.kept import entries
+from pathjax.derivatives.kept import kept as kept_of
 from pathjax.errors import InputError
 from pathjax.integrators import pixel
 from pathjax.integrators.options import Counts, Options
@@ -41,6 +43,8 @@ METHODS = ("difference", "attached")
 # Up to so many colours tangents are the cheaper way: for 1, 2, 3 colours of the Cornell box, image and Jacobian took
 # 1.14, 1.24, 1.44 images of CPU time, and by a recorded sweep 1.23, 1.24, 1.26.
 MOST_TANGENTS = 2
+# Where a sweep finds them, `takes_sweep`.
+UNLESS = " unless it holds colours, no IOR of smooth glass is named with it, and pixels share no samples (box filter)"
 
 
 @register_dataclass
@@ -105,8 +109,9 @@ def jacobian(
     Returns:
         image and Jacobian.
     Raises:
-        InputError: unknown name, method or strategy; spp, seed or step out of range; a name of a texture; a value that
-            counts as a larger one, as a roughness of 0 does; more derivatives than fit into memory.
+        InputError: unknown name, method or strategy; spp, seed or step out of range; a texture, unless it holds colours
+            and pixels share no samples; a value that counts as a larger one, as a roughness of 0 does; more
+            derivatives than fit into memory.
     """
     if isinstance(names, str):
         raise InputError(f"names is a list of names; write [{names!r}]")
@@ -161,7 +166,6 @@ def pixel_jacobians(
         ring: of `backward.longest_ring`; None: that of the scene.
         how: `form` and `devices` of `native_map`.
     """
-    tangents.refuse_textures(wanted)
     scene = on_all_devices(scene, how.get("devices"))
     attached = method == "attached"
     colors = [name for name, p in wanted.items() if attached or not p.moves_paths]
@@ -176,6 +180,7 @@ def pixel_jacobians(
     ring = ring or backward.longest_ring(scene)
     if not rows and ring <= backward.MOST_RING and takes_sweep(scene, wanted.values(), options, **how):
         return *_swept(wanted, options, ring, how, scene, pixels, *numbers), {}, {}
+    tangents.refuse_textures(wanted, UNLESS)
     held = tangents.places(wanted[name] for name in colors)
 
     def of(held, first):
@@ -200,14 +205,13 @@ def pixel_jacobians(
 
 
 def takes_sweep(scene: Scene, parameters, options: Options, form: str | None = None, devices: int | None = None):
-    """Whether a recorded sweep finds all derivatives, of so many colours that tangents would cost more.
+    """Whether a recorded sweep finds all derivatives: of textures, or of so many colours that tangents would cost more.
 
     It knows of pixels that draw their own samples alone, of colours, and of native kernels.
     """
     lanes = form == "lanes" or (form is None and native())
-    if not lanes or options.shared or len(parameters) <= MOST_TANGENTS:
-        return False
-    return has_rows(scene, parameters) and all(parameter.shape == (3,) for parameter in parameters)
+    few = len(parameters) <= MOST_TANGENTS and not any(parameter.is_texture for parameter in parameters)
+    return lanes and not options.shared and not few and has_rows(scene, parameters)
 
 
 def has_rows(scene: Scene, parameters) -> bool:
@@ -224,21 +228,24 @@ def has_rows(scene: Scene, parameters) -> bool:
 def _swept(wanted, options, ring, how, scene, pixels, *numbers):
     """Means and derivatives, by name. how: `form` and `devices`; lanes are the only form."""
     paths = tuple(dict.fromkeys(parameter.path for parameter in wanted.values()))
-    first, entries = differentiated.firsts(scene, paths)
-    entry = {name: first[parameter.path] + parameter.index[0] for name, parameter in wanted.items()}
-    kept = sorted(set(entry.values()))
+    kept = kept_of(scene, paths, wanted.values())
     options = replace(options, derivative=True, by_vertex=True)
     image, rows = backward.rows(
-        scene, pixels, *numbers, paths=paths, options=options, ring=ring, devices=how.get("devices")
+        scene, pixels, *numbers, paths=paths, kept=kept, options=options, ring=ring, devices=how.get("devices")
     )
-    rows = rows if len(kept) == entries else rows.taken(kept)
-    return image, ColorSlopes(rows, tuple((name, kept.index(entry[name])) for name in wanted), (len(pixels),))
+
+    def place(parameter):
+        shape = named.get(scene, parameter.path).shape
+        return Place(kept.places(entries(scene, paths, parameter)), parameter, shape)
+
+    return image, ColorSlopes(rows, tuple((name, place(each)) for name, each in wanted.items()), (len(pixels),))
 
 
 @partial(_swept.defjvp, symbolic_zeros=True)
 @usual_promotion
 def _swept_jvp(wanted, options, ring, how, primals, changes):
     """No derivative goes through a sweep: second ones are those of the same Jacobian, made by tangents."""
+    tangents.refuse_textures(wanted)
     scene, *work = primals
     leaves, tree = jax.tree.flatten(scene)
     changes = jax.tree.leaves(changes[0], is_leaf=is_symbolic_zero)
@@ -254,8 +261,10 @@ def _swept_jvp(wanted, options, ring, how, primals, changes):
 
     image, slopes = _swept(wanted, options, ring, how, scene, *work)
     _, (moves, by_color) = jax.jvp(of, ([leaves[k] for k in moved],), ([changes[k] for k in moved],))
-    number_of = {row: k for k, (_, row) in enumerate(slopes.places)}
-    rows = jnp.stack([by_color[:, number_of[row]] for row in range(len(number_of))])
+    number_of = {place.rows.start: k for k, (_, place) in enumerate(slopes.places)}
+    nothing = jnp.zeros_like(by_color[:, 0])
+    rows = [by_color[:, number_of[row]] if row in number_of else nothing for row in range(slopes.rows.count)]
+    rows = jnp.stack(rows)
     rows = jnp.pad(rows, [(0, 0), (0, 0), (0, totals.WIDTH - 3)])
     return (image, slopes), (moves, replace(slopes, rows=slopes.rows.like(rows)))
 

@@ -20,12 +20,15 @@ from pathjax.scene.scene import Scene
 Places = tuple[tuple[tuple, tuple], ...]
 
 
-def refuse_textures(wanted: Mapping[str, Parameter]) -> None:
-    """Raises InputError: one of the parameters is a texture, whose entries are too many for a derivative each."""
+def refuse_textures(wanted: Mapping[str, Parameter], unless: str = "") -> None:
+    """Raises InputError: one of the parameters is a texture, whose entries are too many for a tangent each.
+
+    unless: where there would be derivatives.
+    """
     for name, parameter in wanted.items():
         if parameter.is_texture:
             raise InputError(
-                f"{name} is a texture, whose numbers are too many for a derivative of each by itself; differentiate "
+                f"{name} is a texture, of whose numbers no derivative is made one by one{unless}; differentiate "
                 "`render` in it by jax.grad, jax.vjp or jax.jvp, which take them all at once"
             )
 

@@ -15,7 +15,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from pathjax.compile import devices_of_a_call
-from pathjax.derivatives import backward, differentiated
+from pathjax.derivatives import backward
+from pathjax.derivatives.kept import entries, of_parameter
+from pathjax.derivatives.kept import kept as kept_of
 from pathjax.integrators import pixel
 from pathjax.integrators.options import Options
 from pathjax.inverse.compiled_cache import compiled
@@ -174,22 +176,20 @@ def _rows(values, views, pixels, spp, seeds, vector):
     def one(scene, work):
         seed, pixels = work
         scene = named.nameless(named.attached(views.with_values(scene, by_name)))
-        how = dict(paths=paths, options=options, ring=backward.longest_ring(scene))
+        kept = kept_of(scene, paths, views.wanted.values())
+        how = dict(paths=paths, kept=kept, options=options, ring=backward.longest_ring(scene))
         numbers = pixel.numbers(pixels, 0, spp, seed)
         _, found = backward.rows(scene, pixels, *numbers, devices=devices_of_a_call(), **how)
-        first, _ = differentiated.firsts(scene, paths)
 
         def of_pixel(row):
             columns = []
             for name, parameter in vector.parameters:
-                shape = *parameter.shape[:-1], 3
+                slope = jnp.zeros(parameter.shape, row.dtype)
                 if name in views.names:
                     parameter = views.wanted[name]
-                    array = named.get(scene, parameter.path)
-                    here = row[first[parameter.path] :][: differentiated.count(scene, parameter.path)]
-                    slope = parameter.transposed(here.reshape(array.shape))
-                else:
-                    slope = jnp.zeros(shape, row.dtype)
+                    here = kept.places(entries(scene, paths, parameter))
+                    array = named.get(scene, parameter.path).shape
+                    slope = of_parameter(parameter, array, row[here.start : here.stop])
                 columns.append(slope.reshape(-1, 3))
             return jnp.concatenate(columns) * views.exposure
 

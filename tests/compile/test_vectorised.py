@@ -46,6 +46,7 @@ results = {"image": image, "J": J.derivatives}
 EVERYTHING = """
 from pathjax import transport
 from pathjax.derivatives import backward
+from pathjax.derivatives.kept import kept
 from pathjax.integrators import pixel, reference
 from pathjax.integrators.options import Options
 from pathjax.scene import parameters as named
@@ -68,7 +69,8 @@ view = transport.image(box, operator.radiosity(operator.solve().L), spp=2)
 plain = named.nameless(named.attached(box))
 numbers = pixel.numbers(jnp.arange(64), 0, 4, 1)
 wanted = [named.find(box, name) for name in colors]
-choice = dict(paths=tuple(p.path for p in wanted), ring=backward.longest_ring(plain))
+paths = tuple(p.path for p in wanted)
+choice = dict(paths=paths, kept=kept(plain, paths, wanted), ring=backward.longest_ring(plain))
 means, rows = backward.rows(plain, jnp.arange(64), *numbers, options=Options(derivative=True, by_vertex=True), **choice)
 wide = load("tests/scenes/shapes_and_filters", res=8)
 textured = load("tests/scenes/textures", res=8)

@@ -1,6 +1,7 @@
 """J v and J^T v without J: against each other, entry by entry, and against the Jacobian."""
 
 import contextlib
+import itertools
 from dataclasses import replace
 
 import jax
@@ -11,6 +12,7 @@ import pytest
 import pathjax as pj
 from pathjax.compile import mapping
 from pathjax.derivatives import backward, jacobian, matrix_free, record, totals
+from pathjax.derivatives.kept import MOST_RUNS, Kept, few
 from pathjax.errors import InputError
 from pathjax.images import write_exr
 from pathjax.integrators.options import Options
@@ -286,11 +288,52 @@ def test_transformations_of_a_linear_image(screen):
     np.testing.assert_allclose(batch, [value, 2 * value], rtol=1e-5)
 
 
-def test_what_takes_a_derivative_of_each_number_refuses_textures(screen):
-    with pytest.raises(pj.InputError, match=f"{NAME} is a texture"):
-        pj.jacobian(screen, [NAME], 1)
-    with pytest.raises(pj.InputError, match=f"{NAME} is a texture"):
-        pj.normal_equations(screen, [NAME], np.ones((RES, RES, 3)))
+def test_jacobians_in_textures(make_scene, picture):
+    """The texels alone that are asked for are kept, beside a colour, of two textures that lie in one array."""
+    before = '<transform name="to_world"><translate x="{}" z="-0.1"/></transform>'
+    inside = "".join(
+        f'<shape type="rectangle">{before.format(x)}{diffuse(name, texture(picture(*size)))}</shape>'
+        for x, name, size in ((-1, "left", (2, 3)), (1, "right", (5, 4)))
+    )
+    ball = f'<shape type="sphere"><float name="radius" value="0.5"/>{diffuse("ball", rgb("reflectance", 0.5))}</shape>'
+    inside += ball + f'<emitter type="constant" id="sky">{rgb("radiance", 1)}</emitter>'
+    scene, names = make_scene(inside, res=RES, depth=3), ["right.reflectance", "ball.reflectance"]
+    image, J = pj.jacobian(scene, names, SPP, 3)
+    wanted = {name: scene.about.parameters[name] for name in names}
+    bare, pixels = named.nameless(scene), jnp.arange(RES * RES, dtype=jnp.int32)
+    v = jnp.asarray(np.random.default_rng(1).normal(size=(RES * RES, 3)), jnp.float32)
+    pulled = matrix_free.pull(bare, wanted, v, pixels, 0, SPP, 3, Options())
+    for name, found in pulled.items():
+        terms = np.asarray(J[name]).reshape(RES * RES, 3, *found.shape)
+        sizes = np.abs(terms).sum((0, 1)) + np.finfo(np.float32).tiny
+        assert (np.abs(np.tensordot(v, terms, 2) - found) <= ROUNDING * sizes).all(), name
+        assert (np.abs(np.asarray(found)) > 0).any()
+    assert len(J.derivatives.rows.all()) == 5 * 4 + 1 + 1  # and one for what is not asked for
+
+    normal = pj.normal_equations(scene, names, image, spp=SPP, seed=3)
+    assert normal.matrix.shape == (63, 63) and normal.components[0] == "right.reflectance[0, 0].r"
+    halves = normal.residuals.reshape(2, -1) + np.asarray(image).ravel()
+    assert np.isfinite(halves).all() and np.linalg.eigvalsh(normal.matrix).max() > 0
+
+
+@pytest.mark.parametrize("count", [1, MOST_RUNS, MOST_RUNS + 3])
+def test_entries_of_few_runs_are_kept(count):
+    wanted = [range(10 * k * k, 10 * k * k + 1 + k) for k in range(count)]
+    runs = few(wanted)
+    assert len(runs) == min(count, MOST_RUNS) and all(a.stop < b.start for a, b in itertools.pairwise(runs))
+    held = Kept(runs, False)
+    places = [held.places(run) for run in wanted]
+    assert sorted({p for each in places for p in each}) == sorted(p for each in places for p in each)
+    for run, mine in zip(wanted, places, strict=True):
+        assert [int(held.place(entry)) for entry in run] == list(mine)
+    assert int(held.place(runs[-1].stop)) == held.count - 1 == sum(map(len, runs))
+    assert few([range(3, 4), range(0, 3), range(3, 6)][1:]) == (range(0, 6),)
+
+
+def test_what_takes_a_derivative_of_each_number_refuses_textures_that_it_cannot_take(screen):
+    wide = replace(screen, film=replace(screen.film, shared=True))
+    with pytest.raises(pj.InputError, match=f"{NAME} is a texture, .* unless it holds colours"):
+        pj.jacobian(wide, [NAME], 1)
     with pytest.raises(pj.InputError, match="second derivatives are not"):
         jax.hessian(lambda x: pj.render(pj.with_parameters(screen, {NAME: x}), 1).sum())(pj.parameters(screen)[NAME])
 

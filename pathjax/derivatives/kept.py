@@ -1,0 +1,94 @@
+"""Which entries of the list of `differentiated` a row of J holds: those of what is asked for, not of all around it.
+
+The texels of all textures of a scene stand in one array, of which one small texture may be asked for.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from pathjax.derivatives import differentiated
+from pathjax.kinds.parameter import Parameter
+from pathjax.scene import parameters as named
+from pathjax.scene.scene import Scene
+
+# At each look-up the place is compared with the ends of all runs.
+MOST_RUNS = 4
+
+
+@dataclass(frozen=True)
+class Kept:
+    """Runs of entries that are kept, ascending; static."""
+
+    runs: tuple[range, ...]
+    all: bool  # nothing else is in the list
+
+    @property
+    def count(self) -> int:
+        """Entries of a row: those kept, and behind them one for all others, unless there are none."""
+        return sum(map(len, self.runs)) + (not self.all)
+
+    def place(self, entry: Int[Array, ""] | int) -> Int[Array, ""]:
+        """Where an entry of the list stands in a row."""
+        if self.all:
+            return jnp.asarray(entry)
+        found, first = jnp.int32(self.count - 1), 0
+        for run in self.runs:
+            inside = (entry >= run.start) & (entry < run.stop)
+            found = jnp.where(inside, entry - run.start + first, found)
+            first += len(run)
+        return found
+
+    def places(self, entries: range) -> range:
+        """Where entries that are kept, and neighbours in the list, stand in a row."""
+        first = 0
+        for run in self.runs:
+            if entries.start in run:
+                begin = entries.start - run.start + first
+                return range(begin, begin + len(entries))
+            first += len(run)
+        raise ValueError(f"{entries} are not kept")
+
+
+def kept(scene: Scene, paths: differentiated.Paths, parameters: Iterable[Parameter]) -> Kept:
+    """What a row holds, for derivatives in parameters whose arrays are at the paths."""
+    _, count = differentiated.firsts(scene, paths)
+    runs = few(sorted((entries(scene, paths, each) for each in parameters), key=lambda run: run.start))
+    return Kept(runs, sum(map(len, runs)) == count)
+
+
+def entries(scene: Scene, paths: differentiated.Paths, parameter: Parameter) -> range:
+    """Where the entries of a parameter stand in the list."""
+    first, _ = differentiated.firsts(scene, paths)
+    shape, width = named.get(scene, parameter.path).shape, 3 if differentiated.of_colors(scene, parameter.path) else 1
+    begin = sum(place * math.prod(shape[axis + 1 :]) for axis, place in enumerate(parameter.index))
+    count = (parameter.rows or 1) * math.prod(shape[len(parameter.index) :])
+    begin = first[parameter.path] + begin // width
+    return range(begin, begin + count // width)
+
+
+def of_parameter(
+    parameter: Parameter, array: tuple[int, ...], found: Float[Array, "entries 3"]
+) -> Float[Array, "... 3"]:
+    """Derivatives in a parameter, from those in its entries; array: shape of what it lives in."""
+    if not parameter.is_texture:
+        return found.reshape(parameter.shape)
+    return replace(parameter, index=(0,)).transposed(found.reshape(parameter.rows, *array[1:]))
+
+
+def few(runs: Sequence[range]) -> tuple[range, ...]:
+    """Runs, sorted by where they start, joined where they touch; and across the smallest gaps, if they are many."""
+    gaps = sorted(later.start - run.stop for run, later in zip(runs[:-1], runs[1:], strict=True))
+    least = max(gaps[-MOST_RUNS + 1 :][0], 1) if len(gaps) >= MOST_RUNS else 1
+    joined = [runs[0]]
+    for run in runs[1:]:
+        if run.start - joined[-1].stop < least:
+            joined[-1] = range(joined[-1].start, max(joined[-1].stop, run.stop))
+        else:
+            joined.append(run)
+    return tuple(joined)
