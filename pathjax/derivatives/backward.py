@@ -36,7 +36,6 @@ from pathjax.errors import InputError
 from pathjax.integrators import path, pixel
 from pathjax.integrators.options import Options
 from pathjax.integrators.random_numbers import bounce_numbers
-from pathjax.scene import parameters as named
 from pathjax.scene.scene import Scene
 
 # Trips between two sweeps, and those that the ring holds: powers of 2. Where the longest path is not known when a
@@ -255,7 +254,6 @@ class _Kernel(NamedTuple):
     scene: Scene
     choice: Choice | None
     structure: Record  # of shapes and dtypes
-    entries: int  # of the list
     of_pixel: Callable  # `pixel_sweep`
 
 
@@ -263,7 +261,6 @@ def _kernel(scene: Scene, paths: differentiated.Paths, options: Options) -> _Ker
     scene = options.applied(scene)
     choice = emitters.choice(scene.emitters, options.strategy)
     slots = differentiated.slots(scene, paths)
-    _, entries = differentiated.firsts(scene, paths)
 
     def record(scene, choice, x):
         now, _ = pixel.camera_path(scene, jnp.int32(0), x, x, options)
@@ -272,14 +269,26 @@ def _kernel(scene: Scene, paths: differentiated.Paths, options: Options) -> _Ker
 
     structure = jax.eval_shape(record, scene, choice, jnp.uint32(0))
     of_pixel = partial(pixel_sweep, options=options, slots=slots, paths=paths, structure=structure)
-    return _Kernel(scene, choice, structure, entries, of_pixel)
+    return _Kernel(scene, choice, structure, of_pixel)
 
 
-@partial(jax.jit, static_argnames=("paths", "options", "ring", "form", "devices"))
+@partial(jax.jit, static_argnames=("paths", "kept", "options", "ring", "form", "devices"))
 def pullback(
-    scene: Scene, adjoint, pixels, first_sample, spp, seed, *, paths, options: Options, ring, form=None, devices=None
-):
-    """J^T adjoint: of each of the arrays, its shape.
+    scene: Scene,
+    adjoint,
+    pixels,
+    first_sample,
+    spp,
+    seed,
+    *,
+    paths,
+    kept: Kept,
+    options: Options,
+    ring,
+    form=None,
+    devices=None,
+) -> Float[Array, "entries 3"]:
+    """J^T adjoint: of the entries that are kept; of a number, the sum of the three is its own.
 
     Args:
         scene: without names.
@@ -289,27 +298,19 @@ def pullback(
         ring: of `longest_ring`.
         form, devices: of `native_fold`.
     """
-    scene, choice, structure, entries, sweep_of = _kernel(scene, paths, options)
-    first, _ = differentiated.firsts(scene, paths)
+    scene, choice, structure, sweep_of = _kernel(scene, paths, options)
 
     def of_pixel(work, scene, choice, memory):
         adjoint, work = work
-        return sweep_of(work, scene, choice, adjoint, lambda place: place, memory)[1]
+        return sweep_of(work, scene, choice, adjoint, kept.place, memory)[1]
 
     def end(memory):
         # The sums of parts are those of three numbers.
         return finish(structure, memory)[:, :3]
 
-    begin = partial(start, scene, structure, entries, ring)
+    begin = partial(start, scene, structure, kept.count, ring)
     work = adjoint, (pixels, first_sample, spp, seed)
-    total = native_fold(of_pixel, work, scene, choice, start=begin, finish=end, form=form, devices=devices)
-
-    def of_array(path):
-        rows = total[first[path] :][: differentiated.count(scene, path)]
-        rows = rows if differentiated.of_colors(scene, path) else rows.sum(1)
-        return rows.reshape(named.get(scene, path).shape)
-
-    return [of_array(path) for path in paths]
+    return native_fold(of_pixel, work, scene, choice, start=begin, finish=end, form=form, devices=devices)
 
 
 @partial(jax.jit, static_argnames=("paths", "kept", "options", "ring", "form", "devices"))
@@ -320,7 +321,7 @@ def rows(
 
     Arguments as for `pullback`; the arrays hold colours alone. A row is (N, 4), and the last number is none.
     """
-    scene, choice, structure, _, sweep_of = _kernel(scene, paths, options)
+    scene, choice, structure, sweep_of = _kernel(scene, paths, options)
 
     def of_pixel(work, number, scene, choice, memory):
         pixels = totals.count(memory.total) // kept.count

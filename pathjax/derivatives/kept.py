@@ -1,4 +1,4 @@
-"""Which entries of the list of `differentiated` a row of J holds: those of what is asked for, not of all around it.
+"""Which entries of the list of `differentiated` are kept: those of what is asked for, not of all around it.
 
 The texels of all textures of a scene stand in one array, of which one small texture may be asked for.
 """
@@ -30,11 +30,11 @@ class Kept:
 
     @property
     def count(self) -> int:
-        """Entries of a row: those kept, and behind them one for all others, unless there are none."""
+        """Entries that are kept, and one more, behind them, for all others, unless there are none."""
         return sum(map(len, self.runs)) + (not self.all)
 
     def place(self, entry: Int[Array, ""] | int) -> Int[Array, ""]:
-        """Where an entry of the list stands in a row."""
+        """Where an entry of the list stands among those kept."""
         if self.all:
             return jnp.asarray(entry)
         found, first = jnp.int32(self.count - 1), 0
@@ -45,7 +45,7 @@ class Kept:
         return found
 
     def places(self, entries: range) -> range:
-        """Where entries that are kept, and neighbours in the list, stand in a row."""
+        """Where entries that are kept, and neighbours in the list, stand among those."""
         first = 0
         for run in self.runs:
             if entries.start in run:
@@ -56,7 +56,7 @@ class Kept:
 
 
 def kept(scene: Scene, paths: differentiated.Paths, parameters: Iterable[Parameter]) -> Kept:
-    """What a row holds, for derivatives in parameters whose arrays are at the paths."""
+    """What is kept for derivatives in parameters, whose arrays are at the paths."""
     _, count = differentiated.firsts(scene, paths)
     runs = few(sorted((entries(scene, paths, each) for each in parameters), key=lambda run: run.start))
     return Kept(runs, sum(map(len, runs)) == count)
@@ -73,8 +73,8 @@ def entries(scene: Scene, paths: differentiated.Paths, parameter: Parameter) -> 
 
 
 def of_parameter(
-    parameter: Parameter, array: tuple[int, ...], found: Float[Array, "entries 3"]
-) -> Float[Array, "... 3"]:
+    parameter: Parameter, array: tuple[int, ...], found: Float[Array, "entries ..."]
+) -> Float[Array, "..."]:
     """Derivatives in a parameter, from those in its entries; array: shape of what it lives in."""
     if not parameter.is_texture:
         return found.reshape(parameter.shape)

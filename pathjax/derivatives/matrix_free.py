@@ -14,6 +14,8 @@ from jaxtyping import Array, Float, Int
 
 from pathjax.compile import usual_promotion
 from pathjax.derivatives import backward, differentiated, forward
+from pathjax.derivatives.kept import entries, of_parameter
+from pathjax.derivatives.kept import kept as kept_of
 from pathjax.integrators import pixel
 from pathjax.integrators.options import Counts, Options
 from pathjax.kinds.parameter import Parameter
@@ -67,9 +69,17 @@ def pull(
     numbers = pixel.numbers(pixels, first_sample, spp, seed)
     options = replace(options, derivative=True, by_vertex=True)
     ring = ring or backward.longest_ring(scene)
-    arrays = backward.pullback(scene, adjoint, pixels, *numbers, paths=paths, options=options, ring=ring, **how)
-    by_path = dict(zip(paths, arrays, strict=True))
-    return {name: parameter.transposed(by_path[parameter.path]) for name, parameter in wanted.items()}
+    kept = kept_of(scene, paths, wanted.values())
+    how |= dict(paths=paths, kept=kept, options=options, ring=ring)
+    total = backward.pullback(scene, adjoint, pixels, *numbers, **how)
+
+    def of(parameter):
+        here = kept.places(entries(scene, paths, parameter))
+        found = total[here.start : here.stop]
+        found = found if differentiated.of_colors(scene, parameter.path) else found.sum(1)
+        return of_parameter(parameter, named.get(scene, parameter.path).shape, found)
+
+    return {name: of(parameter) for name, parameter in wanted.items()}
 
 
 def _paths(wanted):
