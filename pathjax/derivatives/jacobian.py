@@ -44,7 +44,10 @@ METHODS = ("difference", "attached")
 # 1.14, 1.24, 1.44 images of CPU time, and by a recorded sweep 1.23, 1.24, 1.26.
 MOST_TANGENTS = 2
 # Where a sweep finds them, `takes_sweep`.
-UNLESS = " unless it holds colours, no IOR of smooth glass is named with it, and pixels share no samples (box filter)"
+UNLESS = (
+    " unless it and all other textures are colours, no IOR of smooth glass is named, and pixels share no samples, as "
+    "under a box filter"
+)
 
 
 @register_dataclass

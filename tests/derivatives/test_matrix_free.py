@@ -332,7 +332,7 @@ def test_entries_of_few_runs_are_kept(count):
 
 def test_what_takes_a_derivative_of_each_number_refuses_textures_that_it_cannot_take(screen):
     wide = replace(screen, film=replace(screen.film, shared=True))
-    with pytest.raises(pj.InputError, match=f"{NAME} is a texture, .* unless it holds colours"):
+    with pytest.raises(pj.InputError, match=f"{NAME} is a texture, .* unless it and all other"):
         pj.jacobian(wide, [NAME], 1)
     with pytest.raises(pj.InputError, match="second derivatives are not"):
         jax.hessian(lambda x: pj.render(pj.with_parameters(screen, {NAME: x}), 1).sum())(pj.parameters(screen)[NAME])
