@@ -257,10 +257,10 @@ class _Kernel(NamedTuple):
     of_pixel: Callable  # `pixel_sweep`
 
 
-def _kernel(scene: Scene, paths: differentiated.Paths, options: Options) -> _Kernel:
+def _kernel(scene: Scene, paths: differentiated.Paths, kept: Kept, options: Options) -> _Kernel:
     scene = options.applied(scene)
     choice = emitters.choice(scene.emitters, options.strategy)
-    slots = differentiated.slots(scene, paths)
+    slots = differentiated.slots(scene, paths, kept.fields)
 
     def record(scene, choice, x):
         now, _ = pixel.camera_path(scene, jnp.int32(0), x, x, options)
@@ -298,7 +298,7 @@ def pullback(
         ring: of `longest_ring`.
         form, devices: of `native_fold`.
     """
-    scene, choice, structure, sweep_of = _kernel(scene, paths, options)
+    scene, choice, structure, sweep_of = _kernel(scene, paths, kept, options)
 
     def of_pixel(work, scene, choice, memory):
         adjoint, work = work
@@ -321,7 +321,7 @@ def rows(
 
     Arguments as for `pullback`; the arrays hold colours alone. A row is (N, 4), and the last number is none.
     """
-    scene, choice, structure, sweep_of = _kernel(scene, paths, options)
+    scene, choice, structure, sweep_of = _kernel(scene, paths, kept, options)
 
     def of_pixel(work, number, scene, choice, memory):
         pixels = totals.count(memory.total) // kept.count

@@ -18,13 +18,15 @@ from jaxtyping import Array, Float, Int
 
 from pathjax import emitters
 from pathjax.bsdfs import tree
-from pathjax.kinds import Declared
+from pathjax.kinds import Declared, Parameter
 from pathjax.media import Nudges
 from pathjax.scene import parameters as named
 from pathjax.scene.scene import Scene
 
 # Of the arrays that are differentiated, where they are in the scene.
 Paths = tuple[tuple, ...]
+# What kinds call the parameters in whose places textures stand that are differentiated; None: it may be any.
+Fields = frozenset[str] | None
 # By slot, the column that is looked up; None: none.
 Columns = tuple[int | None, ...]
 
@@ -122,13 +124,23 @@ def in_textures(scene: Scene, paths: Iterable[tuple], of_textures: tuple) -> dic
     return found
 
 
-def slots(scene: Scene, paths: Paths) -> Slots:
+def places_of_textures(parameters: Iterable[Parameter]) -> Fields:
+    """Where those of some parameters stand that are textures, or of textures."""
+    places = [each.stands_in for each in parameters if "textures" in each.path or each.path[0] == "geometry"]
+    return None if None in places else frozenset().union(*places)
+
+
+def slots(scene: Scene, paths: Paths, fields: Fields) -> Slots:
+    """What is differentiated. fields: of `places_of_textures`."""
+
     def looked_up(table, textures):
         """Colours and numbers that are looked up in a table."""
-        textured = bool(in_textures(scene, paths, textures))
-        columns = named.get(scene, table).columns
-        held = _columns(scene, table).items()
-        found = [i for path, i in held if path in paths or (textured and columns[i].texture is not None)]
+        held = named.get(scene, table)
+        columns, names = held.columns, list(held.kind.declared)
+        may_be = [name for name in names if fields is None or name in fields]
+        filled = map(held.kind.place, may_be if in_textures(scene, paths, textures) else [])
+        filled = {i for i in filled if columns[i] is not None and columns[i].texture is not None}
+        found = [i for path, i in _columns(scene, table).items() if path in paths or i in filled]
         return [i for i in found if columns[i].values.ndim > 1], [i for i in found if columns[i].values.ndim == 1]
 
     def joined(found):

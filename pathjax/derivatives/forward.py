@@ -76,9 +76,9 @@ def pixel_change(
     return total / jnp.maximum(spp, 1).astype(total.dtype)
 
 
-@partial(jax.jit, static_argnames=("paths", "options", "form", "devices"))
+@partial(jax.jit, static_argnames=("paths", "fields", "options", "form", "devices"))
 def push(
-    scene: Scene, changed, pixels, first_sample, spp, seed, *, paths, options: Options, form=None, devices=None
+    scene: Scene, changed, pixels, first_sample, spp, seed, *, paths, fields, options: Options, form=None, devices=None
 ) -> Float[Array, "N 3"]:
     """J v of the means of pixels.
 
@@ -86,12 +86,12 @@ def push(
         scene: without names.
         changed: v, of each of the arrays, of its shape.
         pixels, first_sample, spp, seed: (N,) each.
-        paths: of the arrays, which `differentiated` knows.
+        paths: of the arrays, which `differentiated` knows; fields: of `places_of_textures`.
         form, devices: of `native_map`.
     """
     scene = options.applied(scene)
     choice = emitters.choice(scene.emitters, options.strategy)
-    slots = differentiated.slots(scene, paths)
+    slots = differentiated.slots(scene, paths, fields)
 
     def entries(path, array):
         array = array.reshape(differentiated.count(scene, path), -1)

@@ -45,8 +45,8 @@ METHODS = ("difference", "attached")
 MOST_TANGENTS = 2
 # Where a sweep finds them, `takes_sweep`.
 UNLESS = (
-    " unless it and all other textures are colours, no IOR of smooth glass is named, and pixels share no samples, as "
-    "under a box filter"
+    " unless it holds colours, no IOR of smooth glass is named with it, and pixels share no samples, as under a box "
+    "filter"
 )
 
 
@@ -219,10 +219,11 @@ def takes_sweep(scene: Scene, parameters, options: Options, form: str | None = N
 
 def has_rows(scene: Scene, parameters) -> bool:
     """Whether `backward.rows` finds the derivatives in them: in colours alone, which move no path."""
+    parameters = list(parameters)
     paths = {parameter.path for parameter in parameters}
     if not paths <= differentiated.paths(scene) or any(parameter.shape[-1:] != (3,) for parameter in parameters):
         return False
-    slots = differentiated.slots(scene, tuple(paths))
+    slots = differentiated.slots(scene, tuple(paths), differentiated.places_of_textures(parameters))
     # What also stands for a number has a derivative across channels.
     return slots.of_bsdfs == slots.colors and not (slots.of_choices or slots.of_passed or slots.grids)
 

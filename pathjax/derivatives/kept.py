@@ -27,6 +27,7 @@ class Kept:
 
     runs: tuple[range, ...]
     all: bool  # nothing else is in the list
+    fields: differentiated.Fields = None  # of `differentiated.places_of_textures`
 
     @property
     def count(self) -> int:
@@ -57,9 +58,10 @@ class Kept:
 
 def kept(scene: Scene, paths: differentiated.Paths, parameters: Iterable[Parameter]) -> Kept:
     """What is kept for derivatives in parameters, whose arrays are at the paths."""
+    parameters = list(parameters)
     _, count = differentiated.firsts(scene, paths)
     runs = few(sorted((entries(scene, paths, each) for each in parameters), key=lambda run: run.start))
-    return Kept(runs, sum(map(len, runs)) == count)
+    return Kept(runs, sum(map(len, runs)) == count, differentiated.places_of_textures(parameters))
 
 
 def entries(scene: Scene, paths: differentiated.Paths, parameter: Parameter) -> range:

@@ -42,7 +42,8 @@ def push(
         moved[place] = moved[place] + wanted[name].put(jnp.zeros_like(moved[place]), change)
     numbers = pixel.numbers(pixels, first_sample, spp, seed)
     options = replace(options, derivative=True, by_vertex=True)
-    return forward.push(scene, moved, pixels, *numbers, paths=paths, options=options, **how)
+    how |= dict(paths=paths, fields=differentiated.places_of_textures(wanted.values()), options=options)
+    return forward.push(scene, moved, pixels, *numbers, **how)
 
 
 @usual_promotion

@@ -40,6 +40,7 @@ class Kind:
 
     declared: ClassVar[Mapping[str, Declared]] = {}
     unused: ClassVar[Mapping[str, Unused]] = {}  # what files may say of it without effect
+    fills_places: ClassVar[bool] = False  # of parameters, as textures do
 
     def __init_subclass__(cls):
         classes = [vars(each) for each in reversed(cls.__mro__)]
@@ -100,7 +101,7 @@ class Kind:
             for place, (key, declared) in enumerate(cls.declared.items()):
                 name, value = f"{instance.name}.{key}", instance.values[key]
                 if isinstance(value, Instance):
-                    parameters.enter_texture(name, value, declared)
+                    parameters.enter_texture(name, value, declared, None if cls.fills_places else key)
                 elif value is not None and declared.listed:
                     where = (*path, "columns", place, "values"), (row,)
                     how = declared.shape, declared.bounds, key, declared.moves_paths, declared.least

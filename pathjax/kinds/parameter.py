@@ -48,6 +48,8 @@ class Parameter:
     means: tuple[tuple[tuple[str | int, ...], int], ...] = ()
     # (rows, 3) which of the values that vertices or faces of a mesh carry a corner has; None: they are of no mesh.
     corners: Fixed | None = None
+    # Of a texture: the parameters of bsdfs and lights in whose places it stands, by what kinds call them; None: others.
+    stands_in: frozenset[str] | None = None
 
     @property
     def is_texture(self) -> bool:
@@ -101,8 +103,10 @@ class Parameters:
     textures: dict[object, Parameter] = field(default_factory=dict)
     names: dict[object, str] = field(default_factory=dict)
 
-    def enter_texture(self, name: str, texture, declared) -> None:
+    def enter_texture(self, name: str, texture, declared, field: str | None) -> None:
         """Enter a texture that stands in the place of what is `declared`, and would be the parameter `name`.
+
+        field: of `Parameter.stands_in`; None: it stands in another texture.
 
         An image that stands in several places is named after the first one, and has the bounds of all. Where all want
         numbers it is a parameter of numbers.
@@ -120,6 +124,8 @@ class Parameters:
             color = self.textures[texture]
             shape = color.shape if declared.shape == (3,) else color.shape[:-1]
             bounds = declared.bounds[0], max(declared.bounds[1], texture.kind.span(texture)[1])
-            now = self.known.get(first, replace(color, shape=shape, bounds=bounds))
+            now = self.known.get(first, replace(color, shape=shape, bounds=bounds, stands_in=frozenset()))
             low, high = zip(now.bounds, bounds, strict=True)
-            self.known[first] = replace(now, shape=max(now.shape, shape, key=len), bounds=(max(low), min(high)))
+            shape, bounds = max(now.shape, shape, key=len), (max(low), min(high))
+            places = None if field is None or now.stands_in is None else now.stands_in | {field}
+            self.known[first] = replace(now, shape=shape, bounds=bounds, stands_in=places)

@@ -20,6 +20,7 @@ class Texture(Kind):
     parameters and in uv.
     """
 
+    fills_places = True
     to_uv = Transform2()
     over_uv: ClassVar[bool] = True  # colours follow from uv, so that they slope along it
 

@@ -11,7 +11,7 @@ import pytest
 
 import pathjax as pj
 from pathjax.compile import mapping
-from pathjax.derivatives import backward, jacobian, matrix_free, record, totals
+from pathjax.derivatives import backward, differentiated, jacobian, matrix_free, record, totals
 from pathjax.derivatives.kept import MOST_RUNS, Kept, few
 from pathjax.errors import InputError
 from pathjax.images import write_exr
@@ -316,6 +316,45 @@ def test_jacobians_in_textures(make_scene, picture):
     assert np.isfinite(halves).all() and np.linalg.eigvalsh(normal.matrix).max() > 0
 
 
+def alpha(file):
+    bitmap = f'<texture type="bitmap" name="alpha"><string name="filename" value="{file}"/></texture>'
+    return f'<bsdf type="roughconductor" id="rough">{bitmap}</bsdf>'
+
+
+@pytest.mark.slow
+def test_textures_that_are_not_asked_for_take_no_part(make_scene, picture):
+    """Of a texture in the place of a reflectance, those that are roughnesses or colours of a board are not recorded."""
+    board = f'<texture type="checkerboard" name="reflectance">{rgb("color0", "0.2, 0.5, 0.7")}</texture>'
+    bsdfs = diffuse("wall", texture(picture(2, 3))), diffuse("board", board), alpha(picture(3, 3))
+    inside = "".join(
+        f'<shape type="rectangle"><transform name="to_world"><translate x="{2 * k - 2}"/></transform>{bsdf}</shape>'
+        for k, bsdf in enumerate(bsdfs)
+    )
+    scene = make_scene(inside + f'<emitter type="constant">{rgb("radiance", 1)}</emitter>', res=RES, depth=3)
+    known = scene.about.parameters
+
+    def slots(*names):
+        wanted = [known[name] for name in names]
+        paths = tuple(dict.fromkeys(p.path for p in wanted))
+        return differentiated.slots(scene, paths, differentiated.places_of_textures(wanted))
+
+    assert (slots("wall.reflectance").of_bsdfs, slots("wall.reflectance").colors) == (1, 1)
+    assert (slots("rough.alpha").of_bsdfs, slots("rough.alpha").colors) == (1, 0)
+    assert slots("wall.reflectance", "rough.alpha").of_bsdfs == 2
+    board = next(name for name in known if name.endswith("color0"))
+    assert slots(board).of_bsdfs == 2  # which may stand anywhere
+    everything = [name for name in known if matrix_free.is_swept(scene, known[name])]
+    pulled = {}
+    for names in (everything, *([name] for name in everything)):
+        wanted, pixels = {name: known[name] for name in names}, jnp.arange(RES * RES, dtype=jnp.int32)
+        v = jnp.ones((RES * RES, 3))
+        found = matrix_free.pull(named.nameless(scene), wanted, v, pixels, 0, SPP, 3, Options())
+        for name, x in found.items():
+            first = pulled.setdefault(name, x)
+            np.testing.assert_allclose(x, first, rtol=1e-5, atol=1e-6 * np.abs(first).max())
+    assert jacobian.has_rows(scene, [known["wall.reflectance"]])
+
+
 @pytest.mark.parametrize("count", [1, MOST_RUNS, MOST_RUNS + 3])
 def test_entries_of_few_runs_are_kept(count):
     wanted = [range(10 * k * k, 10 * k * k + 1 + k) for k in range(count)]
@@ -332,7 +371,7 @@ def test_entries_of_few_runs_are_kept(count):
 
 def test_what_takes_a_derivative_of_each_number_refuses_textures_that_it_cannot_take(screen):
     wide = replace(screen, film=replace(screen.film, shared=True))
-    with pytest.raises(pj.InputError, match=f"{NAME} is a texture, .* unless it and all other"):
+    with pytest.raises(pj.InputError, match=f"{NAME} is a texture, .* unless it holds colours"):
         pj.jacobian(wide, [NAME], 1)
     with pytest.raises(pj.InputError, match="second derivatives are not"):
         jax.hessian(lambda x: pj.render(pj.with_parameters(screen, {NAME: x}), 1).sum())(pj.parameters(screen)[NAME])
