@@ -60,7 +60,7 @@ class Dielectric(Interface):
         wi may lie on either side: wi.z < 0 comes from inside. Radiance is scaled by 1/eta^2 on refraction, eta being
         the IOR of the far side over that of the near side (PBRT 4 ed., 9.5.2).
         """
-        ratio = p.int_ior / p.ext_ior
+        ratio = fresnel.relative(p.int_ior, p.ext_ior)
         outside = wi[2] > 0
         eta = jnp.where(outside, ratio, 1 / ratio)
         cos_i = smaller(jnp.abs(wi[2]), jnp.ones_like(eta))

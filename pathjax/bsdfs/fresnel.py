@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from pathjax.core.math import safe_sqrt, smaller
+from pathjax.core.math import larger, safe_sqrt, smaller
 
 
 def dielectric(cos_i: Float[Array, ""], eta: Float[Array, ""]) -> tuple[Float[Array, ""], Float[Array, ""]]:
@@ -17,13 +17,15 @@ def dielectric(cos_i: Float[Array, ""], eta: Float[Array, ""]) -> tuple[Float[Ar
         eta: > 0, IOR of the far side over that of the near side.
     Returns:
         R, in [0, 1]; cos_t >= 0, 0 under total internal reflection, where R = 1.
-    Derivatives are finite, in float32 for eta up to 1e5: at and beyond the critical angle they are those of the
-    constant 1.
+    Derivatives are finite: at and beyond the critical angle they are those of the constant 1.
     """
-    contrast, refracts, cos_t = _refraction(cos_i, eta)
-    s, p = cos_i + eta * cos_t, eta * cos_i + cos_t
-    r_s = contrast / jnp.where(refracts, s * s, 1)
-    r_p = contrast * ((eta * eta + 1) * cos_i * cos_i - 1) / jnp.where(refracts, eta * eta * p * p, 1)
+    eta = within(eta)
+    refracts, cos_t = _refraction(cos_i, eta)
+    share = 1 / jnp.where(refracts, cos_i + eta * cos_t, 1)
+    r_s = ((eta - 1) * share) * ((eta + 1) * share)
+    # Times cos(i + t) / cos(i - t): by products of these no square overflows, as by their squares.
+    sin2, across = (1 - cos_i) * (1 + cos_i), eta * cos_i * cos_t
+    r_p = r_s * ((across - sin2) / jnp.where(refracts, across + sin2, 1))
     return jnp.where(refracts, smaller((r_s * r_s + r_p * r_p) / 2, jnp.ones_like(cos_t)), 1), cos_t
 
 
@@ -34,31 +36,42 @@ def schlick(cos_i: Float[Array, ""], eta: Float[Array, ""]) -> tuple[Float[Array
     The angle is that on the thinner side, so that light going back sees the same reflectance. Wrong most at grazing
     angles: by 0.036 at 85 degrees and IOR 1.5; even equal media reflect, (1 - cos)^5.
     """
-    _, refracts, cos_t = _refraction(cos_i, eta)
+    eta = within(eta)
+    refracts, cos_t = _refraction(cos_i, eta)
     r0 = ((eta - 1) / (eta + 1)) ** 2
     missing = 1 - jnp.where(eta < 1, cos_t, cos_i)
     return jnp.where(refracts, r0 + (1 - r0) * missing**5, 1), cos_t
 
 
+def relative(int_ior: Float[Array, ""], ext_ior: Float[Array, ""]) -> Float[Array, ""]:
+    """IOR inside over that outside, `within` what has powers."""
+    return within(int_ior / ext_ior)
+
+
+def within(eta: Float[Array, ""]) -> Float[Array, ""]:
+    """A ratio of IORs as one whose powers are floats: beyond the reciprocal of a rounding hardly any light passes."""
+    rounding = jnp.finfo(eta.dtype).eps
+    return larger(smaller(eta, 1 / rounding), rounding)
+
+
 def _refraction(cos_i, eta):
-    """eta^2 - 1, whether light refracts, and the cosine if so."""
+    """Whether light refracts, and the cosine if so."""
     # With the contrast taken out, nothing cancels: equal media reflect 0 at any angle, with derivative 0.
-    contrast = (eta - 1) * (eta + 1)
-    cos2_t = (cos_i * cos_i + contrast) / (eta * eta)
-    refracts = cos2_t > 0
-    return contrast, refracts, safe_sqrt(cos2_t)
+    cos2_t = (cos_i * cos_i + (eta - 1) * (eta + 1)) / (eta * eta)
+    refracts = cos2_t >= jnp.finfo(cos2_t.dtype).tiny  # so that its square root may be squared
+    return refracts, safe_sqrt(jnp.where(refracts, cos2_t, 0))
 
 
 def diffuse(eta: Float[Array, ""]) -> Float[Array, ""]:
-    """Share of isotropic light that an interface reflects, by fits of d'Eon and Irving (2011) for eta > 1, and of Egan
+    """Share of isotropic light that passes an interface, by fits of d'Eon and Irving (2011) for eta > 1, and of Egan
     and Hilgeman (1973) below, where some is reflected totally. Both are wrong by less than 0.002.
 
     The second one strays below 1/2. There it follows from the first: of isotropic light, what passes one way is
     eta^2 times what passes the other way.
     """
     thin, x = eta < 1, jnp.where(eta < 1, eta, 1 / eta)
-    enters = 0.919317 + x * (-3.4793 + x * (6.75335 + x * (-7.80989 + x * (4.98554 - x * 1.36881))))
-    leaves = jnp.where(x > 0.5, 0.0636 / x + 0.6681 + x * (0.7099 - x * 1.4399), 1 - (1 - enters) * x * x)
+    enters = 0.080683 + x * (3.4793 + x * (-6.75335 + x * (7.80989 + x * (-4.98554 + x * 1.36881))))
+    leaves = jnp.where(x > 0.5, 0.3319 - 0.0636 / x + x * (x * 1.4399 - 0.7099), enters * x * x)
     return jnp.where(thin, leaves, enters)
 
 

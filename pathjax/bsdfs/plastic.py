@@ -35,7 +35,7 @@ class Plastic(BSDF):
 
     @staticmethod
     def evaluate(p: Row, wi: Float[Array, "3"], wo: Float[Array, "3"]) -> tuple[Float[Array, "3"], Float[Array, ""]]:
-        eta = p.int_ior / p.ext_ior
+        eta = fresnel.relative(p.int_ior, p.ext_ior)
         passes_in, passes_out = 1 - reflectance(wi, eta), 1 - reflectance(wo, eta)
         cosine = square_to_cosine_hemisphere_pdf(wo)
         f = base(p, eta, fresnel.diffuse(1 / eta)) * (passes_in * passes_out * cosine)
@@ -44,7 +44,7 @@ class Plastic(BSDF):
     @staticmethod
     def sample(p: Row, wi: Float[Array, "3"], u: Float[Array, " numbers"]) -> BSDFSample:
         """The mirror direction by about the share that the coat has in the light, else by the cosine."""
-        mirrors = reflectance(wi, p.int_ior / p.ext_ior)
+        mirrors = reflectance(wi, fresnel.relative(p.int_ior, p.ext_ior))
         chance = chance_of_coat(p, mirrors)
         coat, u = chosen(u, chance)
         diffuse = square_to_cosine_hemisphere(u)
@@ -60,14 +60,15 @@ def reflectance(w: Float[Array, "3"], eta: Float[Array, ""]) -> Float[Array, ""]
     return fresnel.dielectric(jnp.clip(w[2], 0, 1), eta)[0]
 
 
-def base(p: Row, eta: Float[Array, ""], internal: Float[Array, ""]) -> Float[Array, "3"]:
+def base(p: Row, eta: Float[Array, ""], leaves: Float[Array, ""]) -> Float[Array, "3"]:
     """Albedo of the base, with all reflections between it and the coat, over eta^2: radiance is spread where it leaves.
 
-    internal: share of diffuse light that the coat sends back to the base.
+    leaves: share of diffuse light that the coat does not send back to the base.
     """
     albedo, nonlinear = p.diffuse_reflectance, p.nonlinear
-    returns = internal if nonlinear is None else internal * jnp.where(nonlinear, albedo, 1)
-    return albedo / ((1 - returns) * (eta * eta))
+    if nonlinear is not None:
+        leaves = leaves + (1 - leaves) * jnp.where(nonlinear, 1 - albedo, 0)
+    return albedo / (leaves * (eta * eta))
 
 
 def chance_of_coat(p: Row, mirrors: Float[Array, ""]) -> Float[Array, ""]:

@@ -143,7 +143,7 @@ def _look(p: Row) -> Look:
         specular = larger(specular, LEAST_CLEAR_SPECULAR) if clear else specular
         of_specular = 2 / (1 - safe_sqrt(0.08 * specular)) - 1
         eta = of_specular if eta is None else jnp.where(p.eta > 0, eta, of_specular)
-    return Look(**values, eta=eta)
+    return Look(**values, eta=fresnel.within(eta))
 
 
 def _reflectance(look: Look, cos: Float[Array, ""], inside: Bool[Array, ""] | None):

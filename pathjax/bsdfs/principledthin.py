@@ -80,7 +80,7 @@ class Look(NamedTuple):
 
     @classmethod
     def of(cls, p: Row) -> Look:
-        return cls(*(getattr(p, name) for name in cls._fields))
+        return cls(*(getattr(p, name) for name in cls._fields))._replace(eta=fresnel.within(p.eta))
 
     @property
     def base(self) -> Float[Array, ""] | float:

@@ -91,5 +91,5 @@ def _side(wi):
 
 def _eta(p, wi):
     """IOR of the far side over that of the near side."""
-    ratio = p.int_ior / p.ext_ior
+    ratio = fresnel.relative(p.int_ior, p.ext_ior)
     return jnp.where(wi[2] < 0, 1 / ratio, ratio)

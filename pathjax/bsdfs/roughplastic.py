@@ -42,24 +42,28 @@ class RoughPlastic(Plastic):
 
     @staticmethod
     def evaluate(p: Row, wi: Float[Array, "3"], wo: Float[Array, "3"]) -> tuple[Float[Array, "3"], Float[Array, ""]]:
-        eta, facets, cosine = p.int_ior / p.ext_ior, _facets(p), square_to_cosine_hemisphere_pdf(wo)
+        eta, facets, cosine = _eta(p), _facets(p), square_to_cosine_hemisphere_pdf(wo)
         terms, returns = coat.at(p.coat, p.alpha, eta)
         passes_in, passes_out = (coat.passes(terms, jnp.clip(w[2], 0, 1)) for w in (wi, wo))
         share, m = facets.reflected(wi, wo)
         mirrors, _ = fresnel.dielectric(jnp.clip(dot(wi, m), 0, 1), eta)
-        f = base(p, eta, returns) * (passes_in * passes_out * cosine) + p.specular_reflectance * (mirrors * share)
+        f = base(p, eta, 1 - returns) * (passes_in * passes_out * cosine) + p.specular_reflectance * (mirrors * share)
         chance = chance_of_coat(p, 1 - passes_in)
         return f, chance * facets.detached().reflected_pdf(wi, wo) + (1 - chance) * cosine
 
     @staticmethod
     def sample(p: Row, wi: Float[Array, "3"], u: Float[Array, " numbers"]) -> BSDFSample:
         """Mirrored at a normal that wi sees, by about the share that the coat has in the light, else by the cosine."""
-        terms, _ = coat.at(p.coat, p.alpha, p.int_ior / p.ext_ior)
+        terms, _ = coat.at(p.coat, p.alpha, _eta(p))
         on_coat, u = chosen(u, chance_of_coat(p, 1 - coat.passes(terms, jnp.clip(wi[2], 0, 1))))
         m = _facets(p).detached().sample(wi, u)
         wo = jnp.where(on_coat, mirrored(wi, m), square_to_cosine_hemisphere(u))
         f, pdf = RoughPlastic.evaluate(p, wi, wo)
         return BSDFSample(wo, f * safe_divide(1.0, pdf), pdf, jnp.bool_(False), jnp.ones_like(pdf))
+
+
+def _eta(p: Row):
+    return fresnel.relative(p.int_ior, p.ext_ior)
 
 
 def _facets(p: Row):

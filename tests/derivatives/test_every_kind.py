@@ -13,12 +13,15 @@ import pytest
 
 import pathjax as pj
 from pathjax import bsdfs, emitters, media, textures
+from pathjax.bsdfs.ior import LEAST_IOR
 from pathjax.sensors.film import image_shape
 
 SEEDS = 16
 # Samples per pixel to begin with, and at most; as many are taken as find an error of this size half of the time.
 SPP, MOST_SPP = 64, 2048
 RESOLUTION = 0.15
+# Its square is no float32.
+LARGE_IOR = 1e30
 
 # What stands around: its parameters are checked with the kinds that they are of.
 FLOOR = """<shape type="rectangle"><transform name="to_world"><scale value="3"/><rotate x="1" angle="-90"/>
@@ -310,6 +313,7 @@ def test_no_derivative_is_nan(scene_of, case):
     # What is below the least value that counts has no derivative.
     least = {name: max(known[name].bounds[0], np.nextafter(np.float32(known[name].least), np.inf)) for name in names}
     ends = {name: [least[name], known[name].bounds[1]] for name in names}
+    ends |= {name: [least[name], LARGE_IOR] for name in names if known[name].bounds == (LEAST_IOR, np.inf)}
     ends = {name: [np.full_like(values[name], end) for end in each if np.isfinite(end)] for name, each in ends.items()}
     lowest, highest = ({name: each[i] for name, each in ends.items() if each[i:]} for i in (0, -1))
     single = [{name: end} for name, each in ends.items() for end in each if not known[name].is_texture]
