@@ -233,7 +233,9 @@ def firsts(scene: Scene, paths: Paths) -> tuple[dict[tuple, int], int]:
 def count(scene: Scene, path: tuple) -> int:
     """Entries of an array: its colours, or its numbers."""
     array = named.get(scene, path)
-    return array.size // 3 if of_colors(scene, path) else array.size
+    if not of_colors(scene, path):
+        return array.size
+    return array.size // (array.shape[-1] if array.ndim > 1 else 3)
 
 
 def path_of_grid(nudge: str) -> tuple:
@@ -245,9 +247,14 @@ def of_colors(scene: Scene, path: tuple) -> bool:
     """Whether an array holds colours; else it holds numbers."""
     array = named.get(scene, path)
     if array.ndim > 1:
-        return array.shape[-1] == 3
+        return array.shape[-1] == 3 or may_be_wider(scene, path)
     known = declared(scene, path)
     return known.shared and known.colors
+
+
+def may_be_wider(scene: Scene, path: tuple) -> bool:
+    """Whether the rows of an array may have numbers behind their colours."""
+    return len(path) > 2 and path[-3] == "columns" and getattr(declared(scene, path), "wider", False)
 
 
 def declared(scene: Scene, path: tuple) -> Declared:

@@ -21,20 +21,28 @@ from pathjax.core import sampler
 from pathjax.core.math import at, luminance
 from pathjax.derivatives import differentiated
 from pathjax.derivatives.record import Record, extend
+from pathjax.derivatives.totals import NEAR
 from pathjax.emitters import Choice
 from pathjax.integrators import path, pixel
 from pathjax.integrators.options import Options
 from pathjax.integrators.random_numbers import bounce_numbers
 from pathjax.integrators.reconstruction import map_pixels
+from pathjax.scene import parameters as named
 from pathjax.scene.scene import Scene
 
+# Numbers in a row of texels with their changes beside them: a power of 2, so that one line of a cache holds it.
+WIDTH = 8
 
-def changes(record: Record, v: Float[Array, "M 3"]) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
-    """What v does to Le + n and to w of a vertex. v: the list of changes, as `differentiated` orders it."""
+
+def changes(record: Record, v: Float[Array, "M numbers"]) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
+    """What v does to Le + n and to w of a vertex.
+
+    v: the list of changes, as `differentiated` orders it: the last three numbers of each row.
+    """
     now = later = jnp.zeros_like(record.weight)
     for slot in record.slots:
         shares = slot.shares or (1,)
-        change = sum(share * at(v, place) for place, share in zip(slot.places, shares, strict=True))
+        change = sum(share * at(v, place)[-3:] for place, share in zip(slot.places, shares, strict=True))
         # Read once, as both of its consumers would read it from far memory.
         change = compute_once(luminance(change) if slot.is_number else change)
         now = now + slot.now * change
@@ -47,15 +55,16 @@ def pixel_change(
     work: pixel.Work,
     scene: Scene,
     choice: Choice | None,
-    v: Float[Array, "M 3"],
+    v: Float[Array, "M 3"] | None,
     *,
     options: Options,
     slots: differentiated.Slots,
     paths: differentiated.Paths,
 ) -> Float[Array, "3"]:
-    """What v does to the mean of a pixel."""
+    """What v does to the mean of a pixel. v: None, where it stands `beside` the one array that is differentiated."""
     pixel_number, first_sample, spp, seed = work
     stream = sampler.pixel_stream(seed, pixel_number)
+    v = named.get(scene, paths[0]) if v is None else v
     zero = jnp.zeros((3,), scene.camera.origin.dtype)
 
     def step(state):
@@ -74,6 +83,11 @@ def pixel_change(
     state = first_sample, jnp.int32(0), *pixel.no_path(scene, options), zero, (zero, zero)
     *_, (total, _) = persistent_loop(lambda state: state[0] != first_sample + spp, step, state)
     return total / jnp.maximum(spp, 1).astype(total.dtype)
+
+
+def beside(array: Float[Array, "M 3"], v: Float[Array, "M 3"]) -> Float[Array, "M numbers"]:
+    """Texels, and their changes behind them: what J v costs is mostly what it reads from far memory, once so."""
+    return jnp.concatenate([array, jnp.zeros((len(array), WIDTH - 6), array.dtype), v], 1)
 
 
 @partial(jax.jit, static_argnames=("paths", "fields", "options", "form", "devices"))
@@ -98,8 +112,10 @@ def push(
         return jnp.broadcast_to(array, (len(array), 3))
 
     rows = list(map(entries, paths, changed))
-    # One array alone is not copied, as it may be large.
     v = rows[0] if len(rows) == 1 else jnp.concatenate(rows)
+    far = v.size * v.dtype.itemsize > NEAR
+    if far and len(paths) == 1 and differentiated.may_be_wider(scene, paths[0]):
+        scene, v = named.put(scene, paths[0], beside(named.get(scene, paths[0]), v)), None
     of_pixel = partial(pixel_change, options=options, slots=slots, paths=paths)
     work = pixels, first_sample, spp, seed
     return map_pixels(of_pixel, work, scene, choice, v, options=options, form=form, devices=devices)

@@ -191,6 +191,7 @@ class Shared(Declared):
 
     by_number: bool = False  # read at numbers that rows of the table tell, never as a whole: it may be longer
     colors: bool = False  # one after another, in an array of one axis
+    wider: bool = False  # its rows are colours, and may have more numbers behind them, which are not read
     shared = True
 
 

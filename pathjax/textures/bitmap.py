@@ -27,7 +27,7 @@ _FAR = 2.0**24
 class Bitmap(Texture):
     """An image. An `Instance` holds `texels` (H, W, 3), linear, `to_uv`, `interpolation` and `wrap`."""
 
-    texels = Shared(by_number=True)  # (N, 3), all images one after another, rows from the top
+    texels = Shared(by_number=True, wider=True)  # (N, 3), all images one after another, rows from the top
     first = PerRow()  # () int32 first texel
     size = PerRow()  # (2,) int32 height, width
     nearest = PerRow()  # () bool, no interpolation
@@ -130,7 +130,7 @@ def _corners(p, uv):
 
 def _between(p, index, fraction):
     def texel(i, j):
-        return at(p.texels, index(i, j))
+        return at(p.texels, index(i, j))[:3]
 
     top = texel(0, 0) * (1 - fraction[1]) + texel(0, 1) * fraction[1]
     bottom = texel(1, 0) * (1 - fraction[1]) + texel(1, 1) * fraction[1]

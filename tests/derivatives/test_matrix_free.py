@@ -11,7 +11,7 @@ import pytest
 
 import pathjax as pj
 from pathjax.compile import mapping
-from pathjax.derivatives import backward, differentiated, jacobian, matrix_free, record, totals
+from pathjax.derivatives import backward, differentiated, forward, jacobian, matrix_free, record, totals
 from pathjax.derivatives.kept import MOST_RUNS, Kept, few
 from pathjax.errors import InputError
 from pathjax.images import write_exr
@@ -138,6 +138,22 @@ def test_strategies_hidden_lights_and_float64(room, x64, how):
     strategy = how.pop("strategy", "mis")
     with x64() if "dtype" in how else contextlib.nullcontext():
         assert_transposed(limited(room(**how), 6, 3), strategy=strategy)
+
+
+@pytest.mark.slow
+def test_changes_of_texels_alone_are_those_beside_other_changes(room, monkeypatch):
+    """Alone and far they stand in the rows of the texels; among others in the list of all."""
+    monkeypatch.setattr(forward, "NEAR", 0)
+    scene = limited(room(), 4, 2)
+    wanted, _, _ = parts(scene)
+    of_texels = {name: p for name, p in wanted.items() if p.is_texture}
+    assert len({p.path for p in of_texels.values()}) == 1 < len({p.path for p in wanted.values()})
+    random = np.random.default_rng(5)
+    changes = {name: jnp.asarray(random.normal(size=p.shape), jnp.float32) for name, p in of_texels.items()}
+    work = jnp.arange(RES * RES, dtype=jnp.int32), 0, SPP, 3, Options()
+    alone, among = (matrix_free.push(named.nameless(scene), which, changes, *work) for which in (of_texels, wanted))
+    assert np.abs(among).max() > 0
+    np.testing.assert_allclose(alone, among, rtol=1e-5, atol=1e-5 * np.abs(among).max())
 
 
 @pytest.mark.slow
