@@ -1,5 +1,7 @@
 """Rays hit what float64 brute force says they hit: every shape, every scale, with trees and without."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -54,33 +56,67 @@ def affine(linear, translation):
 
 
 @jax.jit
-def _closest(shapes, rays):
+def _closest(shapes, *rays):
     return native_map(lambda ray, shapes: geometry.closest_hit(shapes, Ray(*ray)), rays, shapes)
 
 
 @jax.jit
-def _occluded(shapes, rays, targets):
+def _occluded(shapes, *rays):
+    *rays, targets = rays
     return native_map(lambda x, shapes: geometry.occluded(shapes, Ray(*x[0]), x[1]), (rays, targets), shapes)
 
 
+# Rays of a call, and the least numbers of nodes, leaves and primitives of a tree, and its depth: scenes of one kind then
+# share a kernel, and compiling is what takes time.
+RAYS, NODES, LEAVES, PRIMITIVES, DEPTH = 4096, 512, 2048, 2048, 8
+
+
+def longer(x, least):
+    """x (N, ...) with rows of zeros behind it, which nothing refers to, up to a power of 2."""
+    size = max(least, 1 << (len(x) - 1).bit_length())
+    return np.pad(np.asarray(x), [(0, size - len(x)), *[(0, 0)] * (x.ndim - 1)])
+
+
+def roomy(shapes):
+    """The same shapes, with room for more in what lies in a tree, and for more primitives behind all others."""
+    tables = []
+    for table in shapes.tables:
+        if getattr(table, "tree", None) is not None:
+            tree = replace(table.tree, nodes=longer(table.tree.nodes, NODES), depth=max(DEPTH, table.tree.depth))
+            table = replace(table, tree=tree, leaves=longer(table.leaves, LEAVES))
+        tables.append(table)
+    if not tables or not hasattr(tables[-1], "tree") or tables[-1].tree is None:
+        return replace(shapes, tables=tuple(tables))
+    rows = jax.tree.map(lambda x: longer(x, PRIMITIVES), tables[-1].by_row())
+    tables[-1] = replace(tables[-1], **rows)
+    first = sum(table.count for table in tables[:-1])
+    behind = {name: getattr(shapes, name) for name in ("shape", "light")}
+    behind = {name: x if x is None else np.r_[x[:first], longer(x[first:], PRIMITIVES)] for name, x in behind.items()}
+    return replace(shapes, tables=tuple(tables), **behind)
+
+
+def asked(query, shapes, *rays):
+    """What a query says of each ray, NumPy arrays; the last call is filled up with rays that are asked already."""
+    shapes, count = roomy(shapes), len(rays[0])
+    number = np.resize(np.arange(count), -(-count // RAYS) * RAYS).reshape(-1, RAYS)
+    parts = [query(shapes, *(jnp.asarray(x[some]) for x in rays)) for some in number]
+    return jax.tree.map(lambda *x: np.concatenate(x)[:count], *parts)
+
+
 def packed(shapes, o, d, t_max, exclude):
-    """Rays, repeated up to a power of 2: tests of one scene then share a kernel, and compiling is what takes time."""
     dtype = f"f{shapes.tables[0].leaves.dtype.itemsize if shapes.tables else 4}"
-    number = np.resize(np.arange(len(o)), 4096 if len(o) <= 4096 else 1 << (len(o) - 1).bit_length())
     t_max, exclude = np.broadcast_to(t_max, len(o)), np.broadcast_to(exclude, len(o))
-    o, d, t_max = (jnp.asarray(np.asarray(x)[number], dtype) for x in (o, d, t_max))
-    return o, d, t_max, jnp.asarray(exclude[number], jnp.int32)
+    return *(np.asarray(x, dtype) for x in (o, d, t_max)), np.asarray(exclude, np.int32)
 
 
 def closest(shapes, o, d, t_max=np.inf, exclude=-1):
     """Hit of each ray, NumPy arrays."""
-    return jax.tree.map(lambda x: np.asarray(x)[: len(o)], _closest(shapes, packed(shapes, o, d, t_max, exclude)))
+    return asked(_closest, shapes, *packed(shapes, o, d, t_max, exclude))
 
 
 def occluded(shapes, o, d, t_max=np.inf, target=-1):
-    rays = packed(shapes, o, d, t_max, -1)
-    targets = jnp.asarray(np.resize(np.broadcast_to(target, len(o)), len(rays[0])), jnp.int32)
-    return np.asarray(_occluded(shapes, rays, targets))[: len(o)]
+    targets = np.broadcast_to(np.asarray(target, np.int32), len(o))
+    return asked(_occluded, shapes, *packed(shapes, o, d, t_max, -1), targets)
 
 
 def unit(v, dtype=np.float32):
@@ -709,7 +745,7 @@ def test_surface_derivatives_are_finite(kind):
 
 
 @jax.jit
-def _bounce(shapes, rays):
+def _bounce(shapes, *rays):
     def one(ray, shapes):
         o, d, wish = ray
         ray = Ray(o, d, jnp.full_like(o[0], jnp.inf), jnp.int32(-1))
@@ -728,7 +764,7 @@ def test_spawned_rays_stay_inside_a_closed_mesh():
         moved = np.float32(vertices * scale + shift * scale).astype(float)
         o, d = rays_at_edges(moved, faces, 200_000, 5)
         wish = unit(np.random.default_rng(6).normal(size=d.shape))
-        first, second = _bounce(scene_of(mesh(moved, faces)), tuple(map(jnp.asarray, (o, d, wish))))
+        first, second = asked(_bounce, scene_of(mesh(moved, faces)), o, d, np.float32(wish))
         assert np.isfinite(first).all() and np.isfinite(second).all(), (scale, shift, np.isinf(second).sum())
 
 
