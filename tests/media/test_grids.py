@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -76,7 +77,7 @@ def test_depths_are_integrals_of_what_is_looked_up(two, form):
 
         return exact, jax.lax.fori_loop(0, steps, add, jnp.zeros(3))
 
-    exact, summed = native_map(both, (o, d, number), two, form=form)
+    exact, summed = jax.jit(partial(native_map, both, form=form))((o, d, number), two)
     assert float(exact.max()) > 2
     np.testing.assert_allclose(exact, summed, atol=2e-2)
     assert abs(np.mean(exact - summed)) < 1e-3
