@@ -9,6 +9,7 @@ from pathjax.cli import DONE
 from pathjax.cli.inputs import load
 from pathjax.kinds.parameter import Parameter
 from pathjax.rendering import bounces
+from pathjax.rendering.tail import check_share
 from pathjax.scene.parameters import parameters
 from pathjax.scene.scene import UNBOUNDED, Scene
 from pathjax.sensors import film
@@ -89,6 +90,7 @@ def tail_facts(scene: Scene, error: float) -> dict:
     Raises:
         InputError: error is not between 0 and 1.
     """
+    check_share(error)  # before anything is rendered
     tail, max_depth = bounces.pilot(scene), int(scene.max_depth)
     share, uncertainty = tail.cut_off(max_depth)
     return {

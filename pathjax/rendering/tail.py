@@ -56,8 +56,7 @@ class Tail:
         Raises:
             InputError: error is not between 0 and 1.
         """
-        if not 0 < error < 1:
-            raise InputError(f"error = {error}; a share of light that may be cut off lies between 0 and 1")
+        check_share(error)
         if not np.isfinite(self.light).all():
             return None
         depth = len(self.terms)
@@ -68,6 +67,12 @@ class Tail:
         lacking = share > error
         further = np.log(error / share[lacking]) / np.log(self.ratio[lacking])
         return depth + math.ceil(further.max())
+
+
+def check_share(error: float) -> None:
+    """Raises InputError where a share of light that may be cut off is not between 0 and 1."""
+    if not 0 < error < 1:
+        raise InputError(f"error = {error}; a share of light that may be cut off lies between 0 and 1")
 
 
 def fit(terms: np.ndarray, standard_error: np.ndarray) -> Tail:
