@@ -28,13 +28,15 @@ import pytest
 from jax.experimental.compilation_cache import compilation_cache
 
 from pathjax.bench import peers
+from pathjax.compile import on_all_devices
 from pathjax.derivatives import jacobian, tangents
 from pathjax.integrators import pixel
 from pathjax.integrators.options import DEFAULTS
 from pathjax.io.mitsuba import loader as mitsuba_xml
 from pathjax.rendering.render import pixel_means
 from pathjax.scene import build
-from pathjax.sensors.film import image_shape, pixel_count
+from pathjax.scene.parameters import nameless
+from pathjax.sensors import film
 
 os.environ["PATHJAX_CACHE"] = "0"  # tests leave the user's cache of kernels alone
 
@@ -154,17 +156,23 @@ def x64():
 
 
 class Kernel(NamedTuple):
-    """A shipped scene at 16 pixels wide, compiled once for all tests that look at its kernel or its image."""
+    """A shipped scene at 16 pixels wide, compiled once for all tests that look at its kernel or its image.
+
+    The program is the one that `render` compiles.
+    """
 
     scene: pathjax.Scene
     compiled: jax.stages.Compiled
 
     def image(self, spp, seed=1):
         """(H, W, 3)."""
-        pixels = jnp.arange(pixel_count(self.scene.film), dtype=jnp.int32)
-        numbers = pixel.numbers(pixels, 0, spp, seed)
-        means = self.compiled(replace(self.scene, about=None), pixels, *numbers)
-        return np.asarray(means).reshape(*image_shape(self.scene.film), 3)
+        return np.asarray(self.compiled(*arguments_of_render(self.scene, spp, seed)))
+
+
+def arguments_of_render(scene, spp, seed):
+    """What `render` gives to `pixel_means`."""
+    pixels = film.pixels(scene.film)
+    return on_all_devices(nameless(scene)), pixels, *pixel.numbers(pixels, 0, spp, seed), None
 
 
 @pytest.fixture(scope="session")
@@ -174,10 +182,8 @@ def kernel_of(shipped):
     @functools.cache
     def compile(name, dtype=jnp.float32):
         scene = shipped(name, dtype, res=16)
-        pixels = jnp.arange(pixel_count(scene.film), dtype=jnp.int32)
-        numbers = pixel.numbers(pixels, 0, 1, 1)
-        lowered = pixel_means.lower(replace(scene, about=None), pixels, *numbers, options=DEFAULTS)
-        return Kernel(scene, lowered.compile())
+        how = {"options": DEFAULTS, "shape": film.image_shape(scene.film)}
+        return Kernel(scene, pixel_means.lower(*arguments_of_render(scene, 1, 1), **how).compile())
 
     return compile
 
@@ -190,7 +196,7 @@ class JacobianKernel(NamedTuple):
 
     def __call__(self, spp, seed=1, first_sample=0, step=0.02):
         """Means of all pixels (N, 3), derivatives in colours (N, T, 3) and in IORs (N, G, 3), biases (N, G, 3)."""
-        pixels = jnp.arange(pixel_count(self.scene.film), dtype=jnp.int32)
+        pixels = jnp.arange(film.pixel_count(self.scene.film), dtype=jnp.int32)
         numbers = pixel.numbers(pixels, first_sample, spp, seed)
         glass = self.compiled.in_avals[0][-1].shape
         return jax.tree.map(
@@ -209,7 +215,7 @@ def jacobian_kernel_of(shipped):
         glass = sorted({p.index[0] for p in parameters if p.moves_paths}) if which != "colours" else ()
         colors = [p for p in parameters if not p.moves_paths] if which != "glass" else ()
         wanted = jacobian.Wanted(tangents.places(colors), tuple(glass))
-        pixels = jnp.arange(pixel_count(scene.film), dtype=jnp.int32)
+        pixels = jnp.arange(film.pixel_count(scene.film), dtype=jnp.int32)
         numbers = pixel.numbers(pixels, 0, 1, 1)
         steps = jnp.full(len(glass), 0.02)
         lowered = jacobian._jacobians.lower(
