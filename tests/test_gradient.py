@@ -968,9 +968,9 @@ def test_more_dielectrics_than_one_kernel_takes(make_scene, monkeypatch):
         for name, x, z in (("front", 0, 1), ("back", 0.5, -1))
     )
     scene, names = make_scene("".join(balls) + sky(), res=8), ["front.int_ior", "back.int_ior"]
-    _, together = pj.jacobian(scene, names, spp=2)
+    _, together = pj.jacobian(scene, names, spp=2, step=0.02)
     monkeypatch.setattr(ior_difference, "MOST_GLASS", 1)
-    _, apart = pj.jacobian(scene, names, spp=2)
+    _, apart = pj.jacobian(scene, names, spp=2, step=0.02)
     for name in names:
         assert np.abs(together[name]).max() > 0.01
         np.testing.assert_allclose(apart[name], together[name], atol=1e-5)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -77,7 +76,7 @@ def test_depths_are_integrals_of_what_is_looked_up(two, form):
 
         return exact, jax.lax.fori_loop(0, steps, add, jnp.zeros(3))
 
-    exact, summed = jax.jit(partial(native_map, both, form=form))((o, d, number), two)
+    exact, summed = jax.jit(native_map, static_argnums=0, static_argnames="form")(both, (o, d, number), two, form=form)
     assert float(exact.max()) > 2
     np.testing.assert_allclose(exact, summed, atol=2e-2)
     assert abs(np.mean(exact - summed)) < 1e-3
@@ -154,9 +153,9 @@ def test_the_nearest_value_is_that_of_the_cell():
     p = made.box[0] + RNG.random((50, 3)) * (made.box[1] - made.box[0])
     cell = np.clip(np.rint(p @ made.to_grid[:, :3].T + made.to_grid[:, 3]).astype(int), 0, [1, 3, 2])
     built = grids.build([made], np.float32)
-    found = jax.vmap(lambda p: grids.look_up(built, 0, p))(jnp.asarray(p, jnp.float32))
+    found = jax.jit(jax.vmap(lambda p: grids.look_up(built, 0, p)))(jnp.asarray(p, jnp.float32))
     np.testing.assert_allclose(found, data[cell[:, 2], cell[:, 1], cell[:, 0]], rtol=1e-6)
-    entries = jax.vmap(lambda p: grids.entries(built, 0, p))(jnp.asarray(p, jnp.float32))
+    entries = jax.jit(jax.vmap(lambda p: grids.entries(built, 0, p)))(jnp.asarray(p, jnp.float32))
     told = sum(share[:, None] * np.asarray(built.values)[place] for place, share in entries)
     np.testing.assert_allclose(told, found, rtol=1e-6)
 
@@ -283,7 +282,7 @@ def test_a_grid_that_repeats_is_laid_side_by_side():
         share = np.prod(np.where(corner, x - low, 1 - (x - low)), 1, keepdims=True)
         i, j, k = ((low + corner) % data.shape[2::-1]).T
         expected += share * data[k, j, i]
-    found = jax.vmap(lambda p: grids.look_up(tiled, 0, p))(jnp.asarray(p, jnp.float32))
+    found = jax.jit(jax.vmap(lambda p: grids.look_up(tiled, 0, p)))(jnp.asarray(p, jnp.float32))
     np.testing.assert_allclose(found, expected, atol=1e-5)
 
 

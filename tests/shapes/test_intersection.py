@@ -66,8 +66,8 @@ def _occluded(shapes, *rays):
     return native_map(lambda x, shapes: geometry.occluded(shapes, Ray(*x[0]), x[1]), (rays, targets), shapes)
 
 
-# Rays of a call, and the least numbers of nodes, leaves and primitives of a tree, and its depth: scenes of one kind then
-# share a kernel, and compiling is what takes time.
+# Rays of a call, and of a tree the least numbers of nodes, leaves, primitives and levels: scenes of one kind then share
+# a kernel, and compiling is what takes time.
 RAYS, NODES, LEAVES, PRIMITIVES, DEPTH = 4096, 512, 2048, 2048, 8
 
 

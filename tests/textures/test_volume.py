@@ -56,7 +56,7 @@ def test_a_surface_has_the_values_of_where_it_is(wrap, nearest):
     def look_up(p):
         return made.look_up(jnp.asarray(codes[it], jnp.int32), SimpleNamespace(uv=surfaces.uv, p=p))
 
-    found = jax.vmap(look_up)(jnp.asarray(p, jnp.float32))
+    found = jax.jit(jax.vmap(look_up))(jnp.asarray(p, jnp.float32))
     # Where a face of cells is nearer than rounding either side is right.
     near = (np.abs(x + 0.5 * nearest - np.rint(x + 0.5 * nearest)) < 1e-4).any(1)
     np.testing.assert_allclose(found[~near], expected[~near], atol=1e-5)

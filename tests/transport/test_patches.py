@@ -3,6 +3,7 @@
 import contextlib
 from dataclasses import replace
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -53,7 +54,7 @@ def test_points_of_a_patch_lie_in_it(make_scene, x64, dtype):
 
         patch = np.arange(cells.count, dtype=np.int32).repeat(64)
         u = jnp.asarray(np.random.default_rng(1).uniform(0.001, 0.999, (len(patch), 2)), dtype)
-        again, same_side = native_map(found, (patch, u), cells, scene.geometry)
+        again, same_side = jax.jit(native_map, static_argnums=0)(found, (patch, u), cells, scene.geometry)
         assert cells.area.dtype == dtype
         np.testing.assert_array_equal(again, patch)
         assert np.asarray(same_side).all()
