@@ -104,7 +104,8 @@ def checked(name, value, parameter: Parameter, dtype):
         raise InputError(f"{name} takes {wanted}, not {given!r}") from None
     if not is_traced(value):
         low, high = parameter.bounds
-        if not bool(jnp.all((value >= low) & (value <= high) & jnp.isfinite(value))):
+        known = np.asarray(value)  # of which NumPy compiles nothing
+        if not np.all((known >= low) & (known <= high) & np.isfinite(known)):
             given = "a value" if parameter.is_texture else np.asarray(value).tolist()
             raise InputError(f"{name} = {given} lies outside its bounds [{low:g}, {high:g}]")
     return value

@@ -189,7 +189,7 @@ class Operator:
         else:
             self._check_radius()
             L = _gmres(self, tolerance)
-        return Solution(L, safe_divide(_norm(self.Le + self.T.mv(L) - L), _norm(self.Le)))
+        return Solution(L, _residual(self, L))
 
     def _terms_for(self, tolerance):
         radius = self._check_radius()
@@ -295,16 +295,17 @@ def _closing(exchange, area):
 def _albedos_and_lights(scene: Scene, patches: Patches):
     """Albedo (U, 3) and emitted radiance (U, 3) of the patches."""
     scene = attached(scene)
-
-    def of(table, rows):
-        # A row of black at the end stands for none.
-        return jnp.concatenate([table, jnp.zeros_like(table[:1])])[rows]
-
     _, column = bsdfs.reflectances(scene.materials) or (None, None)
     lights = emitters.even_lights(scene.emitters)
-    black = jnp.zeros((patches.count, 3), patches.area.dtype)
-    albedo = black if column is None else of(column.values, patches.row)
-    return albedo, black if lights is None else of(lights.table.column("radiance").values, patches.emitter)
+    black = jnp.asarray(np.zeros((patches.count, 3), patches.area.dtype))
+    albedo = black if column is None else _rows(column.values, patches.row)
+    return albedo, black if lights is None else _rows(lights.table.column("radiance").values, patches.emitter)
+
+
+@jax.jit
+def _rows(table, rows):
+    # A row of black at the end stands for none.
+    return jnp.concatenate([table, jnp.zeros_like(table[:1])])[rows]
 
 
 def _check_depth(depth):
@@ -314,6 +315,11 @@ def _check_depth(depth):
 
 def _norm(x):
     return jnp.sqrt(jnp.sum(x * x))
+
+
+@jax.jit
+def _residual(op: Operator, L):
+    return safe_divide(_norm(op.Le + op.T.mv(L) - L), _norm(op.Le))
 
 
 @jax.jit
