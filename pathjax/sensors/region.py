@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 
 from pathjax.compile import register_dataclass
 from pathjax.core.cumulated import cumulated, search
+from pathjax.errors import InputError
 from pathjax.shapes.shape import SurfacePoint, Table
 
 
@@ -29,4 +30,6 @@ class Region:
 def build(shape, dtype) -> Region:
     """shape: a `description.Shape`."""
     table, _ = shape.geometry.table.build([shape.geometry.primitives(shape.flip_normals)], [False], dtype, "sah", None)
+    if not table.even().all():
+        raise InputError(f"shape {shape.name!r} is round and scaled unevenly; of such no points are drawn evenly")
     return Region(table, np.asarray(cumulated(table.areas()), dtype))

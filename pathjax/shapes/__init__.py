@@ -19,6 +19,7 @@ from pathjax.shapes.accel.build import Tree
 from pathjax.shapes.cube import Cube
 from pathjax.shapes.cylinder import Cylinder
 from pathjax.shapes.disk import Disk
+from pathjax.shapes.ellipsoid import Ellipsoid
 from pathjax.shapes.geometry import Geometry
 from pathjax.shapes.rectangle import Rectangle
 from pathjax.shapes.shape import Lamps, Primitives, Shape, Table
@@ -54,6 +55,8 @@ KINDS: dict[str, type[Shape]] = {
     "mesh": ArrayMesh,
     "cylinder": Cylinder,
 }
+# The same of tables, in which order scenes hold them; instances make what no file names.
+TABLES = tuple(dict.fromkeys(kind.table for kind in (*KINDS.values(), Ellipsoid)))
 
 
 class Lamp(NamedTuple):
@@ -91,8 +94,7 @@ def build(
         path: where the geometry will be in the scene; parameters: to enter the attributes that bsdfs ask for.
         tangents, along: whether a bsdf asks for those of `Surface`.
     """
-    order = dict.fromkeys(kind.table for kind in KINDS.values())
-    by_table: dict[type[Table], list[_Part]] = {table: [] for table in order}
+    by_table: dict[type[Table], list[_Part]] = {table: [] for table in TABLES}
     asked = {t.values["names"] for shape in shapes for _, _, t in mesh_attribute.asked(shape.bsdf)}
     numbers = sorted(range(len(shapes)), key=lambda number: shapes[number].geometry.comes_last)
     for number in numbers:

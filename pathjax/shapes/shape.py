@@ -254,21 +254,25 @@ class Table(Searched):
 
     # ---- patches
 
-    @abstractmethod
+    def even(self) -> np.ndarray:
+        """(P,) bool: whether the methods below are known, which else are not asked for."""
+        return np.ones(self.count, bool)
+
     def areas(self) -> np.ndarray:
         """(P,) float64."""
+        raise NotImplementedError
 
-    @abstractmethod
     def cell_lengths(self, size: float) -> np.ndarray:
         """(P, 2) lengths along the two coordinates of `to_square`, cells being about `size` long."""
+        raise NotImplementedError
 
-    @abstractmethod
     def to_square(self, row: Int[Array, ""], p: Float[Array, "3"]) -> Float[Array, "2"]:
         """Coordinates in [0, 1], in which equal areas are equal, of a point; of triangles two barycentric ones."""
+        raise NotImplementedError
 
-    @abstractmethod
     def from_square(self, row: Int[Array, ""], xy: Float[Array, "2"]) -> SurfacePoint:
         """The inverse."""
+        raise NotImplementedError
 
     def edges_and_normals(self) -> tuple[np.ndarray, np.ndarray]:
         """For polygons: a corner and the two edges from there (P, 3, 3), and normals (P, 3) of any length; float64."""

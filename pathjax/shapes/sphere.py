@@ -30,6 +30,7 @@ from pathjax.description.fields import Fields
 from pathjax.shapes import coincident
 from pathjax.shapes.accel.leaves import numbers_of, pack, rows_of
 from pathjax.shapes.accel.traverse import Tree
+from pathjax.shapes.ellipsoid import Ellipsoid
 from pathjax.shapes.shape import ROUND, LampSample, Primitives, Shape, Table
 
 
@@ -212,7 +213,8 @@ class Sphere(Shape):
             return cls(to_world[:3, 3], radius, to_world) if round_enough and 0 < np.float32(radius) < np.inf else None
 
     def placed(self, to_world):
-        return self.of(to_world @ self.to_world)
+        to_world = to_world @ self.to_world
+        return self.of(to_world) or Ellipsoid.of(to_world)
 
     @property
     def mirrored(self):

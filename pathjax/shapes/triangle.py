@@ -263,7 +263,7 @@ class Triangles(Table):
 
 @dataclass(frozen=True)
 class Mesh(Shape):
-    """Triangles without degenerate ones; normals follow the transform and are unit."""
+    """Triangles without degenerate ones; normals follow the transform, and are unit but where an instance is uneven."""
 
     vertices: np.ndarray  # (V, 3)
     faces: np.ndarray  # (F, 3) int64
@@ -312,7 +312,8 @@ class Mesh(Shape):
             faces = faces[:, ::-1]
         if normals is not None:
             normals = normals @ np.linalg.inv(linear)
-            normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
+            # One length for all: as in Mitsuba, what is between the vertices is carried, too.
+            normals = normals / np.linalg.norm(normals, axis=1).max()
         return replace(self, vertices=vertices, faces=faces, normals=normals)
 
     def primitives(self, flip):

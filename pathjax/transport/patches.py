@@ -58,6 +58,12 @@ def cut_scene(scene: Scene, count: int, faceted: bool = False) -> Patches:
     rows = _diffuse_rows(scene, faceted)
     shape, light = np.asarray(shapes.shape), np.asarray(shapes.light)
 
+    even = np.concatenate([table.even() for table in shapes.tables])
+    if not even.all():
+        raise InputError(
+            f"{_name(scene, shape[np.argmin(even)])} is round and scaled unevenly, which is not cut into patches of "
+            "equal area. Give it a mesh, or use pathjax.render"
+        )
     area = np.concatenate([table.areas() for table in shapes.tables])
     if not (area > 0).all():
         worst = _name(scene, shape[np.argmin(area > 0)])

@@ -99,6 +99,11 @@ CASES = {
     "roughconductor, brushed": on_ball("roughconductor", METAL, numbers(alpha_u=0.4, alpha_v=0.2)),
     "roughconductor, brushed ggx": on_ball("roughconductor", GGX, METAL, numbers(alpha_u=0.1, alpha_v=0.4)),
     "dielectric": on_ball("dielectric", GLASS, SPECULAR, TRANSMITTED),
+    "dielectric, of an ellipsoid": LIGHT
+    + '<shape type="shapegroup" id="ball">'
+    + BALL.format(bsdf("dielectric", GLASS, SPECULAR, TRANSMITTED))
+    + '</shape><shape type="instance"><ref id="ball"/><transform name="to_world"><scale x="1.2" y="0.7"/>'
+    '<rotate z="1" angle="20"/></transform></shape>',
     "thindielectric": on_pane("thindielectric", GLASS, SPECULAR, TRANSMITTED),
     "roughdielectric": on_ball("roughdielectric", GLASS, SPECULAR, TRANSMITTED, numbers(alpha=0.3)),
     "roughdielectric, ggx": on_ball("roughdielectric", GGX, GLASS, numbers(alpha=0.15)),

@@ -23,6 +23,8 @@ PLACES = [
     '<translate x="0.5" y="-0.3"/>',
     '<rotate z="1" angle="40"/><scale value="0.6"/><translate z="-1.5"/>',
     '<scale x="-0.8" y="0.8" z="0.8"/><rotate x="1" angle="70"/><translate y="1.2"/>',
+    '<scale x="0.5" y="1.2" z="-0.8"/><rotate x="1" angle="30"/><translate x="-1" y="-1"/>',
+    '<matrix value="1 0.6 0 0.2 0.5 0.3 0 0.1 0.9"/><translate x="1" z="1.2"/>',
 ]
 OBJ = "v -1 -1 0\nv 1 -1 0.2\nv 1 1 0\nv -1 0.5 0.1\nvt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\nf 1/1 2/2 3/3 4/4\n"
 
@@ -86,9 +88,9 @@ def test_what_rays_meet_is_as_in_mitsuba(write):
 def test_instances_share_the_material_of_their_group_and_are_told_to_be_copies(write):
     scene = pj.load_scene(write(GROUP + instances()))
     names = [shape.name for shape in scene.about.description.shapes]
-    assert len(names) == 12 and len(set(names)) == 12 and sum(name.endswith(".leaf") for name in names) == 3
+    assert len(names) == 20 and len(set(names)) == 20 and sum(name.endswith(".leaf") for name in names) == 5
     assert [name for name in pj.parameters(scene) if name.startswith("green")] == ["green.reflectance"]
-    assert any("triangles of instances are copies: 6 of them" in note for note in scene.about.description.notes)
+    assert any("triangles of instances are copies: 10 of them" in note for note in scene.about.description.notes)
 
 
 def test_a_group_is_not_seen_by_itself_and_may_follow_its_instances(write):
@@ -111,8 +113,8 @@ def test_a_group_may_stand_inside_its_instance(write):
     [
         ('<shape type="instance"/>', 'needs a <ref> to a <shape type="shapegroup">'),
         ('<shape type="sphere" id="tree"/><shape type="instance"><ref id="tree"/></shape>', "needs a <ref> to a"),
-        (GROUP + instances(['<scale x="2"/>']), 'makes of "fruit" what is no sphere'),
-        (GROUP.replace("<scale v", '<scale value="1e9"/><scale v') + instances(['<scale value="1e31"/>']), "overflows"),
+        (GROUP + instances(['<matrix value="1 1 0 0 1e-9 0 0 0 1"/>']), 'makes "fruit" flat'),
+        (GROUP.replace("<scale v", '<scale value="1e9"/><scale v') + instances(['<scale value="1e31"/>']), "too large"),
         ('<shape type="shapegroup"><shape type="instance"/></shape>', "groups hold shapes alone"),
         ('<shape type="shapegroup"><shape type="shapegroup"/></shape>', "groups hold shapes alone"),
         ('<shape type="shapegroup"><shape type="cube"><emitter type="area"/></shape></shape>', "emits light"),

@@ -16,7 +16,8 @@ from pathjax.core.warp import square_to_cosine_hemisphere, square_to_cosine_hemi
 from pathjax.scene import build
 from pathjax.sensors import Perspective
 from pathjax.sensors.film import HDRFilm
-from pathjax.shapes import Cube, Disk, Mesh, Rectangle, Sphere, geometry
+from pathjax.shapes import Cube, Cylinder, Disk, Mesh, Rectangle, Sphere, geometry
+from pathjax.shapes.ellipsoid import Ellipsoid
 
 
 class Brushed(BSDF):
@@ -47,6 +48,8 @@ def geometry_of(shape, bsdf=Brushed):
 SHEARED = np.array([[0.9, 0.5, 0.1, 0.1], [-0.2, 0.8, 0.3, 0.2], [0.3, -0.1, 0.7, 0.3], [0, 0, 0, 1]])
 BALL = np.eye(4)
 BALL[:3, :3] = np.linalg.qr(SHEARED[:3, :3])[0]
+# The axis of a cylinder from y = -0.5 to 0.5.
+UPRIGHT = np.array([[0, 1, 0, 0], [0, 0, 1, -0.5], [1, 0, 0, 0], [0, 0, 0, 1]])
 TRIANGLE = np.array([[-1.0, -1, 0.2], [1.2, -0.8, 0], [0.1, 1.1, 0.4]])
 UV = np.array([[0.1, 0.2], [0.3, 0.9], [0.8, 0.4]])
 SHAPES = {
@@ -54,6 +57,8 @@ SHAPES = {
     "disk": Disk(SHEARED),
     "cube": Cube(SHEARED),
     "sphere": Sphere(np.zeros(3), 1.0, BALL),
+    "ellipsoid": Ellipsoid(SHEARED),
+    "cylinder": Cylinder(SHEARED @ UPRIGHT),
     "triangle": Mesh(TRIANGLE, np.array([[0, 1, 2]]), None, UV),
     "triangle of mirrored uv": Mesh(TRIANGLE, np.array([[0, 1, 2]]), None, UV[:, ::-1]),
 }

@@ -70,8 +70,7 @@ class Instance:
 def _placed(fields: Fields, shape: d.Shape, to_world: np.ndarray, name: str) -> d.Shape:
     placed = shape.geometry.placed(to_world)
     if placed is None:
-        kind = type(shape.geometry).__name__.lower()
-        raise fields.error("to_world", f'makes of "{shape.name}" what is no {kind}: it scales unevenly, or overflows')
+        raise fields.error("to_world", f'makes "{shape.name}" flat, or too large or small')
     return replace(shape, name=f"{name}.{shape.name}", geometry=placed)
 
 
