@@ -4,8 +4,10 @@ Of light that meets a rough interface at the cosine mu, T(mu) = E[(1 - F(m . wi)
 that over the normals m that wi sees (Walter et al. 2007). What comes from below as from a diffuse surface is reflected
 by the share 2 integral R(mu) mu dmu, R(mu) = E[F(m . wi) G1(wo)] being that of the interface from inside.
 
-T is a sum of Chebyshev polynomials, right to 0.001, and to 0.01 at grazing angles where alpha is below 0.05. Its terms
-are made for one alpha and one relative IOR eta, and are linear in them with the right derivatives, for kernels.
+T is a sum of Chebyshev polynomials in a variable that grows fastest where T does: at grazing angles, and where eta is below
+1 about the cosine from which on light is not reflected totally. It is right to 0.003, to 0.01 where alpha is below 0.05 or
+eta below 1, and to 0.02 where both and alpha is below 0.01, but at the very edge of total reflection. Its terms are made for one alpha and one relative IOR eta, and are linear in them with the right
+derivatives, for kernels.
 """
 
 from __future__ import annotations
@@ -21,8 +23,13 @@ from pathjax.compile import is_traced
 from pathjax.core.math import larger, smaller
 
 TERMS = 12
-# Constant, factor of alpha and factor of eta: of the terms of T, and of the share that is reflected inside.
-SHAPE = (3, TERMS + 1)
+# Constants, factors of alpha and factors of eta: of the share that is reflected inside, and of the terms of T; and the
+# four numbers of `_place`.
+SHAPE = (3 * (1 + TERMS) + 4,)
+# How far the variable goes as the cosine does: without total reflection, and about its edge, which is some alpha eta wide.
+# What is rougher is smoother at grazing angles. A smooth coat has an edge without width, and a root behind it: this alpha
+# is for both.
+REACH, REACH_OF_EDGE, LEAST_EDGE = 0.5, 2, 0.01
 # Points of the quadrature, in slopes of facets and in their azimuth, by which T and R are right to some 1e-4.
 POINTS = 48
 # Relative step of differences: over less, the points at the edges of what is seen and what is reflected totally make
@@ -30,14 +37,14 @@ POINTS = 48
 STEP = 0.03
 # Mitsuba's cosines, of which the mean of R(mu) mu stands for its integral: too low by 1/64 or so.
 COSINES_INSIDE = np.maximum(np.arange(64) / 63, 1e-6)
-# The roots of the polynomial behind the last: where T is computed.
+# Of the roots of the polynomial behind the last, where T is computed.
 _ANGLES = np.pi * (np.arange(TERMS) + 0.5) / TERMS
 _TO_TERMS = np.cos(np.outer(np.arange(TERMS), _ANGLES)) * np.where(np.arange(TERMS) == 0, 1, 2)[:, None] / TERMS
 
 
 def coats(
     distribution: str, alpha: Float[Array | np.ndarray, " R"], eta: Float[Array | np.ndarray, " R"]
-) -> Float[Array | np.ndarray, "R values terms_and_share"]:
+) -> Float[Array | np.ndarray, "R numbers"]:
     """What `SHAPE` says of each row, detached; eta: IOR of the coat over that outside."""
     shape = jax.ShapeDtypeStruct((*alpha.shape, *SHAPE), alpha.dtype)
 
@@ -51,15 +58,17 @@ def coats(
     return on_host(alpha, eta)
 
 
-def at(coat: Float[Array, "values terms_and_share"], alpha: Float[Array, ""], eta: Float[Array, ""]):
-    """The terms of T, for `passes`, and the share that is reflected inside, of a coat made for this alpha and eta."""
-    terms = coat[0] + coat[1] * alpha + coat[2] * eta
-    return terms[:TERMS], terms[TERMS]
+def at(coat: Float[Array, " numbers"], alpha: Float[Array, ""], eta: Float[Array, ""]):
+    """T, for `passes`, and the share that is reflected inside, of a coat made for this alpha and eta."""
+    k = TERMS + 1
+    share_and_terms = coat[:k] + coat[k : 2 * k] * alpha + coat[2 * k : 3 * k] * eta
+    return (share_and_terms[1:], coat[3 * k :]), share_and_terms[0]
 
 
-def passes(terms: Float[Array, " terms"], mu: Float[Array, ""]) -> Float[Array, ""]:
-    """T(mu) for mu >= 0: Clenshaw's sum of the series, in a variable that grows fastest at grazing angles."""
-    z = (3 * mu - 1) / (mu + 1)
+def passes(T: tuple[Float[Array, " terms"], Float[Array, "4"]], mu: Float[Array, ""]) -> Float[Array, ""]:
+    """T(mu) for mu >= 0: Clenshaw's sum of the series."""
+    terms, (edge, squared, scale, shift) = T
+    z = scale * ((mu - edge) * lax.rsqrt((mu - edge) * (mu - edge) + squared)) + shift
     ahead = behind = jnp.zeros_like(z)
     for k in range(TERMS - 1, 0, -1):
         ahead, behind = 2 * z * ahead - behind + terms[k], ahead
@@ -70,16 +79,30 @@ def passes(terms: Float[Array, " terms"], mu: Float[Array, ""]) -> Float[Array, 
 
 
 def _coat(distribution, alpha, eta):
+    place, cosines = _place(alpha, eta)
+
     def of(alpha, eta):
-        z = np.cos(_ANGLES)
-        T = _mean(distribution, alpha, (1 + z) / (3 - z), eta, inside=False)
+        T = _mean(distribution, alpha, cosines, eta, inside=False)
         R = _mean(distribution, alpha, COSINES_INSIDE, 1 / eta, inside=True)
-        return np.append(_TO_TERMS @ T, 2 * np.mean(R * COSINES_INSIDE))
+        return np.append(2 * np.mean(R * COSINES_INSIDE), _TO_TERMS @ T)
 
     up, down = 1 + STEP, 1 - STEP
     by_alpha = (of(alpha * up, eta) - of(alpha * down, eta)) / (2 * STEP * alpha)
     by_eta = (of(alpha, eta * up) - of(alpha, eta * down)) / (2 * STEP * eta)
-    return np.stack([of(alpha, eta) - by_alpha * alpha - by_eta * eta, by_alpha, by_eta])
+    return np.concatenate([of(alpha, eta) - by_alpha * alpha - by_eta * eta, by_alpha, by_eta, place])
+
+
+def _place(alpha, eta):
+    """The variable z from -1 to 1 in which T is a polynomial, as `passes` has it of the cosine; and the cosines that it
+    has at the roots.
+    """
+    edge = np.sqrt(max(1 - eta * eta, 0))  # smaller cosines are reflected totally by what is smooth
+    width = REACH_OF_EDGE * max(alpha, LEAST_EDGE) * eta if eta < 1 else REACH + alpha
+    low, high = (x / np.hypot(x, width) for x in (-edge, 1 - edge))
+    scale = 2 / (high - low)
+    shift = -1 - scale * low
+    x = (np.cos(_ANGLES) - shift) / scale
+    return [edge, width * width, scale, shift], np.clip(edge + width * x / np.sqrt(1 - x * x), 0, 1)
 
 
 def _mean(distribution, alpha, mu, eta, inside):

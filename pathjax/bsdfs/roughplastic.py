@@ -28,14 +28,6 @@ class RoughPlastic(Plastic):
     unused: ClassVar[Mapping[str, Unused]] = Rough.unused
 
     @classmethod
-    def read(cls, loader, fields, name):
-        made = super().read(loader, fields, name)
-        if made.values["int_ior"] < made.values["ext_ior"]:
-            why = "some light would be reflected totally before it enters, which is not modelled for rough coats"
-            raise fields.error("int_ior", f"must not be below ext_ior: {why}")
-        return made
-
-    @classmethod
     def derived(cls, table, changed=()):
         alpha, inside, outside = (table.column(name).values for name in ("alpha", "int_ior", "ext_ior"))
         return table.with_column("coat", coat.coats(dict(table.settings)["distribution"], alpha, inside / outside))
@@ -43,8 +35,8 @@ class RoughPlastic(Plastic):
     @staticmethod
     def evaluate(p: Row, wi: Float[Array, "3"], wo: Float[Array, "3"]) -> tuple[Float[Array, "3"], Float[Array, ""]]:
         eta, facets, cosine = _eta(p), _facets(p), square_to_cosine_hemisphere_pdf(wo)
-        terms, returns = coat.at(p.coat, p.alpha, eta)
-        passes_in, passes_out = (coat.passes(terms, jnp.clip(w[2], 0, 1)) for w in (wi, wo))
+        T, returns = coat.at(p.coat, p.alpha, eta)
+        passes_in, passes_out = (coat.passes(T, jnp.clip(w[2], 0, 1)) for w in (wi, wo))
         share, m = facets.reflected(wi, wo)
         mirrors, _ = fresnel.dielectric(jnp.clip(dot(wi, m), 0, 1), eta)
         f = base(p, eta, 1 - returns) * (passes_in * passes_out * cosine) + p.specular_reflectance * (mirrors * share)
@@ -54,8 +46,8 @@ class RoughPlastic(Plastic):
     @staticmethod
     def sample(p: Row, wi: Float[Array, "3"], u: Float[Array, " numbers"]) -> BSDFSample:
         """Mirrored at a normal that wi sees, by about the share that the coat has in the light, else by the cosine."""
-        terms, _ = coat.at(p.coat, p.alpha, _eta(p))
-        on_coat, u = chosen(u, chance_of_coat(p, 1 - coat.passes(terms, jnp.clip(wi[2], 0, 1))))
+        T, _ = coat.at(p.coat, p.alpha, _eta(p))
+        on_coat, u = chosen(u, chance_of_coat(p, 1 - coat.passes(T, jnp.clip(wi[2], 0, 1))))
         m = _facets(p).detached().sample(wi, u)
         wo = jnp.where(on_coat, mirrored(wi, m), square_to_cosine_hemisphere(u))
         f, pdf = RoughPlastic.evaluate(p, wi, wo)
