@@ -4,10 +4,10 @@ Of light that meets a rough interface at the cosine mu, T(mu) = E[(1 - F(m . wi)
 that over the normals m that wi sees (Walter et al. 2007). What comes from below as from a diffuse surface is reflected
 by the share 2 integral R(mu) mu dmu, R(mu) = E[F(m . wi) G1(wo)] being that of the interface from inside.
 
-T is a sum of Chebyshev polynomials in a variable that grows fastest where T does: at grazing angles, and where eta is below
-1 about the cosine from which on light is not reflected totally. It is right to 0.003, to 0.01 where alpha is below 0.05 or
-eta below 1, and to 0.02 where both and alpha is below 0.01, but at the very edge of total reflection. Its terms are made for one alpha and one relative IOR eta, and are linear in them with the right
-derivatives, for kernels.
+T is a sum of Chebyshev polynomials, in a variable that grows fastest where T does: at grazing angles, or where eta is
+below 1 about the cosine from which on light is not reflected totally. It is right to 0.003, to 0.01 where alpha is
+below 0.05 or eta below 1, and to 0.02 where alpha is below 0.01, too, but at the very edge of total reflection. Its
+terms are made for one alpha and one relative IOR eta, and are linear in them with the right derivatives, for kernels.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ TERMS = 12
 # Constants, factors of alpha and factors of eta: of the share that is reflected inside, and of the terms of T; and the
 # four numbers of `_place`.
 SHAPE = (3 * (1 + TERMS) + 4,)
-# How far the variable goes as the cosine does: without total reflection, and about its edge, which is some alpha eta wide.
-# What is rougher is smoother at grazing angles. A smooth coat has an edge without width, and a root behind it: this alpha
-# is for both.
+# How far the variable goes as the cosine does: without total reflection, where what is rougher is smoother at grazing
+# angles; and about the edge of that, some alpha eta wide. A smooth coat has an edge without width, and a root behind:
+# this alpha is for both.
 REACH, REACH_OF_EDGE, LEAST_EDGE = 0.5, 2, 0.01
 # Points of the quadrature, in slopes of facets and in their azimuth, by which T and R are right to some 1e-4.
 POINTS = 48
