@@ -126,8 +126,13 @@ def in_textures(scene: Scene, paths: Iterable[tuple], of_textures: tuple) -> dic
 
 def places_of_textures(parameters: Iterable[Parameter]) -> Fields:
     """Where those of some parameters stand that are textures, or of textures."""
-    places = [each.stands_in for each in parameters if "textures" in each.path or each.path[0] == "geometry"]
+    places = [each.stands_in for each in parameters if _is_looked_up_by_textures(each.path)]
     return None if None in places else frozenset().union(*places)
+
+
+def _is_looked_up_by_textures(path: tuple) -> bool:
+    of_bsdfs, of_lights = path[:2] == TEXTURES, path[2:3] == TEXTURES[1:]
+    return of_bsdfs or of_lights or path[0] == "geometry"
 
 
 def slots(scene: Scene, paths: Paths, fields: Fields) -> Slots:
