@@ -20,6 +20,7 @@ from pathjax.compile import compute_once, persistent_loop
 from pathjax.core import sampler
 from pathjax.core.math import at, luminance
 from pathjax.derivatives import differentiated
+from pathjax.derivatives.kept import Kept
 from pathjax.derivatives.record import Record, extend
 from pathjax.derivatives.totals import NEAR
 from pathjax.emitters import Choice
@@ -34,15 +35,17 @@ from pathjax.scene.scene import Scene
 WIDTH = 8
 
 
-def changes(record: Record, v: Float[Array, "M numbers"]) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
+def changes(
+    record: Record, v: Float[Array, "M numbers"], kept: Kept
+) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
     """What v does to Le + n and to w of a vertex.
 
-    v: the list of changes, as `differentiated` orders it: the last three numbers of each row.
+    v: the changes of the entries that are kept: the last three numbers of each row.
     """
     now = later = jnp.zeros_like(record.weight)
     for slot in record.slots:
         shares = slot.shares or (1,)
-        change = sum(share * at(v, place)[-3:] for place, share in zip(slot.places, shares, strict=True))
+        change = sum(share * at(v, kept.place(place))[-3:] for place, share in zip(slot.places, shares, strict=True))
         # Read once, as both of its consumers would read it from far memory.
         change = compute_once(luminance(change) if slot.is_number else change)
         now = now + slot.now * change
@@ -60,6 +63,7 @@ def pixel_change(
     options: Options,
     slots: differentiated.Slots,
     paths: differentiated.Paths,
+    kept: Kept,
 ) -> Float[Array, "3"]:
     """What v does to the mean of a pixel. v: None, where it stands `beside` the one array that is differentiated."""
     pixel_number, first_sample, spp, seed = work
@@ -73,7 +77,7 @@ def pixel_change(
         now, weight = pixel.begun(scene, pixel_number, stream, number, now, weight, options)
         u = bounce_numbers(scene, stream, number, path.vertices(now), options.sampler, bool(slots.grids))
         on, record, itself = extend(scene, choice, now, u, options, slots, paths, jnp.ones_like(zero), passed)
-        gain, later = changes(record, v)
+        gain, later = changes(record, v, kept)
         sums = pixel.add_compensated(sums, compute_once(weight * (b * record.gathered + gain)))
         b = b * record.weight + later
         if slots.of_passed:
@@ -90,32 +94,36 @@ def beside(array: Float[Array, "M 3"], v: Float[Array, "M 3"]) -> Float[Array, "
     return jnp.concatenate([array, jnp.zeros((len(array), WIDTH - 6), array.dtype), v], 1)
 
 
-@partial(jax.jit, static_argnames=("paths", "fields", "options", "form", "devices"))
+@partial(jax.jit, static_argnames=("paths", "kept", "options", "form", "devices"))
 def push(
-    scene: Scene, changed, pixels, first_sample, spp, seed, *, paths, fields, options: Options, form=None, devices=None
+    scene: Scene,
+    v: Float[Array, "entries 3"],
+    pixels,
+    first_sample,
+    spp,
+    seed,
+    *,
+    paths,
+    kept: Kept,
+    options: Options,
+    form=None,
+    devices=None,
 ) -> Float[Array, "N 3"]:
     """J v of the means of pixels.
 
     Args:
         scene: without names.
-        changed: v, of each of the arrays, of its shape.
+        v: of the entries that are kept.
         pixels, first_sample, spp, seed: (N,) each.
-        paths: of the arrays, which `differentiated` knows; fields: of `places_of_textures`.
+        paths: of the arrays, which `differentiated` knows.
         form, devices: of `native_map`.
     """
     scene = options.applied(scene)
     choice = emitters.choice(scene.emitters, options.strategy)
-    slots = differentiated.slots(scene, paths, fields)
-
-    def entries(path, array):
-        array = array.reshape(differentiated.count(scene, path), -1)
-        return jnp.broadcast_to(array, (len(array), 3))
-
-    rows = list(map(entries, paths, changed))
-    v = rows[0] if len(rows) == 1 else jnp.concatenate(rows)
+    slots = differentiated.slots(scene, paths, kept.fields)
     far = v.size * v.dtype.itemsize > NEAR
-    if far and len(paths) == 1 and differentiated.may_be_wider(scene, paths[0]):
+    if far and kept.all and len(paths) == 1 and differentiated.may_be_wider(scene, paths[0]):
         scene, v = named.put(scene, paths[0], beside(named.get(scene, paths[0]), v)), None
-    of_pixel = partial(pixel_change, options=options, slots=slots, paths=paths)
+    of_pixel = partial(pixel_change, options=options, slots=slots, paths=paths, kept=kept)
     work = pixels, first_sample, spp, seed
     return map_pixels(of_pixel, work, scene, choice, v, options=options, form=form, devices=devices)

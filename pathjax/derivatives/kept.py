@@ -83,6 +83,15 @@ def of_parameter(
     return replace(parameter, index=(0,)).transposed(found.reshape(parameter.rows, *array[1:]))
 
 
+def of_entries(scene: Scene, parameter: Parameter, change: Float[Array, "..."]) -> Float[Array, "entries 3"]:
+    """Changes of the entries of a parameter, from that of the parameter; of a number the same in all channels."""
+    if parameter.is_texture:
+        mine = jnp.zeros((parameter.rows, *named.get(scene, parameter.path).shape[1:]), change.dtype)
+        change = replace(parameter, index=(0,)).put(mine, change)
+    rows = change.reshape(-1, 3 if differentiated.of_colors(scene, parameter.path) else 1)
+    return jnp.broadcast_to(rows, (len(rows), 3))
+
+
 def few(runs: Sequence[range]) -> tuple[range, ...]:
     """Runs, sorted by where they start, joined where they touch; and across the smallest gaps, if they are many."""
     gaps = sorted(later.start - run.stop for run, later in zip(runs[:-1], runs[1:], strict=True))

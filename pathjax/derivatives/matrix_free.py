@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Int
 
 from pathjax.compile import usual_promotion
 from pathjax.derivatives import backward, differentiated, forward
-from pathjax.derivatives.kept import entries, of_parameter
+from pathjax.derivatives.kept import entries, of_entries, of_parameter
 from pathjax.derivatives.kept import kept as kept_of
 from pathjax.integrators import pixel
 from pathjax.integrators.options import Counts, Options
@@ -36,14 +36,18 @@ def push(
 ) -> Float[Array, "N 3"]:
     """J v. changes: of parameters, by name; the rest as for `jacobian.pixel_jacobians`."""
     paths = _paths(wanted)
-    moved = [jnp.zeros_like(named.get(scene, path)) for path in paths]
-    for name, change in changes.items():
-        place = paths.index(wanted[name].path)
-        moved[place] = moved[place] + wanted[name].put(jnp.zeros_like(moved[place]), change)
+    kept = kept_of(scene, paths, wanted.values())
+    moved = {name: of_entries(scene, wanted[name], change) for name, change in changes.items()}
+    if len(wanted) == 1 and kept.all:
+        (v,) = moved.values()  # not copied, as it may be large
+    else:
+        v = jnp.zeros((kept.count, 3), scene.camera.origin.dtype)
+        for name, change in moved.items():
+            here = kept.places(entries(scene, paths, wanted[name]))
+            v = v.at[here.start : here.stop].set(change)
     numbers = pixel.numbers(pixels, first_sample, spp, seed)
     options = replace(options, derivative=True, by_vertex=True)
-    how |= dict(paths=paths, fields=differentiated.places_of_textures(wanted.values()), options=options)
-    return forward.push(scene, moved, pixels, *numbers, **how)
+    return forward.push(scene, v, pixels, *numbers, paths=paths, kept=kept, options=options, **how)
 
 
 @usual_promotion
