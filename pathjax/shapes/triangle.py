@@ -211,10 +211,10 @@ class Triangles(Table):
         return 3 * row, jnp.stack(_barycentrics(vertices[0], edge1, edge2, o, d))
 
     def along_u(self, row, surface):
-        """Nowhere, where the mesh has no uv or squeezes it to a line."""
-        if self.uv is None:
-            return jnp.zeros_like(surface.p)
+        """Nowhere, where the mesh squeezes uv to a line; along the first edge, where it has none, as u does."""
         a, b, c = at(self.vertices, row)
+        if self.uv is None:
+            return b - a
         uv = at(self.uv, row)
         (u1, v1), (u2, v2) = uv[1] - uv[0], uv[2] - uv[0]
         return jnp.sign(u1 * v2 - u2 * v1) * (v2 * (b - a) - v1 * (c - a))

@@ -60,6 +60,7 @@ SHAPES = {
     "ellipsoid": Ellipsoid(SHEARED),
     "cylinder": Cylinder(SHEARED @ UPRIGHT),
     "triangle": Mesh(TRIANGLE, np.array([[0, 1, 2]]), None, UV),
+    "triangle without uv": Mesh(TRIANGLE, np.array([[0, 1, 2]]), None, None),
     "triangle of mirrored uv": Mesh(TRIANGLE, np.array([[0, 1, 2]]), None, UV[:, ::-1]),
 }
 
@@ -88,9 +89,8 @@ def test_along_the_tangent_u_grows_and_v_stays(kind):
     assert (duv[:, 0] > 0).all() and (np.abs(duv[:, 1]) < 1e-3 * duv[:, 0]).all()
 
 
-@pytest.mark.parametrize("uv", [None, np.zeros((3, 2))])
-def test_where_u_grows_nowhere_any_tangent_will_do(uv):
-    shapes = geometry_of(Mesh(TRIANGLE, np.array([[0, 1, 2]]), None, uv))
+def test_where_u_grows_nowhere_any_tangent_will_do():
+    shapes = geometry_of(Mesh(TRIANGLE, np.array([[0, 1, 2]]), None, np.zeros((3, 2))))
     ray = Ray(jnp.array([0.0, 0, 5]), jnp.array([0.0, 0, -1]), jnp.float32(np.inf), jnp.int32(-1))
     surface = geometry.surface(shapes, ray, geometry.closest_hit(shapes, ray))
     np.testing.assert_allclose(np.linalg.norm(surface.tangent), 1, rtol=1e-6)
