@@ -48,7 +48,8 @@ class Parameter:
     means: tuple[tuple[tuple[str | int, ...], int], ...] = ()
     # (rows, 3) which of the values that vertices or faces of a mesh carry a corner has; None: they are of no mesh.
     corners: Fixed | None = None
-    # Of a texture: the parameters of bsdfs and lights in whose places it stands, by what kinds call them; None: others.
+    # Of a texture: the parameters of bsdfs and lights in whose places it stands, by what kinds call them; None: it may
+    # be any.
     stands_in: frozenset[str] | None = None
 
     @property
@@ -106,10 +107,11 @@ class Parameters:
     def enter_texture(self, name: str, texture, declared, field: str | None) -> None:
         """Enter a texture that stands in the place of what is `declared`, and would be the parameter `name`.
 
-        field: of `Parameter.stands_in`; None: it stands in another texture.
-
         An image that stands in several places is named after the first one, and has the bounds of all. Where all want
         numbers it is a parameter of numbers.
+
+        Args:
+            field: what its kind calls the parameter; None: the texture stands in another one.
         """
         if texture not in self.textures:
             self.refused.update(texture.kind.refused(name))
