@@ -31,5 +31,6 @@ def build(shape, dtype) -> Region:
     """shape: a `description.Shape`."""
     table, _ = shape.geometry.table.build([shape.geometry.primitives(shape.flip_normals)], [False], dtype, "sah", None)
     if not table.even().all():
-        raise InputError(f"shape {shape.name!r} is round and scaled unevenly; no points are drawn evenly on it, so give a mesh")
+        what = f"shape {shape.name!r} is round and scaled unevenly"
+        raise InputError(f"{what}; no points are drawn evenly on it, so give the sensor a mesh")
     return Region(table, np.asarray(cumulated(table.areas()), dtype))
