@@ -50,7 +50,7 @@ def relative(int_ior: Float[Array, ""], ext_ior: Float[Array, ""]) -> Float[Arra
 
 def within(eta: Float[Array, ""]) -> Float[Array, ""]:
     """A ratio of IORs as one whose powers are floats: beyond the reciprocal of a rounding hardly any light passes."""
-    rounding = jnp.finfo(eta.dtype).eps
+    rounding = float(jnp.finfo(eta.dtype).eps)
     return larger(smaller(eta, 1 / rounding), rounding)
 
 

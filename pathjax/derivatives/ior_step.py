@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, Int
 
 from pathjax import bsdfs
 from pathjax.bsdfs import dielectric
-from pathjax.compile import native_map
+from pathjax.compile import native, native_map
 from pathjax.core.math import at, dot, safe_divide, spawn_ray
 from pathjax.derivatives import ior
 from pathjax.integrators.random_numbers import bsdf_dimensions
@@ -49,7 +49,9 @@ def motions(scene: Scene, rows: Int[Array, " G"]) -> Float[Array, " G"]:
     """Median number of pixels by which what is seen through glass moves per unit of relative IOR; 0: not seen."""
     count = film.pixel_count(scene.film)
     pilots = jnp.asarray(np.unique(np.linspace(0, count - 1, min(_PILOTS, count)).astype(np.int32)))
-    return jax.vmap(lambda row: _median(native_map(_motion, pilots, scene, row)))(rows)
+    # Lanes would take longer to compile, four times, than so few rays take in any form.
+    form = "loop" if native() else None
+    return jax.vmap(lambda row: _median(native_map(_motion, pilots, scene, row, form=form)))(rows)
 
 
 def _median(x):

@@ -167,7 +167,7 @@ def test_rows_are_read_of_items_in_any_number_of_parts(monkeypatch):
         for one in (found, found.here()):
             np.testing.assert_array_equal(one[1], -xs)
             np.testing.assert_array_equal(one.all(), [xs, -xs])
-            np.testing.assert_array_equal(one.taken([1])[0], one[1])
+            assert one.count == 2
         assert len(found.here()[0].devices()) == 1 or parts == 1
         np.testing.assert_array_equal(found.like(found.all()).of_parts[0], found.of_parts[0])
         np.testing.assert_array_equal(pair.here()[1], [-xs, -xs - 2])
