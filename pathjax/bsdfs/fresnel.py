@@ -44,7 +44,7 @@ def schlick(cos_i: Float[Array, ""], eta: Float[Array, ""]) -> tuple[Float[Array
 
 
 def relative(int_ior: Float[Array, ""], ext_ior: Float[Array, ""]) -> Float[Array, ""]:
-    """IOR inside over that outside, `within` what has powers."""
+    """IOR inside over that outside, `within` bounds."""
     return within(int_ior / ext_ior)
 
 

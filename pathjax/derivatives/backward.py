@@ -257,10 +257,10 @@ class _Kernel(NamedTuple):
     of_pixel: Callable  # `pixel_sweep`
 
 
-def _kernel(scene: Scene, paths: differentiated.Paths, kept: Kept, options: Options) -> _Kernel:
+def _kernel(scene: Scene, kept: Kept, options: Options) -> _Kernel:
     scene = options.applied(scene)
     choice = emitters.choice(scene.emitters, options.strategy)
-    slots = differentiated.slots(scene, paths, kept.fields)
+    paths, slots = kept.paths, differentiated.slots(scene, kept.paths, kept.fields)
 
     def record(scene, choice, x):
         now, _ = pixel.camera_path(scene, jnp.int32(0), x, x, options)
@@ -272,7 +272,7 @@ def _kernel(scene: Scene, paths: differentiated.Paths, kept: Kept, options: Opti
     return _Kernel(scene, choice, structure, of_pixel)
 
 
-@partial(jax.jit, static_argnames=("paths", "kept", "options", "ring", "form", "devices"))
+@partial(jax.jit, static_argnames=("kept", "options", "ring", "form", "devices"))
 def pullback(
     scene: Scene,
     adjoint,
@@ -281,7 +281,6 @@ def pullback(
     spp,
     seed,
     *,
-    paths,
     kept: Kept,
     options: Options,
     ring,
@@ -294,11 +293,11 @@ def pullback(
         scene: without names.
         adjoint: (N, 3) of the means of the pixels.
         pixels, first_sample, spp, seed: (N,) each.
-        paths: of the arrays, which `differentiated` knows.
+        kept: of arrays that `differentiated` knows.
         ring: of `longest_ring`.
         form, devices: of `native_fold`.
     """
-    scene, choice, structure, sweep_of = _kernel(scene, paths, kept, options)
+    scene, choice, structure, sweep_of = _kernel(scene, kept, options)
 
     def of_pixel(work, scene, choice, memory):
         adjoint, work = work
@@ -313,15 +312,15 @@ def pullback(
     return native_fold(of_pixel, work, scene, choice, start=begin, finish=end, form=form, devices=devices)
 
 
-@partial(jax.jit, static_argnames=("paths", "kept", "options", "ring", "form", "devices"))
+@partial(jax.jit, static_argnames=("kept", "options", "ring", "form", "devices"))
 def rows(
-    scene: Scene, pixels, first_sample, spp, seed, *, paths, kept: Kept, options: Options, ring, form=None, devices=None
+    scene: Scene, pixels, first_sample, spp, seed, *, kept: Kept, options: Options, ring, form=None, devices=None
 ) -> tuple[Float[Array, "N 3"], Rows]:
     """Means of pixels, and their derivatives in each of the colours that are kept, of each channel in its own.
 
     Arguments as for `pullback`; the arrays hold colours alone. A row is (N, 4), and the last number is none.
     """
-    scene, choice, structure, sweep_of = _kernel(scene, paths, kept, options)
+    scene, choice, structure, sweep_of = _kernel(scene, kept, options)
 
     def of_pixel(work, number, scene, choice, memory):
         pixels = totals.count(memory.total) // kept.count

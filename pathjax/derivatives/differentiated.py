@@ -140,12 +140,13 @@ def slots(scene: Scene, paths: Paths, fields: Fields) -> Slots:
 
     def looked_up(table, textures):
         """Colours and numbers that are looked up in a table."""
-        held = named.get(scene, table)
+        held, textured = named.get(scene, table), bool(in_textures(scene, paths, textures))
         columns, names = held.columns, list(held.kind.declared)
-        may_be = [name for name in names if fields is None or name in fields]
-        filled = map(held.kind.place, may_be if in_textures(scene, paths, textures) else [])
-        filled = {i for i in filled if columns[i] is not None and columns[i].texture is not None}
-        found = [i for path, i in _columns(scene, table).items() if path in paths or i in filled]
+
+        def is_filled(i):
+            return columns[i].texture is not None and (fields is None or names[i] in fields)
+
+        found = [i for path, i in _columns(scene, table).items() if path in paths or (textured and is_filled(i))]
         return [i for i in found if columns[i].values.ndim > 1], [i for i in found if columns[i].values.ndim == 1]
 
     def joined(found):
@@ -259,7 +260,10 @@ def of_colors(scene: Scene, path: tuple) -> bool:
 
 def may_be_wider(scene: Scene, path: tuple) -> bool:
     """Whether the rows of an array may have numbers behind their colours."""
-    return len(path) > 2 and path[-3] == "columns" and getattr(declared(scene, path), "wider", False)
+    if "columns" not in path:
+        return False
+    known = declared(scene, path)
+    return known.shared and known.wider
 
 
 def declared(scene: Scene, path: tuple) -> Declared:

@@ -62,13 +62,12 @@ def pixel_change(
     *,
     options: Options,
     slots: differentiated.Slots,
-    paths: differentiated.Paths,
     kept: Kept,
 ) -> Float[Array, "3"]:
     """What v does to the mean of a pixel. v: None, where it stands `beside` the one array that is differentiated."""
     pixel_number, first_sample, spp, seed = work
     stream = sampler.pixel_stream(seed, pixel_number)
-    v = named.get(scene, paths[0]) if v is None else v
+    v = named.get(scene, kept.paths[0]) if v is None else v
     zero = jnp.zeros((3,), scene.camera.origin.dtype)
 
     def step(state):
@@ -76,7 +75,7 @@ def pixel_change(
         b = jnp.where(now.alive, b, 0)
         now, weight = pixel.begun(scene, pixel_number, stream, number, now, weight, options)
         u = bounce_numbers(scene, stream, number, path.vertices(now), options.sampler, bool(slots.grids))
-        on, record, itself = extend(scene, choice, now, u, options, slots, paths, jnp.ones_like(zero), passed)
+        on, record, itself = extend(scene, choice, now, u, options, slots, kept.paths, jnp.ones_like(zero), passed)
         gain, later = changes(record, v, kept)
         sums = pixel.add_compensated(sums, compute_once(weight * (b * record.gathered + gain)))
         b = b * record.weight + later
@@ -94,7 +93,7 @@ def beside(array: Float[Array, "M 3"], v: Float[Array, "M 3"]) -> Float[Array, "
     return jnp.concatenate([array, jnp.zeros((len(array), WIDTH - 6), array.dtype), v], 1)
 
 
-@partial(jax.jit, static_argnames=("paths", "kept", "options", "form", "devices"))
+@partial(jax.jit, static_argnames=("kept", "options", "form", "devices"))
 def push(
     scene: Scene,
     v: Float[Array, "entries 3"],
@@ -103,7 +102,6 @@ def push(
     spp,
     seed,
     *,
-    paths,
     kept: Kept,
     options: Options,
     form=None,
@@ -115,15 +113,15 @@ def push(
         scene: without names.
         v: of the entries that are kept.
         pixels, first_sample, spp, seed: (N,) each.
-        paths: of the arrays, which `differentiated` knows.
+        kept: of arrays that `differentiated` knows.
         form, devices: of `native_map`.
     """
     scene = options.applied(scene)
     choice = emitters.choice(scene.emitters, options.strategy)
-    slots = differentiated.slots(scene, paths, kept.fields)
+    slots, paths = differentiated.slots(scene, kept.paths, kept.fields), kept.paths
     far = v.size * v.dtype.itemsize > NEAR
     if far and kept.all and len(paths) == 1 and differentiated.may_be_wider(scene, paths[0]):
         scene, v = named.put(scene, paths[0], beside(named.get(scene, paths[0]), v)), None
-    of_pixel = partial(pixel_change, options=options, slots=slots, paths=paths, kept=kept)
+    of_pixel = partial(pixel_change, options=options, slots=slots, kept=kept)
     work = pixels, first_sample, spp, seed
     return map_pixels(of_pixel, work, scene, choice, v, options=options, form=form, devices=devices)

@@ -25,7 +25,6 @@ from pathjax.compile import is_symbolic_zero, is_traced, native, on_all_devices,
 from pathjax.core.types import Number
 from pathjax.derivatives import backward, differentiated, ior, ior_difference, ior_step, rules, tangents, totals
 from pathjax.derivatives.color_slopes import ColorSlopes, Place
-from pathjax.derivatives.kept import entries
 from pathjax.derivatives.kept import kept as kept_of
 from pathjax.errors import InputError
 from pathjax.integrators import pixel
@@ -231,16 +230,15 @@ def has_rows(scene: Scene, parameters) -> bool:
 @partial(jax.custom_jvp, nondiff_argnums=(0, 1, 2, 3))
 def _swept(wanted, options, ring, how, scene, pixels, *numbers):
     """Means and derivatives, by name. how: `form` and `devices`; lanes are the only form."""
-    paths = tuple(dict.fromkeys(parameter.path for parameter in wanted.values()))
-    kept = kept_of(scene, paths, wanted.values())
+    kept = kept_of(scene, wanted.values())
     options = replace(options, derivative=True, by_vertex=True)
     image, rows = backward.rows(
-        scene, pixels, *numbers, paths=paths, kept=kept, options=options, ring=ring, devices=how.get("devices")
+        scene, pixels, *numbers, kept=kept, options=options, ring=ring, devices=how.get("devices")
     )
 
     def place(parameter):
         shape = named.get(scene, parameter.path).shape
-        return Place(kept.places(entries(scene, paths, parameter)), parameter, shape)
+        return Place(kept.of(scene, parameter), parameter, shape)
 
     return image, ColorSlopes(rows, tuple((name, place(each)) for name, each in wanted.items()), (len(pixels),))
 

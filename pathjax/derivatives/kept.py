@@ -25,6 +25,7 @@ MOST_RUNS = 4
 class Kept:
     """Runs of entries that are kept, ascending; static."""
 
+    paths: differentiated.Paths  # of the arrays of the list
     runs: tuple[range, ...]
     all: bool  # nothing else is in the list
     fields: differentiated.Fields = None  # of `differentiated.places_of_textures`
@@ -45,8 +46,12 @@ class Kept:
             first += len(run)
         return found
 
+    def of(self, scene: Scene, parameter: Parameter) -> range:
+        """Where the entries of a parameter that is asked for stand among those kept."""
+        return self.places(entries(scene, self.paths, parameter))
+
     def places(self, entries: range) -> range:
-        """Where entries that are kept, and neighbours in the list, stand among those."""
+        """The same of entries that are neighbours in the list."""
         first = 0
         for run in self.runs:
             if entries.start in run:
@@ -56,12 +61,13 @@ class Kept:
         raise ValueError(f"{entries} are not kept")
 
 
-def kept(scene: Scene, paths: differentiated.Paths, parameters: Iterable[Parameter]) -> Kept:
-    """What is kept for derivatives in parameters, whose arrays are at the paths."""
+def kept(scene: Scene, parameters: Iterable[Parameter]) -> Kept:
+    """What is kept for derivatives in some parameters."""
     parameters = list(parameters)
+    paths = tuple(dict.fromkeys(parameter.path for parameter in parameters))
     _, count = differentiated.firsts(scene, paths)
     runs = few(sorted((entries(scene, paths, each) for each in parameters), key=lambda run: run.start))
-    return Kept(runs, sum(map(len, runs)) == count, differentiated.places_of_textures(parameters))
+    return Kept(paths, runs, sum(map(len, runs)) == count, differentiated.places_of_textures(parameters))
 
 
 def entries(scene: Scene, paths: differentiated.Paths, parameter: Parameter) -> range:
@@ -77,7 +83,7 @@ def entries(scene: Scene, paths: differentiated.Paths, parameter: Parameter) -> 
 def of_parameter(
     parameter: Parameter, array: tuple[int, ...], found: Float[Array, "entries ..."]
 ) -> Float[Array, "..."]:
-    """Derivatives in a parameter, from those in its entries; array: shape of what it lives in."""
+    """Derivatives in a parameter, of its shape, from those in its entries; array: shape of what it lives in."""
     if not parameter.is_texture:
         return found.reshape(parameter.shape)
     return replace(parameter, index=(0,)).transposed(found.reshape(parameter.rows, *array[1:]))

@@ -14,8 +14,8 @@ from jaxtyping import Array, Float, Int
 
 from pathjax.compile import usual_promotion
 from pathjax.derivatives import backward, differentiated, forward
-from pathjax.derivatives.kept import entries, of_entries, of_parameter
 from pathjax.derivatives.kept import kept as kept_of
+from pathjax.derivatives.kept import of_entries, of_parameter
 from pathjax.integrators import pixel
 from pathjax.integrators.options import Counts, Options
 from pathjax.kinds.parameter import Parameter
@@ -35,19 +35,18 @@ def push(
     scene: Scene, wanted: Mapping[str, Parameter], changes: Changes, pixels, first_sample, spp, seed, options, **how
 ) -> Float[Array, "N 3"]:
     """J v. changes: of parameters, by name; the rest as for `jacobian.pixel_jacobians`."""
-    paths = _paths(wanted)
-    kept = kept_of(scene, paths, wanted.values())
+    kept = kept_of(scene, wanted.values())
     moved = {name: of_entries(scene, wanted[name], change) for name, change in changes.items()}
     if len(wanted) == 1 and kept.all:
         (v,) = moved.values()  # not copied, as it may be large
     else:
         v = jnp.zeros((kept.count, 3), scene.camera.origin.dtype)
         for name, change in moved.items():
-            here = kept.places(entries(scene, paths, wanted[name]))
+            here = kept.of(scene, wanted[name])
             v = v.at[here.start : here.stop].set(change)
     numbers = pixel.numbers(pixels, first_sample, spp, seed)
     options = replace(options, derivative=True, by_vertex=True)
-    return forward.push(scene, v, pixels, *numbers, paths=paths, kept=kept, options=options, **how)
+    return forward.push(scene, v, pixels, *numbers, kept=kept, options=options, **how)
 
 
 @usual_promotion
@@ -70,22 +69,17 @@ def pull(
         ring: of `backward.longest_ring`; None: that of the scene.
         others: as for `push`.
     """
-    paths = _paths(wanted)
     numbers = pixel.numbers(pixels, first_sample, spp, seed)
     options = replace(options, derivative=True, by_vertex=True)
     ring = ring or backward.longest_ring(scene)
-    kept = kept_of(scene, paths, wanted.values())
-    how |= dict(paths=paths, kept=kept, options=options, ring=ring)
+    kept = kept_of(scene, wanted.values())
+    how |= dict(kept=kept, options=options, ring=ring)
     total = backward.pullback(scene, adjoint, pixels, *numbers, **how)
 
     def of(parameter):
-        here = kept.places(entries(scene, paths, parameter))
+        here = kept.of(scene, parameter)
         found = total[here.start : here.stop]
         found = found if differentiated.of_colors(scene, parameter.path) else found.sum(1)
         return of_parameter(parameter, named.get(scene, parameter.path).shape, found)
 
     return {name: of(parameter) for name, parameter in wanted.items()}
-
-
-def _paths(wanted):
-    return tuple(dict.fromkeys(parameter.path for parameter in wanted.values()))

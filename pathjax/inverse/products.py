@@ -16,8 +16,8 @@ import numpy as np
 
 from pathjax.compile import devices_of_a_call
 from pathjax.derivatives import backward
-from pathjax.derivatives.kept import entries, of_parameter
 from pathjax.derivatives.kept import kept as kept_of
+from pathjax.derivatives.kept import of_parameter
 from pathjax.integrators import pixel
 from pathjax.integrators.options import Options
 from pathjax.inverse.compiled_cache import compiled
@@ -171,13 +171,12 @@ def _pull(values, views, pixels, spp, seeds, adjoint, vector):
 def _rows(values, views, pixels, spp, seeds, vector):
     """(V, part, Q, 3), by a kernel for `concurrently`."""
     by_name, options = vector.unpack(values), Options(derivative=True, by_vertex=True)
-    paths = tuple(dict.fromkeys(parameter.path for parameter in views.wanted.values()))
 
     def one(scene, work):
         seed, pixels = work
         scene = named.nameless(named.attached(views.with_values(scene, by_name)))
-        kept = kept_of(scene, paths, views.wanted.values())
-        how = dict(paths=paths, kept=kept, options=options, ring=backward.longest_ring(scene))
+        kept = kept_of(scene, views.wanted.values())
+        how = dict(kept=kept, options=options, ring=backward.longest_ring(scene))
         numbers = pixel.numbers(pixels, 0, spp, seed)
         _, found = backward.rows(scene, pixels, *numbers, devices=devices_of_a_call(), **how)
 
@@ -187,7 +186,7 @@ def _rows(values, views, pixels, spp, seeds, vector):
                 slope = jnp.zeros(parameter.shape, row.dtype)
                 if name in views.names:
                     parameter = views.wanted[name]
-                    here = kept.places(entries(scene, paths, parameter))
+                    here = kept.of(scene, parameter)
                     array = named.get(scene, parameter.path).shape
                     slope = of_parameter(parameter, array, row[here.start : here.stop])
                 columns.append(slope.reshape(-1, 3))

@@ -255,7 +255,7 @@ class Table(Searched):
     # ---- patches
 
     def even(self) -> np.ndarray:
-        """(P,) bool: whether the methods below are known, which else are not asked for."""
+        """(P,) bool: whether equal areas are equal in a square, as the methods below say; of others none is called."""
         return np.ones(self.count, bool)
 
     def areas(self) -> np.ndarray:

@@ -18,7 +18,6 @@ from pathjax.core.math import (
     frame_from_normal,
     larger,
     normalize,
-    safe_atan2,
     safe_divide,
     safe_sqrt,
     to_world,
@@ -30,7 +29,7 @@ from pathjax.description.fields import Fields
 from pathjax.shapes import coincident
 from pathjax.shapes.accel.leaves import numbers_of, pack, rows_of
 from pathjax.shapes.accel.traverse import Tree
-from pathjax.shapes.ellipsoid import Ellipsoid
+from pathjax.shapes.ellipsoid import Ellipsoid, Ellipsoids
 from pathjax.shapes.shape import ROUND, LampSample, Primitives, Shape, Table
 
 
@@ -109,11 +108,9 @@ class Spheres(Table):
         # t says which of the two roots was found.
         outward = compute_once(normalize(closest + jnp.copysign(half_chord, t - b) * d))
         local = compute_once(at(self.to_local, row) @ outward)
-        theta = safe_atan2(safe_sqrt(local[0] * local[0] + local[1] * local[1]), local[2]) / math.pi
-        uv = jnp.stack([turns(local[1], local[0]), theta])
         n = outward * at(self.sign, row)
         margin = jnp.zeros_like(radius) if self.margins is None else at(self.margins, row)
-        return Surface(center + radius * outward, n, margin, n, uv)
+        return Surface(center + radius * outward, n, margin, n, Ellipsoids.uv(local))
 
     def along_u(self, row, surface):
         return cross(at(self.to_local, row)[2], surface.p - at(self.balls, row)[:3])

@@ -376,7 +376,7 @@ def test_entries_of_few_runs_are_kept(count):
     wanted = [range(10 * k * k, 10 * k * k + 1 + k) for k in range(count)]
     runs = few(wanted)
     assert len(runs) == min(count, MOST_RUNS) and all(a.stop < b.start for a, b in itertools.pairwise(runs))
-    held = Kept(runs, False)
+    held = Kept((), runs, False)
     places = [held.places(run) for run in wanted]
     assert sorted({p for each in places for p in each}) == sorted(p for each in places for p in each)
     for run, mine in zip(wanted, places, strict=True):
