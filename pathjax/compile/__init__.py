@@ -2,8 +2,8 @@
 
 - `native_map` runs a function of one item over all items, on all devices; `lanes/` is how, on CPUs. `native_fold` is
   the same for items that leave something in memory that they share, `native_rows` where each has rows of its own there.
-- `compute_once`, `one_by_one`, `interleaved` and `persistent_loop` stand in code of one item. They change nothing of
-  its results, only what is computed when. `together` changes the memory of a `native_fold`.
+- `compute_once`, `one_by_one`, `interleaved`, `persistent_loop` and `basis` stand in code of one item. They change
+  nothing of its results, only what is computed, and when. `together` changes the memory of a `native_fold`.
 - `linear` is a linear function with a transpose of its own.
 - `register_dataclass` makes a dataclass a pytree, where JAX's own may give it the kernel of another.
 - `on_all_devices` keeps large arrays from being copied at each call.
@@ -21,7 +21,7 @@ from pathjax.compile.jax_compat import is_symbolic_zero, is_traced, register_dat
 from pathjax.compile.lanes.interpreter import SELECTED_ROWS
 from pathjax.compile.linear import linear
 from pathjax.compile.mapping import MANY_ITEMS, cuts, native_fold, native_map, native_rows, split_map, sum_of_parts
-from pathjax.compile.primitives import Search, compute_once, interleaved, one_by_one, persistent_loop, together
+from pathjax.compile.primitives import Search, basis, compute_once, interleaved, one_by_one, persistent_loop, together
 from pathjax.compile.promotion import usual_promotion
 from pathjax.compile.replicas import on_all_devices
 from pathjax.compile.rows import Rows
@@ -33,6 +33,7 @@ __all__ = [
     "SELECTED_ROWS",
     "Rows",
     "Search",
+    "basis",
     "calls_at_once",
     "compiled",
     "compute_once",

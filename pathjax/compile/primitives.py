@@ -1,6 +1,6 @@
-"""What code of one item may say to `lanes`: four primitives, with all rules that JAX's transformations need.
+"""What code of one item may say to `lanes`: five primitives, with all rules that JAX's transformations need.
 
-Three change no result, and outside of lanes they do next to nothing. `together` changes what all items share.
+Four change no result, and outside of lanes they do next to nothing. `together` changes what all items share.
 """
 
 from __future__ import annotations
@@ -32,6 +32,7 @@ column_p = Primitive("computed_column")
 one_by_one_p = Primitive("one_by_one")
 one_by_one_p.multiple_results = True
 persistent_test_p = Primitive("persistent_test")
+basis_p = Primitive("basis")
 together_p = Primitive("together")
 together_p.multiple_results = True
 
@@ -45,6 +46,16 @@ def compute_once(values):
     """
     leaves, structure = jax.tree.flatten(values)
     return jax.tree.unflatten(structure, compute_once_p.bind(*leaves) if leaves else [])
+
+
+def basis(count: int, dtype):
+    """Tangents (count, count) of as many numbers, one after another: the identity.
+
+    `jax.vmap` pushes them through a function all at once. Lanes know the zeros, and compute nothing of what is zero
+    because of them: so the tangent of a number costs only what depends on the number. It stands in no other place of a
+    function with a `persistent_loop` than the loop's body.
+    """
+    return basis_p.bind(count=count, dtype=np.dtype(dtype))
 
 
 def one_by_one(f: Callable) -> Callable:
@@ -204,6 +215,18 @@ column_p.def_abstract_eval(lambda column: column)
 mlir.register_lowering(column_p, call_of_identity)
 batching.defvectorized(column_p)
 ad.deflinear2(column_p, lambda cotangent, _: [cotangent])
+
+
+# ---- basis ----------------------------------------------------------------------------------------------------------
+
+
+def _identity(*, count, dtype):
+    return jnp.eye(count, dtype=dtype)
+
+
+basis_p.def_impl(_identity)
+basis_p.def_abstract_eval(lambda *, count, dtype: jax.core.ShapedArray((count, count), dtype))
+mlir.register_lowering(basis_p, mlir.lower_fun(_identity, multiple_results=False))
 
 
 # ---- one_by_one -----------------------------------------------------------------------------------------------------

@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from pathjax.compile import register_dataclass
+from pathjax.compile import basis, register_dataclass
 from pathjax.core.math import smaller
 from pathjax.derivatives import differentiated, places
 from pathjax.emitters import Choice
@@ -41,7 +41,8 @@ class Slot:
     shares: tuple[Float[Array, "..."], ...] | None
     now: Float[Array, "3"]  # d(Le + n)
     later: Float[Array, "3"] | None  # dw, to be multiplied by R
-    is_number: bool = field(default=False, metadata={"static": True})  # the luminance of what is looked up
+    # The number is the luminance of colours, if it is one of those.
+    by_luminance: bool = field(default=False, metadata={"static": True})
 
 
 class Record(NamedTuple):
@@ -91,14 +92,15 @@ def extend(
 
     count = of_grids.stop
     push = partial(jax.jvp, varied, (jnp.zeros((count,), scale.dtype),), has_aux=True)
-    (Le, n, w), changes, on = jax.vmap(lambda change: push((change,)), out_axes=(None, 0, None))(jnp.eye(count))
+    tangents = basis(count, scale.dtype)
+    (Le, n, w), changes, on = jax.vmap(lambda change: push((change,)), out_axes=(None, 0, None))(tangents)
     scale = scale * now.throughput
     dLe, dn, dw = changes
     w, dw = jnp.where(on.alive, w, 0), jnp.where(on.alive, dw, 0)
     found = []
     for s, k in enumerate(of_bsdfs if here is not None else ()):
         entries = places.of_bsdf(scene, paths, slots, s, here)
-        found.append(Slot(*entries, scale * dn[k], scale * dw[k], s >= slots.colors))
+        found.append(Slot(*entries, scale * dn[k], scale * dw[k], slots.by_luminance and s >= slots.colors))
     for s, k in enumerate(of_lights):
         entries = places.of_hit(scene, paths, slots, s, now.ray, hit, here)
         found.append(Slot(*entries, scale * dLe[k], None))
@@ -107,16 +109,15 @@ def extend(
             found.append(Slot(*entries, scale * dn[k], None))
     for s, k in enumerate(of_choices):
         entries = places.of_choice(scene, paths, slots, s, here)
-        found.append(Slot(*entries, scale * dn[k], scale * dw[k], is_number=True))
+        found.append(Slot(*entries, scale * dn[k], scale * dw[k], slots.by_luminance))
     end, shadow = smaller(hit.t, now.ray.t_max), on.L.dimmed
     on = on._replace(L=on.L._replace(dimmed=None))
     for nudge, k in zip(slots.grids, of_grids, strict=True):
         entries = places.of_grid(scene, paths, nudge, now.medium, now.ray, end, u, shadow)
-        is_number = not differentiated.of_colors(scene, differentiated.path_of_grid(nudge))
         if nudge == "shadow":
-            found.append(Slot(*entries, scale * dn[k], None, is_number))
+            found.append(Slot(*entries, scale * dn[k], None))
         else:
-            found.append(Slot(*entries, scale * (dLe[k] + dn[k]), scale * dw[k], is_number))
+            found.append(Slot(*entries, scale * (dLe[k] + dn[k]), scale * dw[k]))
     record = Record(jnp.bool_(False), ~on.alive, Le + n, w, found)
     if not of_passed:
         return on, record, jnp.bool_(True)
@@ -127,6 +128,6 @@ def extend(
     found = [jax.tree.map(lambda x: jnp.where(itself, x, 0).astype(x.dtype), slot) for slot in found]
     for s, k in enumerate(of_passed):
         entries = places.of_passed(scene, paths, slots, s, passed)
-        found.append(Slot(*entries, jnp.where(itself, 0, scale * dn[k]), None, is_number=True))
+        found.append(Slot(*entries, jnp.where(itself, 0, scale * dn[k]), None, slots.by_luminance))
     gathered, weight = jnp.where(itself, record.gathered, 0), jnp.where(itself, record.weight, 1)
     return on, Record(record.begins, record.ends & itself, gathered, weight, found), itself

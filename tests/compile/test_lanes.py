@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from jax import lax
 
-from pathjax.compile import compute_once, one_by_one, persistent_loop
+from pathjax.compile import basis, compute_once, one_by_one, persistent_loop
 from pathjax.compile.lanes import lanes, runs
 
 WIDTH = 5
@@ -243,6 +243,46 @@ def test_a_value_computed_once_is_not_computed_again():
     assert once.count(" popcnt(") == 1
     assert again.count(" popcnt(") > 1
     assert once.count(" copy(") == again.count(" copy(")
+
+
+def tangents_of(f, tangents):
+    """Function of (a, b, table) to f and its derivatives in the numbers that it takes first, at 0."""
+
+    def of(a, b, table):
+        def push(t):
+            return jax.jvp(lambda x: f(x, a, b, table), (jnp.zeros(len(t)),), (t,))
+
+        return jax.vmap(push, out_axes=(None, 0))(tangents(4))
+
+    return of
+
+
+def test_derivatives_of_several_numbers_at_once(vectors):
+    """Through branches, loops, calls, tables and products of matrices, some of which do not depend on a number."""
+
+    def f(x, a, b, table):
+        branch = lax.cond(a[0] > 0, lambda x: x[0] * b + x[1], lambda x: jnp.exp(x[2] * a), x)
+        loop = lax.fori_loop(0, 3, lambda i, y: y * 0.5 + x[i % 2], branch[0])
+        picked = table[jnp.int32(a[1] > 0), 0] * x[3] + x[jnp.int32(b[0] > 0)]
+        product = jnp.stack([x[0] * a[0], x[1], a[2] - x[3] / b[1]]) @ table[0].T
+        return branch, loop, compute_once(picked), product, jnp.where(b > 0, a, x[:3]).sum(), jax.jit(jnp.sum)(x * a[0])
+
+    agrees(tangents_of(f, lambda n: basis(n, jnp.float32)), *vectors)
+
+
+def test_what_does_not_depend_on_a_number_costs_its_tangent_nothing(vectors):
+    """Each of these functions depends on one number, so the four tangents cost what one does."""
+
+    def f(x, a, b, table):
+        return [jnp.sin(a * x[k] + b) * jnp.exp(a * (b + k)) for k in range(4)]
+
+    def products(tangents):
+        of = tangents_of(f, tangents)
+        program = jax.make_jaxpr(lanes(lambda x, table: of(*x, table), WIDTH))(tuple(vectors), TABLE)
+        return str(program).count(" = mul ")
+
+    # Of a tangent: times a, the cosine and the exponential, 3 components each.
+    assert products(jnp.eye) - products(lambda n: basis(n, jnp.float32)) == 3 * 4 * 3 * 3
 
 
 def test_no_tracer_outlives_its_function(vectors):

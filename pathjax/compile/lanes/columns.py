@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 
 import jax.numpy as jnp
@@ -20,6 +21,16 @@ def as_components(shape, items) -> np.ndarray:
     for place, item in enumerate(items):
         flat[place] = item
     return flat.reshape(shape)
+
+
+@functools.cache
+def known_zero(dtype: np.dtype) -> np.generic:
+    """The component that stands for what is known to be zero: this very object, elsewhere a number as any other."""
+    return dtype.type(0)
+
+
+def is_known_zero(item) -> bool:
+    return isinstance(item, np.generic) and item is known_zero(item.dtype)
 
 
 def split(x) -> np.ndarray:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from pathjax.compile.jax_compat import ClosedJaxpr, Literal, called_program, scan_parts, while_parts
-from pathjax.compile.primitives import persistent_test_p, together_p
+from pathjax.compile.primitives import basis_p, persistent_test_p, together_p
 
 
 def variables(atoms) -> set:
@@ -35,7 +35,9 @@ def program_outputs_differ(program: ClosedJaxpr, inputs_differ: list[bool]) -> l
 
 
 def equation_outputs_differ(eqn, inputs_differ: list[bool]) -> list[bool]:
-    if not any(inputs_differ) or eqn.primitive is together_p:
+    if eqn.primitive is basis_p:
+        return [True]  # as components, so that its zeros are known
+    if eqn.primitive is together_p:
         return [False] * len(eqn.outvars)
     match eqn.primitive.name:
         case "while":
@@ -47,7 +49,9 @@ def equation_outputs_differ(eqn, inputs_differ: list[bool]) -> list[bool]:
             results = [program_outputs_differ(branch, operands_differ) for branch in eqn.params["branches"]]
             return [which_differs or any(each) for each in zip(*results, strict=True)]
     called = called_program(eqn)
-    return [True] * len(eqn.outvars) if called is None else program_outputs_differ(called, inputs_differ)
+    if called is None:
+        return [any(inputs_differ)] * len(eqn.outvars)
+    return program_outputs_differ(called, inputs_differ)
 
 
 def _while_outputs_differ(eqn, inputs_differ):

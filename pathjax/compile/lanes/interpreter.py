@@ -26,13 +26,15 @@ from pathjax.compile.lanes.columns import (
     differs,
     entry,
     gathered,
+    is_known_zero,
     join,
+    known_zero,
     split,
     with_entry,
 )
 from pathjax.compile.lanes.dataflow import equation_outputs_differ, variables, variables_read_by
-from pathjax.compile.lanes.primitive_rules import COMPONENTWISE, RULES
-from pathjax.compile.primitives import column_p, compute_once_p, one_by_one_p, together_p
+from pathjax.compile.lanes.primitive_rules import COMPONENTWISE, RULES, ZEROS
+from pathjax.compile.primitives import basis_p, column_p, compute_once_p, one_by_one_p, together_p
 
 # Rows of a table from which lanes select what they want; gathering is faster from more.
 SELECTED_ROWS = 8
@@ -96,6 +98,8 @@ class Interpreter:
             return self.one_by_one(inputs, **eqn.params)
         if primitive is together_p:
             return self.together(inputs, **eqn.params)
+        if primitive is basis_p:
+            return [self.basis(**eqn.params)]
         called = called_program(eqn)
         if called is not None:
             return self.run(called, inputs)
@@ -104,7 +108,7 @@ class Interpreter:
             return list(outputs) if primitive.multiple_results else [outputs]
         shape = eqn.outvars[0].aval.shape
         if name in COMPONENTWISE:
-            return [self.componentwise(partial(primitive.bind, **eqn.params), inputs, shape)]
+            return [self.componentwise(partial(primitive.bind, **eqn.params), inputs, shape, ZEROS.get(name))]
         result = RULES[name](self, inputs, eqn.params, shape) if name in RULES else None
         if result is None:
             return self.by_vmap(eqn, inputs)
@@ -118,10 +122,20 @@ class Interpreter:
             operands = [x if jnp.ndim(x) else jnp.broadcast_to(x, (self.width,)) for x in operands]
         return op(*operands)
 
-    def componentwise(self, op, inputs, shape):
-        """op of each component; inputs have the shape or are single numbers."""
+    def componentwise(self, op, inputs, shape, zeros=None):
+        """op of each component; inputs have the shape or are single numbers. zeros: of `ZEROS`."""
+
+        def component(*operands):
+            known = zeros(*operands) if zeros is not None and any(map(is_known_zero, operands)) else None
+            return self.columnwise(op, *operands) if known is None else known
+
         columns = [np.broadcast_to(components(x), shape).flat for x in inputs]
-        return as_components(shape, [self.columnwise(op, *operands) for operands in zip(*columns, strict=True)])
+        return as_components(shape, list(map(component, *columns)))
+
+    @staticmethod
+    def basis(count, dtype):
+        zero, one = known_zero(dtype), jnp.ones((), dtype)
+        return as_components((count, count), [one if i == j else zero for i, j in np.ndindex(count, count)])
 
     def select(self, which, *cases):
         """By the number `which`, components of one of the cases; what is the same in all stays as it is."""
@@ -148,7 +162,7 @@ class Interpreter:
         Column by column, so that those which nobody reads vanish with all that they are made of.
         """
         items = {id(item): item for value in values if differs(value) for item in value.flat}
-        new = [item for item in items.values() if id(item) not in self.computed]
+        new = [item for item in items.values() if id(item) not in self.computed and not is_known_zero(item)]
         results = list(map(column_p.bind, new))
         items |= zip(map(id, new), results, strict=True)
         self.computed.update((id(item), item) for item in results)

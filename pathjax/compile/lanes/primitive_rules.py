@@ -9,13 +9,14 @@ or None: not by this rule, but by `vmap`.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from functools import partial
 
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from pathjax.compile.lanes.columns import as_components, components, differs
+from pathjax.compile.lanes.columns import as_components, components, differs, is_known_zero
 
 
 def _broadcast_in_dim(interpreter, inputs, params, shape):
@@ -36,13 +37,14 @@ def _unstack(interpreter, inputs, params, shape):
     return [part.reshape(shape) for part in np.split(inputs[0], inputs[0].shape[axis], axis)]
 
 
-def _reduce(op):
+def _reduce(op, zeros=None):
     def rule(interpreter, inputs, params, shape):
         axes = params["axes"]
         terms = np.moveaxis(inputs[0], axes, range(len(axes))).reshape(-1, math.prod(shape))
         while len(terms) > 1:
             half = len(terms) // 2
-            folded = interpreter.componentwise(op, [terms[:half], terms[half : 2 * half]], (half, terms.shape[1]))
+            pair = [terms[:half], terms[half : 2 * half]]
+            folded = interpreter.componentwise(op, pair, (half, terms.shape[1]), zeros)
             terms = np.concatenate([folded, terms[2 * half :]])
         return terms.reshape(shape)
 
@@ -55,8 +57,8 @@ def _dot_general(interpreter, inputs, params, shape):
         return None
     a, b = (np.moveaxis(components(x), axes, [0]) for x, axes in zip(inputs, (axes_a, axes_b), strict=True))
     a, b = a.reshape(len(a), -1, 1), b.reshape(len(b), 1, -1)
-    products = interpreter.componentwise(lax.mul, [a, b], (len(a), a.shape[1], b.shape[2]))
-    return _reduce(lax.add)(interpreter, [products], {"axes": (0,)}, shape)
+    products = interpreter.componentwise(lax.mul, [a, b], (len(a), a.shape[1], b.shape[2]), ZEROS["mul"])
+    return _reduce(lax.add, ZEROS["add"])(interpreter, [products], {"axes": (0,)}, shape)
 
 
 def _dynamic_slice(interpreter, inputs, params, shape):
@@ -122,6 +124,16 @@ def _dynamic_update_slice(interpreter, inputs, params, shape):
     return as_components(shape, items)
 
 
+# Of operands of which one at least is known to be zero: the result, where nothing needs to be computed for it; or None.
+ZEROS: dict[str, Callable] = {
+    "add": lambda a, b: b if is_known_zero(a) else a,
+    "add_any": lambda a, b: b if is_known_zero(a) else a,
+    "sub": lambda a, b: a if is_known_zero(b) else lax.neg(b),
+    "mul": lambda a, b: a if is_known_zero(a) else b,
+    "div": lambda a, b: a if is_known_zero(a) else None,
+    "neg": lambda a: a,
+}
+
 RULES = {
     "broadcast_in_dim": _broadcast_in_dim,
     "reshape": lambda interpreter, x, params, shape: x[0].reshape(shape),
@@ -135,8 +147,10 @@ RULES = {
     "stack": lambda interpreter, x, params, shape: np.stack(list(map(components, x)), params["axis"]),
     "unstack": _unstack,
     "split": lambda interpreter, x, params, shape: np.split(x[0], np.cumsum(params["sizes"])[:-1], params["axis"]),
-    "select_n": lambda interpreter, x, params, shape: interpreter.componentwise(lax.select_n, x, shape),
-    "reduce_sum": _reduce(lax.add),
+    "select_n": lambda interpreter, x, params, shape: interpreter.componentwise(
+        lax.select_n, x, shape, lambda which, first, *others: first if all(each is first for each in others) else None
+    ),
+    "reduce_sum": _reduce(lax.add, ZEROS["add"]),
     "reduce_max": _reduce(lax.max),
     "reduce_min": _reduce(lax.min),
     "reduce_and": _reduce(lax.bitwise_and),
