@@ -163,7 +163,7 @@ def sweep(structure: Record, memory: Memory, due: Bool[Array, ""]) -> Memory:
             change = slot.now
             if slot.later is not None:
                 change = [a + b * x for a, b, x in zip(slot.now, slot.later, R, strict=True)]
-            if slot.is_number:
+            if slot.by_luminance:
                 change = [sum(change) * share for share in LUMINANCE]
             total = totals.add(total, slot, [jnp.where(here, x, 0) for x in change])
         R = [n + w * x for n, w, x in zip(record.gathered, record.weight, R, strict=True)]
@@ -316,9 +316,9 @@ def pullback(
 def rows(
     scene: Scene, pixels, first_sample, spp, seed, *, kept: Kept, options: Options, ring, form=None, devices=None
 ) -> tuple[Float[Array, "N 3"], Rows]:
-    """Means of pixels, and their derivatives in each of the colours that are kept, of each channel in its own.
+    """Means of pixels, and derivatives of each channel in the same channel of each colour that is kept, or in a number.
 
-    Arguments as for `pullback`; the arrays hold colours alone. A row is (N, 4), and the last number is none.
+    Arguments as for `pullback`; no colour is looked up by its luminance. A row is (N, 4), and the last number is none.
     """
     scene, choice, structure, sweep_of = _kernel(scene, kept, options)
 

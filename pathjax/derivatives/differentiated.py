@@ -49,6 +49,7 @@ class Slots:
     wrappers: tuple[Columns, ...]  # by table of bsdfs that hold others
     choices: tuple[tuple[int, int, int], ...]  # of `tree.steps`: the step, its wrapper, and which of its columns
     on_the_way: int  # wrappers that `tree.on_the_way` tells; each has a slot for each column
+    by_luminance: bool  # whether a colour may be looked up as one of the numbers of bsdfs, by its luminance
     corners: bool  # whether what meshes carry is differentiated
     grids: tuple[str, ...]  # of `media.Nudges`: what is nudged of media
 
@@ -140,14 +141,16 @@ def slots(scene: Scene, paths: Paths, fields: Fields) -> Slots:
 
     def looked_up(table, textures):
         """Colours and numbers that are looked up in a table."""
-        held, textured = named.get(scene, table), bool(in_textures(scene, paths, textures))
-        columns, names = held.columns, list(held.kind.declared)
-
-        def is_filled(i):
-            return columns[i].texture is not None and (fields is None or names[i] in fields)
-
-        found = [i for path, i in _columns(scene, table).items() if path in paths or (textured and is_filled(i))]
+        columns, by_textures = named.get(scene, table).columns, filled(table, in_textures(scene, paths, textures))
+        found = [i for path, i in _columns(scene, table).items() if path in paths or i in by_textures]
         return [i for i in found if columns[i].values.ndim > 1], [i for i in found if columns[i].values.ndim == 1]
+
+    def filled(table, textures):
+        """Columns of a table that look up some of these textures."""
+        held = named.get(scene, table)
+        columns = zip(held.kind.declared, held.columns, strict=True) if textures else ()
+        allowed = [column is not None and (fields is None or name in fields) for name, column in columns]
+        return [i for i, each in enumerate(allowed) if each and held.columns[i].texture is not None]
 
     def joined(found):
         """All colours, and all numbers behind the most colours that any table has."""
@@ -177,10 +180,16 @@ def slots(scene: Scene, paths: Paths, fields: Fields) -> Slots:
     met = {place for level in scene.materials.passing for place in level if wrappers}
     passed = any(column is not None for place in met for column in wrappers[place])
     on_the_way = tree.most_on_the_way(scene.materials) if passed else 0
+    colored = {key: path for key, path in in_textures(scene, paths, TEXTURES).items() if of_colors(scene, path)}
+    scattering = [(*BSDFS, i) for i in range(len(scene.materials.tables))] + [(*WRAPPERS, i) for i in choosing]
+    by_luminance = any(
+        named.get(scene, table).columns[i].values.ndim == 1 for table in scattering for i in filled(table, colored)
+    )
     corners = any(path[0] == "geometry" for path in paths)
     of_scattering = () if scene.scatters else ("extinction", "albedo")
     grids = tuple(n for path, nudges in GRIDS.items() if path in paths for n in nudges if n not in of_scattering)
-    return Slots(bsdfs, lights, tuple(backgrounds), colors, wrappers, choices, on_the_way, corners, grids)
+    backgrounds = tuple(backgrounds)
+    return Slots(bsdfs, lights, backgrounds, colors, wrappers, choices, on_the_way, by_luminance, corners, grids)
 
 
 def prepared(scene: Scene, paths: Paths, slots: Slots, number: Int[Array, ""]) -> Scene:

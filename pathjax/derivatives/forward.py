@@ -47,7 +47,7 @@ def changes(
         shares = slot.shares or (1,)
         change = sum(share * at(v, kept.place(place))[-3:] for place, share in zip(slot.places, shares, strict=True))
         # Read once, as both of its consumers would read it from far memory.
-        change = compute_once(luminance(change) if slot.is_number else change)
+        change = compute_once(luminance(change) if slot.by_luminance else change)
         now = now + slot.now * change
         if slot.later is not None:
             later = later + slot.later * change

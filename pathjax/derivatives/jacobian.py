@@ -1,7 +1,7 @@
 """Image and Jacobian: how every pixel changes with the parameters of materials and lights.
 
 Colours (reflectances, radiances, a metal's eta and k) change what paths carry, not where they go: the derivative is
-that of the weights (detached sampling), unbiased (`tangents`; of many colours `backward`). The IOR of smooth glass
+that of the weights (detached sampling), unbiased (`tangents`; of many numbers `backward`). The IOR of smooth glass
 moves the path itself, which takes differences (`ior_difference`). No general derivative exists here for moving geometry
 or cameras.
 """
@@ -24,8 +24,8 @@ from pathjax.bsdfs import dielectric
 from pathjax.compile import is_symbolic_zero, is_traced, native, on_all_devices, register_dataclass, usual_promotion
 from pathjax.core.types import Number
 from pathjax.derivatives import backward, differentiated, ior, ior_difference, ior_step, rules, tangents, totals
-from pathjax.derivatives.color_slopes import ColorSlopes, Place
 from pathjax.derivatives.kept import kept as kept_of
+from pathjax.derivatives.row_slopes import Place, RowSlopes
 from pathjax.errors import InputError
 from pathjax.integrators import pixel
 from pathjax.integrators.options import Counts, Options
@@ -44,8 +44,8 @@ METHODS = ("difference", "attached")
 MOST_TANGENTS = 2
 # Where a sweep finds them, `takes_sweep`.
 UNLESS = (
-    " unless it holds colours, no IOR of smooth glass is named with it, and pixels share no samples, as under a box "
-    "filter"
+    " unless no IOR of smooth glass is named with it, pixels share no samples, as under a box filter, and no colour of "
+    "those named stands for a number, too"
 )
 
 
@@ -54,7 +54,7 @@ UNLESS = (
 class Jacobian(Mapping[str, Array]):
     """Derivatives of an image by the names of parameters: `J[name]` is (H, W, 3, *shape of the parameter).
 
-    derivatives: of many colours, `ColorSlopes`, which make each when it is read.
+    derivatives: of many numbers, `RowSlopes`, which make each when it is read.
     bias: of those that are differences, an estimate of derivative minus truth (H, W, 3) from a second step; noisy in a
         single pixel, meant for averages.
     step: of those, the change of the relative IOR to either side.
@@ -111,9 +111,9 @@ def jacobian(
     Returns:
         image and Jacobian.
     Raises:
-        InputError: unknown name, method or strategy; spp, seed or step out of range; a texture, unless it holds colours
-            and pixels share no samples; a value that counts as a larger one, as a roughness of 0 does; more
-            derivatives than fit into memory.
+        InputError: unknown name, method or strategy; spp, seed or step out of range; a texture, where pixels share
+            samples, or where its colours stand for numbers, too; a value that counts as a larger one, as a roughness
+            of 0 does; more derivatives than fit into memory.
     """
     if isinstance(names, str):
         raise InputError(f"names is a list of names; write [{names!r}]")
@@ -134,7 +134,7 @@ def jacobian(
         scene, wanted, pixels, 0, spp, seed, options, method=method, step=step
     )
     shape = film.image_shape(scene.film)
-    if isinstance(derivatives, ColorSlopes):
+    if isinstance(derivatives, RowSlopes):
         return image.reshape(*shape, 3), Jacobian(replace(derivatives, shape=shape), bias, used)
     image, derivatives, bias = _as_images((image, derivatives, bias), shape)
     return image, Jacobian(derivatives, bias, used)
@@ -207,9 +207,9 @@ def pixel_jacobians(
 
 
 def takes_sweep(scene: Scene, parameters, options: Options, form: str | None = None, devices: int | None = None):
-    """Whether a recorded sweep finds all derivatives: of textures, or of so many colours that tangents would cost more.
+    """Whether a recorded sweep finds all derivatives: of textures, or of so many numbers that tangents would cost more.
 
-    It knows of pixels that draw their own samples alone, of colours, and of native kernels.
+    It knows of pixels that draw their own samples alone, and of native kernels.
     """
     lanes = form == "lanes" or (form is None and native())
     few = len(parameters) <= MOST_TANGENTS and not any(parameter.is_texture for parameter in parameters)
@@ -217,14 +217,13 @@ def takes_sweep(scene: Scene, parameters, options: Options, form: str | None = N
 
 
 def has_rows(scene: Scene, parameters) -> bool:
-    """Whether `backward.rows` finds the derivatives in them: in colours alone, which move no path."""
+    """Whether `backward.rows` finds the derivatives in them, which move no path."""
     parameters = list(parameters)
     paths = {parameter.path for parameter in parameters}
-    if not paths <= differentiated.paths(scene) or any(parameter.shape[-1:] != (3,) for parameter in parameters):
+    if not paths <= differentiated.paths(scene):
         return False
-    slots = differentiated.slots(scene, tuple(paths), differentiated.places_of_textures(parameters))
-    # What also stands for a number has a derivative across channels.
-    return slots.of_bsdfs == slots.colors and not (slots.of_choices or slots.of_passed or slots.grids)
+    # A colour that also stands for a number has a derivative across channels.
+    return not differentiated.slots(scene, tuple(paths), differentiated.places_of_textures(parameters)).by_luminance
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0, 1, 2, 3))
@@ -238,9 +237,9 @@ def _swept(wanted, options, ring, how, scene, pixels, *numbers):
 
     def place(parameter):
         shape = named.get(scene, parameter.path).shape
-        return Place(kept.of(scene, parameter), parameter, shape)
+        return Place(kept.of(scene, parameter), parameter, shape, differentiated.of_colors(scene, parameter.path))
 
-    return image, ColorSlopes(rows, tuple((name, place(each)) for name, each in wanted.items()), (len(pixels),))
+    return image, RowSlopes(rows, tuple((name, place(each)) for name, each in wanted.items()), (len(pixels),))
 
 
 @partial(_swept.defjvp, symbolic_zeros=True)

@@ -43,7 +43,9 @@ def is_dense(problem: Problem) -> bool:
     count, pixels = problem.vector.count, sum(target.image.size // 3 for target in problem.targets)
     if count > MOST_NUMBERS or pixels * (count // 3) ** 2 > MOST_PRODUCTS:
         return False
-    return all(has_rows(views.scene, views.wanted.values()) for views in problem.groups)
+    wanted = [(views.scene, list(views.wanted.values())) for views in problem.groups]
+    colored = all(parameter.shape[-1:] == (3,) for _, parameters in wanted for parameter in parameters)
+    return colored and all(has_rows(scene, parameters) for scene, parameters in wanted)
 
 
 def least_within(

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from PIL import Image
 
 import pathjax as pj
 from pathjax.compile import mapping
@@ -168,6 +169,67 @@ def test_the_jacobian_is_the_same(room):
         terms = np.asarray(J[name]).reshape(-1, 3, 3) * np.asarray(v)[..., None]
         gap = np.abs(pulled[name] - terms.sum((0, 1)))
         assert (gap <= ROUNDING * np.abs(terms).sum((0, 1))).all(), name
+
+
+@pytest.fixture(scope="module")
+def numbers(make_scene, tmp_path_factory):
+    """A scene of what is rough, mixed and cut out, a grey texture in the place of a colour, and a point light."""
+    file = tmp_path_factory.mktemp("numbers") / "grey.png"
+    Image.fromarray(np.random.default_rng(0).integers(60, 200, (2, 3), np.uint8)).save(file)
+    grey = f'<string name="filename" value="{file}"/><boolean name="raw" value="true"/>'
+
+    def plastic(name, metallic):
+        inside = f'<float name="roughness" value="0.4"/><float name="metallic" value="{metallic}"/>'
+        inside += f'<float name="sheen" value="0.5"/>{rgb("base_color", "0.7, 0.4, 0.2")}'
+        return f'<bsdf type="principled" id="{name}">{inside}</bsdf>'
+
+    both = f'<float name="weight" value="0.4"/>{plastic("one", 0.2)}{plastic("two", 0.6)}'
+    blend = f'<bsdf type="blendbsdf" id="blend">{both}</bsdf>'
+    metal = '<bsdf type="roughconductor" id="metal"><float name="alpha" value="0.3"/>'
+    metal += f'<texture type="bitmap" name="specular_reflectance">{grey}</texture></bsdf>'
+    leaf = f'<bsdf type="mask" id="leaf"><float name="opacity" value="0.6"/>{diffuse("green", "")}</bsdf>'
+
+    def shape(kind, x, inside):
+        return f'<shape type="{kind}"><transform name="to_world"><translate x="{x}"/></transform>{inside}</shape>'
+
+    lamp = '<emitter type="point" id="lamp"><point name="position" x="0" y="2" z="3"/></emitter>'
+    shapes = shape("sphere", -2, blend) + shape("sphere", 0, metal) + shape("rectangle", 2, leaf) + lamp
+    return make_scene(shapes + f'<emitter type="constant" id="sky">{rgb("radiance", 1)}</emitter>', res=RES, depth=4)
+
+
+@pytest.mark.slow
+def test_a_jacobian_in_many_numbers_is_that_by_tangents(numbers, monkeypatch):
+    """And J^T v is that of a sweep of all entries in one list."""
+    known = numbers.about.parameters
+    names = [name for name in known if not known[name].moves_paths]
+    constants, texels = ([name for name in names if known[name].is_texture == t] for t in (False, True))
+    assert len(constants) > 12 and known[texels[0]].shape == (2, 3, 3)
+    image, J = pj.jacobian(numbers, names, SPP, 3)
+    v = jnp.asarray(np.random.default_rng(1).normal(size=image.shape), jnp.float32)
+    values = {name: jnp.asarray(pj.parameters(numbers)[name]) for name in names}
+    (pulled,) = jax.vjp(lambda values: pj.render(pj.with_parameters(numbers, values), SPP, 3), values)[1](v)
+    monkeypatch.setattr(jacobian, "takes_sweep", lambda *_, **__: False)
+    expected = pj.jacobian(numbers, constants, SPP, 3)[1]
+    for name in names:
+        terms = np.asarray(J[name], float)
+        assert terms.shape == (*image.shape, *known[name].shape) and np.abs(terms).max() > 0, name
+        size = np.tensordot(np.abs(v), np.abs(terms), 3)
+        assert (np.abs(np.tensordot(v, terms, 3) - pulled[name]) <= ROUNDING * size).all(), name
+        if name in constants:
+            np.testing.assert_allclose(terms, expected[name], rtol=1e-5, atol=1e-5 * np.abs(terms).max())
+
+
+def test_the_program_of_a_jacobian_has_a_part_for_each_number_of_a_kind(numbers):
+    """Not of each bsdf: what it costs to compile does not grow with the number of bsdfs."""
+    fields = "base_color", "roughness", "metallic", "sheen"
+
+    def equations(*bsdfs):
+        names = [f"{bsdf}.{field}" for bsdf in bsdfs for field in fields]
+        program = jax.make_jaxpr(lambda: jax.tree.leaves(pj.jacobian(numbers, names, SPP, 3)))()
+        return len(str(program).splitlines())
+
+    one, both = equations("one"), equations("one", "two")
+    assert abs(both - one) < 0.05 * one, (one, both)
 
 
 def patches(count, res):
@@ -369,6 +431,10 @@ def test_textures_that_are_not_asked_for_take_no_part(make_scene, picture):
             first = pulled.setdefault(name, x)
             np.testing.assert_allclose(x, first, rtol=1e-5, atol=1e-6 * np.abs(first).max())
     assert jacobian.has_rows(scene, [known["wall.reflectance"]])
+    # Its colours stand for numbers, so each of their channels counts in all of the image's.
+    assert not jacobian.has_rows(scene, [known["rough.alpha"]])
+    with pytest.raises(pj.InputError, match="rough.alpha is a texture, .* stands for a number"):
+        pj.jacobian(scene, ["rough.alpha"], 1)
 
 
 @pytest.mark.parametrize("count", [1, MOST_RUNS, MOST_RUNS + 3])
@@ -387,7 +453,7 @@ def test_entries_of_few_runs_are_kept(count):
 
 def test_what_takes_a_derivative_of_each_number_refuses_textures_that_it_cannot_take(screen):
     wide = replace(screen, film=replace(screen.film, shared=True))
-    with pytest.raises(pj.InputError, match=f"{NAME} is a texture, .* unless it holds colours"):
+    with pytest.raises(pj.InputError, match=f"{NAME} is a texture, .* unless .* pixels share no samples"):
         pj.jacobian(wide, [NAME], 1)
     with pytest.raises(pj.InputError, match="second derivatives are not"):
         jax.hessian(lambda x: pj.render(pj.with_parameters(screen, {NAME: x}), 1).sum())(pj.parameters(screen)[NAME])

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import pathjax as pj
-from pathjax.derivatives import matrix_free
+from pathjax.derivatives import jacobian, matrix_free
 from pathjax.derivatives.jacobian import pixel_jacobians
 from pathjax.integrators.options import DEFAULTS
 from pathjax.scene.parameters import find, nameless
@@ -16,7 +16,7 @@ from pathjax.sensors import film
 pytestmark = pytest.mark.slow
 
 
-def test_a_sweep_adds_up_what_the_jacobian_holds(shipped):
+def test_a_sweep_adds_up_what_the_jacobian_holds(shipped, monkeypatch):
     """Of surfaces and lights in a scene with media, where paths meet particles between them."""
     scene = shipped("media", res=16)
     wanted = {name: find(scene, name) for name in pj.parameters(scene)}
@@ -26,8 +26,11 @@ def test_a_sweep_adds_up_what_the_jacobian_holds(shipped):
     v = np.random.default_rng(1).normal(size=(len(pixels), 3)).astype(np.float32)
     work = pixels, 0, 16, 1
     swept = matrix_free.pull(nameless(scene), wanted, jax.numpy.asarray(v), *work, DEFAULTS)
+    _, by_rows, *_ = pixel_jacobians(nameless(scene), wanted, *work, DEFAULTS)
+    monkeypatch.setattr(jacobian, "takes_sweep", lambda *_, **__: False)
     _, J, *_ = pixel_jacobians(nameless(scene), wanted, *work, DEFAULTS)
     for name in wanted:
+        np.testing.assert_allclose(by_rows[name], J[name], rtol=1e-4, atol=1e-5 * np.abs(J[name]).max())
         expected = np.einsum("nc,nc...->...", v, np.asarray(J[name], float))
         size = np.einsum("nc,nc...->...", np.abs(v), np.abs(np.asarray(J[name], float)))
         assert (np.abs(swept[name] - expected) < 1e-4 * size.max()).all(), name

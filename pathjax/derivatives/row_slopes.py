@@ -1,4 +1,4 @@
-"""Derivatives in many colours, of which no more is kept than may differ from 0."""
+"""Derivatives in many colours and numbers, of which no more is kept than may differ from 0."""
 
 from __future__ import annotations
 
@@ -23,25 +23,26 @@ class Place(NamedTuple):
     rows: range
     parameter: Parameter
     array: tuple[int, ...]  # shape of what it lives in
+    of_colors: bool  # else it holds numbers
 
 
 @register_dataclass
 @dataclass(frozen=True, eq=False)
-class ColorSlopes(Mapping[str, Array]):
-    """Derivatives by the names of colours and textures, (*shape, 3, ..., 3) each, which are made when they are read.
+class RowSlopes(Mapping[str, Array]):
+    """Derivatives by the names of parameters, (*shape, 3, *shape of the parameter) each, made when they are read.
 
-    Light keeps its channel, so a third of their numbers says all.
+    Light keeps its channel, so of a colour a third of the numbers says all.
     """
 
     rows: Rows  # (N, 4), of each channel in its own; the last number is none
     places: tuple[tuple[str, Place], ...] = field(metadata={"static": True})  # by name
     shape: tuple[int, ...] = field(metadata={"static": True})  # of the N pixels
 
-    def __getitem__(self, name: str) -> Float[Array, "... 3"]:
+    def __getitem__(self, name: str) -> Float[Array, "..."]:
         place = self._place[name]
         if place.parameter.is_texture:
             return _slopes(self._rows, place, self.shape)
-        return _slope(self._rows, place.rows.start, self.shape)
+        return _slope(self._rows, place.rows.start, bool(place.parameter.shape), self.shape)
 
     @cached_property
     def _rows(self) -> Rows:
@@ -61,18 +62,20 @@ class ColorSlopes(Mapping[str, Array]):
         return len(self.places)
 
 
-@partial(jax.jit, static_argnames="shape")
-def _slope(rows: Rows, number, shape: tuple[int, ...]) -> Float[Array, "... 3 3"]:
+@partial(jax.jit, static_argnames=("of_color", "shape"))
+def _slope(rows: Rows, number, of_color: bool, shape: tuple[int, ...]) -> Float[Array, "..."]:
     row = rows[number][..., :3]
-    return tangents.by_channel(row.reshape(*row.shape[:-2], *shape, 3))
+    slope = row.reshape(*row.shape[:-2], *shape, 3)
+    return tangents.by_channel(slope) if of_color else slope
 
 
 @partial(jax.jit, static_argnames=("place", "shape"))
-def _slopes(rows: Rows, place: Place, shape: tuple[int, ...]) -> Float[Array, "... 3"]:
+def _slopes(rows: Rows, place: Place, shape: tuple[int, ...]) -> Float[Array, "..."]:
     found = rows.all()[..., place.rows.start : place.rows.stop, :, :3]  # (..., entries, N, 3)
     found = jnp.moveaxis(found, -3, -2)
     before = *found.shape[:-3], *shape
-    by_pixel = jax.vmap(partial(of_parameter, place.parameter, place.array))(found.reshape(-1, *found.shape[-2:]))
-    texels = place.parameter.shape[:-1]
-    same = jnp.eye(3, dtype=found.dtype).reshape(3, *[1] * len(texels), 3)
-    return by_pixel.reshape(*before, 1, *texels, 3) * same
+    found = found.reshape(-1, *found.shape[-2:])
+    same = jnp.eye(3, dtype=found.dtype)
+    of_channels = found[:, None] * same[:, None] if place.of_colors else jnp.moveaxis(found, -1, 1)
+    slopes = jax.vmap(jax.vmap(partial(of_parameter, place.parameter, place.array)))(of_channels)
+    return slopes.reshape(*before, 3, *place.parameter.shape)
