@@ -76,13 +76,14 @@ def _estimate_jvp(static, primals, tangents):
     scene, varied, *work = primals
     scene_tangent, varied_tangent, *_ = tangents
     changes = _changes(parameters, scene_tangent, varied_tangent)
-    # Attached, for derivatives of the derivative.
-    scene = named.with_values(scene, varied, parameters)
     wanted = {name: parameters[name] for name in changes}
     named.refuse_constant(scene, wanted)
     free = {name: wanted.pop(name) for name in sorted(estimator.matrix_free(scene, wanted))}
     if free:
-        scene = differentiated_once(scene, "an image in a texture, or in many colours,")
+        scene, _ = differentiated_once((scene, varied), "an image in a texture, or in many colours,")
+    else:
+        # Attached, for derivatives of the derivative.
+        scene = named.with_values(scene, varied, parameters)
     value, J = estimator.jacobian(scene, wanted, *work) if wanted else (estimator.value(scene, *work), {})
     tangent = jnp.zeros_like(value)
     for name in wanted:

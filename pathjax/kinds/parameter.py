@@ -5,11 +5,13 @@ from __future__ import annotations
 import functools
 import hashlib
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Shaped
 
 from pathjax.core.math import luminance
@@ -76,11 +78,15 @@ class Parameter:
         """The array with another value of the parameter; a number stands for all channels of a texel."""
         if not self.is_texture:
             return values.at[self.index].set(value)
-        first, (_, *others) = self.index[0], values.shape
+        return with_textures(values, [(self, value)])
+
+    def of_rows(self, values: Shaped[Array, "R ..."], value: Shaped[Array, "..."]) -> Shaped[Array, "rows ..."]:
+        """Of a texture: its rows of the array, for a value of the parameter."""
         if self.corners is not None:
-            return values.at[first : first + self.rows].set(value[self.corners.values])
+            return value[self.corners.values].astype(values.dtype)
+        others = values.shape[1:]
         value = jnp.broadcast_to(value.reshape(self.rows, -1), (self.rows, math.prod(others)))
-        return values.at[first : first + self.rows].set(value.reshape(self.rows, *others))
+        return value.reshape(self.rows, *others).astype(values.dtype)
 
     def transposed(self, values: Shaped[Array, "R ..."]) -> Shaped[Array, "..."]:
         """The transpose of `put` into zeros: of derivatives in the array, those in the parameter."""
@@ -92,6 +98,20 @@ class Parameter:
     def table(self) -> tuple[str | int, ...] | None:
         """Path to the table of its kind, which holds `columns[place].values`; None: it is of a mesh or of a grid."""
         return self.path[:-3] if "columns" in self.path else None
+
+
+def with_textures(
+    values: Shaped[Array, "R ..."], textures: Sequence[tuple[Parameter, Shaped[Array, "..."]]]
+) -> Shaped[Array, "R ..."]:
+    """The array with other values of some textures. If it is of these alone, it is not read: it may be large."""
+    new = [(parameter.index[0], parameter.of_rows(values, value)) for parameter, value in textures]
+    if sum(len(rows) for _, rows in new) == len(values):
+        if len(new) == 1:
+            return new[0][1]
+        values = lax.empty(values.shape, values.dtype)
+    for first, rows in new:
+        values = values.at[first : first + len(rows)].set(rows)
+    return values
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,7 +15,7 @@ from jax.typing import ArrayLike
 
 from pathjax.compile import is_traced, usual_promotion
 from pathjax.errors import InputError
-from pathjax.kinds.parameter import Parameter
+from pathjax.kinds.parameter import Parameter, with_textures
 from pathjax.scene.scene import Scene
 
 
@@ -35,15 +35,14 @@ def with_parameters(scene: Scene, values: Mapping[str, ArrayLike | Sequence[floa
     Raises:
         InputError: a name is unknown, or a value has the wrong shape or lies outside the parameter's bounds.
     """
-    varied = dict(scene.varied)
+    new = {}
     for name, value in values.items():
         parameter = find(scene, name)
-        value = checked(name, value, parameter, get(scene, parameter.path).dtype)
-        varied.pop(name, None)
-        if is_traced(value):
-            varied[name] = value
-        scene = with_values(scene, {name: lax.stop_gradient(value)}, scene.described.parameters)
-    return replace(scene, varied=varied)
+        new[name] = checked(name, value, parameter, get(scene, parameter.path).dtype)
+    varied = {name: value for name, value in scene.varied.items() if name not in new}
+    varied |= {name: value for name, value in new.items() if is_traced(value)}
+    new = {name: lax.stop_gradient(value) for name, value in new.items()}
+    return replace(with_values(scene, new, scene.described.parameters), varied=varied)
 
 
 def attached(scene: Scene) -> Scene:
@@ -53,13 +52,19 @@ def attached(scene: Scene) -> Scene:
 
 def with_values(scene: Scene, values: Mapping[str, jax.Array], parameters: Mapping[str, Parameter]) -> Scene:
     """The scene with values of parameters in its tables, unchecked."""
+    textures: dict[tuple, list[tuple[Parameter, jax.Array]]] = {}
     for name, value in values.items():
         parameter = parameters[name]
-        scene = put(scene, parameter.path, parameter.put(get(scene, parameter.path), value))
+        if parameter.is_texture:
+            textures.setdefault(parameter.path, []).append((parameter, value))
+        else:
+            scene = put(scene, parameter.path, parameter.put(get(scene, parameter.path), value))
         for path, row in parameter.means:
             # Known values as builders take them, to the last bit.
             texels = lax.stop_gradient(value) if is_traced(value) else np.asarray(value, np.float64)
             scene = put(scene, path, get(scene, path).at[row].set(texels.mean((0, 1))))
+    for path, found in textures.items():
+        scene = put(scene, path, with_textures(get(scene, path), found))
     changed: dict[tuple, list[str]] = {}
     for parameter in (parameters[name] for name in values):
         if parameter.table is not None:
