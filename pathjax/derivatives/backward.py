@@ -63,7 +63,7 @@ class Memory(NamedTuple):
     swept: Int[Array, ""]  # trips before the last sweep
     lost: Int[Array, ""]  # 1: a path was longer than the ring
     size: Int[Array, ""]  # trips that are used of the ring: few stay in near caches
-    ring: list  # of each number of a Record, (RING, W)
+    ring: list  # (trips, numbers, W) of each type: the numbers of Records; few arrays, as loops pay for each they carry
 
 
 class Sweep(NamedTuple):
@@ -93,7 +93,8 @@ def start(scene: Scene, record: Record, entries: int, ring: int, lanes: int) -> 
         )
     total = totals.start(entries, lanes, scene.camera.origin.dtype)
     # No trip is read that was not written. On CPUs it is filled with zeros all the same, so it had better be short.
-    buffers = [lax.empty((ring, lanes), x.dtype) for x in jax.eval_shape(columns_of, record)]
+    types = [x.dtype for x in jax.eval_shape(columns_of, record)]
+    buffers = [lax.empty((ring, types.count(dtype), lanes), dtype) for dtype in dict.fromkeys(types)]
     zero = jnp.int32(0)
     return Memory(total, zero, zero, zero, ring_size(scene, ring), buffers)
 
@@ -136,22 +137,32 @@ def remember(structure: Record, memory: Memory, here: Bool[Array, " W"], columns
 
 
 def _with_row(ring: list, row: Int[Array, ""], columns: list) -> list:
-    def put(buffer, x):
-        return lax.dynamic_update_slice(buffer, x[None], (row, jnp.int32(0)), allow_negative_indices=False)
+    """The ring with a trip's columns at a row, those of a type one after another."""
+    new = []
+    for buffer in ring:
+        for k, x in enumerate([x for x in columns if x.dtype == buffer.dtype]):
+            where = row, jnp.int32(k), jnp.int32(0)
+            buffer = lax.dynamic_update_slice(buffer, x[None, None], where, allow_negative_indices=False)
+        new.append(buffer)
+    return new
 
-    return list(map(put, ring, columns))
 
-
-def _row(ring: list, row: Int[Array, ""]) -> list:
-    return [lax.dynamic_index_in_dim(x, row, keepdims=False, allow_negative_indices=False) for x in ring]
+def _row(ring: list, row: Int[Array, ""], types: list) -> list:
+    """What `_with_row` put there, of columns of these types."""
+    following = {}
+    for buffer in ring:
+        columns = lax.dynamic_index_in_dim(buffer, row, keepdims=False, allow_negative_indices=False)
+        following[buffer.dtype] = iter([columns[k] for k in range(len(columns))])
+    return [next(following[dtype]) for dtype in types]
 
 
 def sweep(structure: Record, memory: Memory, due: Bool[Array, ""]) -> Memory:
     """Add what all paths give that have ended since the last sweep, if it is due."""
     window = jnp.where(due, memory.clock - memory.swept, 0)
+    types = [x.dtype for x in jax.eval_shape(columns_of, structure)]
 
     def step(state: Sweep) -> Sweep:
-        bits, *numbers = _row(memory.ring, (memory.clock - 1 - state.back) & (memory.size - 1))
+        bits, *numbers = _row(memory.ring, (memory.clock - 1 - state.back) & (memory.size - 1), types)
         record = unflattened(structure, numbers)
         begins, ends, holds = (bits & bit != 0 for bit in (BEGINS, ENDS, HOLDS))
         complete = (state.complete != 0) | ends
@@ -172,7 +183,7 @@ def sweep(structure: Record, memory: Memory, due: Bool[Array, ""]) -> Memory:
         goes_on = (back < window) | ((back < memory.size) & ~all_set(stopped))
         return Sweep(back, goes_on, complete.astype(jnp.int32), stopped.astype(jnp.int32), R, total)
 
-    nothing = jnp.zeros((memory.ring[0].shape[1],), jnp.int32)
+    nothing = jnp.zeros((memory.ring[0].shape[-1],), jnp.int32)
     zeros = [jnp.zeros(nothing.shape, structure.weight.dtype)] * 3
     first = Sweep(jnp.int32(0), window > 0, nothing, nothing, zeros, memory.total)
     last = lax.while_loop(lambda state: state.goes_on, step, first)
@@ -286,8 +297,8 @@ def pullback(
     ring,
     form=None,
     devices=None,
-) -> Float[Array, "entries 3"]:
-    """J^T adjoint: of the entries that are kept; of a number, the sum of the three is its own.
+) -> Float[Array, "entries 4"]:
+    """J^T adjoint: of the entries that are kept; of a number, the sum of the first three is its own. The last is none.
 
     Args:
         scene: without names.
@@ -303,11 +314,7 @@ def pullback(
         adjoint, work = work
         return sweep_of(work, scene, choice, adjoint, kept.place, memory)[1]
 
-    def end(memory):
-        # The sums of parts are those of three numbers.
-        return finish(structure, memory)[:, :3]
-
-    begin = partial(start, scene, structure, kept.count, ring)
+    begin, end = partial(start, scene, structure, kept.count, ring), partial(finish, structure)
     work = adjoint, (pixels, first_sample, spp, seed)
     return native_fold(of_pixel, work, scene, choice, start=begin, finish=end, form=form, devices=devices)
 

@@ -78,7 +78,7 @@ def pull(
 
     def of(parameter):
         here = kept.of(scene, parameter)
-        found = total[here.start : here.stop]
+        found = total[here.start : here.stop, :3]
         found = found if differentiated.of_colors(scene, parameter.path) else found.sum(1)
         return of_parameter(parameter, named.get(scene, parameter.path).shape, found)
 
