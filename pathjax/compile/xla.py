@@ -18,6 +18,7 @@ import warnings
 import jax
 import jaxlib
 
+from pathjax.system import memory
 from pathjax.system.cores import cores
 
 _OPTION = "xla_cpu_small_while_loop_byte_threshold"
@@ -68,6 +69,7 @@ def setup() -> None:
     Warns:
         UserWarning: the backend was started before, with the remedy.
     """
+    memory.keep_freed()
     flags = os.environ.get("XLA_FLAGS", "")
     native = os.environ.get("PATHJAX_NATIVE_LOOPS", "1") != "0"
     wanted = native and _OPTION not in flags
