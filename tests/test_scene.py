@@ -10,6 +10,7 @@ import pytest
 
 import pathjax as pj
 from pathjax.scene import build
+from pathjax.scene import parameters as named
 
 ZOO = """
 <bsdf type="diffuse" id="paint"><rgb name="reflectance" value="0.1, 0.2, 0.3"/></bsdf>
@@ -100,6 +101,47 @@ def test_every_parameter_reaches_one_entry_and_no_other(zoo):
         after = values(pj.with_parameters(zoo, {name: before[name] * 0.5 + 0.31}))
         assert [other for other in before if not np.array_equal(after[other], before[other])] == [name]
         np.testing.assert_allclose(after[name], before[name] * 0.5 + 0.31, rtol=1e-6)
+
+
+def textured(*sizes):
+    """A scene of a rectangle for each texture, of so many texels along a side."""
+    rng = np.random.default_rng(0)
+    images = {
+        f"b{k}": {"type": "bitmap", "data": rng.random((n, n, 3)).astype(np.float32), "raw": True}
+        for k, n in enumerate(sizes)
+    }
+    bsdfs = {name: {"type": "diffuse", "id": name, "reflectance": image} for name, image in images.items()}
+    shapes = {f"s{name}": {"type": "rectangle", "bsdf": {"type": "ref", "id": name}} for name in bsdfs}
+    rest = {"type": "scene", "sensor": {"type": "perspective"}, "sky": {"type": "constant"}}
+    return pj.load_dict(rest | bsdfs | shapes)
+
+
+@pytest.mark.parametrize("names", [["b1"], ["b2", "b0"], ["b2", "b0", "b1"]])
+def test_textures_that_are_set_together_are_those_set_one_after_another(names):
+    scene = textured(2, 3, 1)
+    names = [f"{name}.reflectance" for name in names]
+    new = {name: jnp.sqrt(pj.parameters(scene)[name]) for name in names}
+    together, alone = pj.with_parameters(scene, new), scene
+    for name in names:
+        alone = pj.with_parameters(alone, {name: new[name]})
+    for a, b in zip(arrays(together), arrays(alone), strict=True):
+        np.testing.assert_array_equal(a, b)
+    for name, value in values(together).items():
+        np.testing.assert_array_equal(value, new[name] if name in new else values(scene)[name])
+
+
+def test_what_textures_replace_is_not_read():
+    """They may be most of a scene, and what a jitted function reads of a scene is copied to each device."""
+    scene = textured(2, 3)
+    path = scene.described.parameters["b0.reflectance"].path
+
+    def with_all(texels, new):
+        return jax.tree.leaves(pj.with_parameters(named.put(scene, path, texels), new))
+
+    new = {name: x for name, x in pj.parameters(scene).items() if name.startswith("b")}
+    program = jax.make_jaxpr(with_all)(named.get(scene, path), new).jaxpr
+    read = {id(v) for eqn in program.eqns for v in eqn.invars} | {id(v) for v in program.outvars}
+    assert id(program.invars[0]) not in read
 
 
 def test_with_parameters_leaves_the_scene_as_it_was(zoo):
