@@ -1,7 +1,5 @@
 """JAX's debug flags, by which users look for bugs of their own, find nothing in healthy scenes."""
 
-from contextlib import contextmanager
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,28 +8,31 @@ import pytest
 import pathjax as pj
 from pathjax import transport
 
-
-@contextmanager
-def strict_promotion():
-    with jax.numpy_dtype_promotion("strict"), jax.numpy_rank_promotion("raise"):
-        yield
-
-
-FLAGS = {"debug_nans": lambda: jax.debug_nans(True), "strict_promotion": strict_promotion}
 SLOW = pytest.mark.slow
 # Boxes and rectangles; triangles in a tree, whose leaves have empty lanes; a sphere and glass, of which the derivatives
 # are quick; the rest.
 SCENES = ["cornell_box", "mesh", *(pytest.param(n, marks=SLOW) for n in ("glass_ball", "textures", "conductors"))]
 
 
-@pytest.fixture(params=FLAGS)
-def flag(request):
-    with FLAGS[request.param]():
-        yield request.param
+@pytest.fixture(autouse=True)
+def flags():
+    """All at once, as each raises an error of its own: while an array is computed, or while a program is traced."""
+    with jax.debug_nans(True), jax.numpy_dtype_promotion("strict"), jax.numpy_rank_promotion("raise"):
+        yield
+
+
+def test_each_flag_finds_its_fault():
+    for fault, error, words in (
+        (lambda: jnp.zeros(3) / 0, FloatingPointError, "nan"),
+        (lambda: jnp.ones(3, jnp.int32) + jnp.ones(3), ValueError, "dtype promotion"),
+        (lambda: jnp.ones((2, 3)) + jnp.ones(3), ValueError, "rank_promotion"),
+    ):
+        with pytest.raises(error, match=words):
+            fault()
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_scenes_load_and_render(flag, shipped, name):
+def test_scenes_load_and_render(shipped, name):
     scene = shipped(name, res=16)  # of which other tests have the kernel
     scene = pj.with_parameters(scene, pj.parameters(scene))
     assert np.isfinite(pj.render(scene, 2)).all()
@@ -39,7 +40,7 @@ def test_scenes_load_and_render(flag, shipped, name):
     assert pj.closest_hit(scene, np.zeros((1, 3)), np.ones((1, 3))).t.shape == (1,)
 
 
-def test_images_with_errors_and_terms_of_the_series(flag, shipped):
+def test_images_with_errors_and_terms_of_the_series(shipped):
     """A single sample a pixel, which has no standard error, is said to have nan, and no flag takes that for a fault."""
     scene = shipped("cornell_box", res=8)
     assert pj.render_until(scene, spp=5).reason
@@ -47,7 +48,7 @@ def test_images_with_errors_and_terms_of_the_series(flag, shipped):
     assert np.isfinite(pj.render_bounces(scene, depth=2, spp=8).standard_error).all()
 
 
-def test_derivatives(flag, shipped):
+def test_derivatives(shipped):
     scene = shipped("glass_ball", res=8)
     names = ["pattern.color0", "glass.int_ior"]
     values = {name: pj.parameters(scene)[name] for name in names}
@@ -62,7 +63,7 @@ def test_derivatives(flag, shipped):
 
 
 @pytest.mark.slow
-def test_fits_and_checks_of_gradients(flag, shipped):
+def test_fits_and_checks_of_gradients(shipped):
     scene = shipped("cornell_box", res=8)
     name = "white.reflectance"
     target = pj.render(scene, 64, seed=5)
@@ -71,7 +72,7 @@ def test_fits_and_checks_of_gradients(flag, shipped):
     assert pj.check_gradient(scene, name, spp=8)
 
 
-def test_light_on_patches(flag, shipped):
+def test_light_on_patches(shipped):
     scene = shipped("cornell_box", res=8)
     op = transport.operator(scene, patches=30)
     assert np.isfinite(op.solve().L).all() and np.isfinite(op.terms(3)).all()
