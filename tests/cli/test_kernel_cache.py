@@ -8,8 +8,11 @@ import trimesh
 
 from pathjax.images import read_exr
 
-FURNACE = "scenes/furnace.xml"
-SMALL = ("-D", "res=8")
+# A scene of what XLA compiles soonest, with edges in view, so that its images have noise.
+SCENE = """<scene version="3.0.0"><sensor type="perspective"><transform name="to_world">
+    <lookat origin="0,1,4" target="0,0,0" up="0,1,0"/></transform><film type="hdrfilm"><rfilter type="box"/>
+    <integer name="width" value="8"/><integer name="height" value="8"/></film></sensor>
+    <emitter type="constant"/>{}</scene>"""
 PIPES = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
 # A byte that no UTF-8 holds, as Python has it in arguments and names of files.
 BYTE = "\udcff"
@@ -33,13 +36,14 @@ sys.exit(status)
 
 @pytest.fixture
 def counted(root, environment, tmp_path):
-    """(*options, scene, **environment) -> a process that renders the furnace, or a scene, to a file, and that file."""
+    """(*options, scene, **environment) -> a process that renders a plate, or a scene, to a file, and that file."""
     numbers = iter(range(100))
+    plate = tmp_path / "plate.xml"
+    plate.write_text(SCENE.format('<shape type="rectangle"/>'))
 
     def start(*more, scene=None, **variables):
         output = tmp_path / f"{next(numbers)}.exr"
-        given = (FURNACE, *SMALL) if scene is None else (scene,)
-        arguments = ("render", *given, "-o", output, "--spp", 4, *more)
+        arguments = ("render", scene or plate, "-o", output, "--spp", 4, *more)
         command = [sys.executable, "-c", COUNTED, *map(str, arguments)]
         plain = {name: value for name, value in environment.items() if not name.startswith(("JAX_", "PATHJAX_"))}
         variables = {name: str(value) for name, value in variables.items()}
@@ -70,16 +74,12 @@ linux = pytest.mark.skipif(sys.platform != "linux", reason="kernels are kept on 
 @linux
 def test_scenes_of_one_structure_find_the_kernel_of_another(counted, tmp_path):
     """With other numbers of triangles and bsdfs."""
-    scene = """<scene version="3.0.0"><sensor type="perspective"><transform name="to_world">
-        <lookat origin="0,1,4" target="0,0,0" up="0,1,0"/></transform><film type="hdrfilm"><rfilter type="box"/>
-        <integer name="width" value="8"/><integer name="height" value="8"/></film></sensor>
-        <emitter type="constant"/>{}</scene>"""
     thing = '<shape type="ply"><string name="filename" value="{}.ply"/><bsdf type="diffuse"/></shape>'
     told = []
     for place, count in enumerate((3, 4)):
         trimesh.creation.icosphere(subdivisions=count).export(tmp_path / f"{count}.ply")
         file = tmp_path / f"{place}.xml"
-        file.write_text(scene.format(thing.format(count) * count))
+        file.write_text(SCENE.format(thing.format(count) * count))
         wanted, found, traced, _ = end(counted(scene=file, XDG_CACHE_HOME=tmp_path / "cache"))
         told.append((wanted > found, traced))
     assert told == [(True, 1), (False, 0)]
