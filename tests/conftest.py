@@ -226,6 +226,24 @@ def jacobian_kernel_of(shipped):
     return compile
 
 
+@pytest.fixture(scope="session")
+def native_kernels():
+    """(lowered or compiled program) -> how many compiled loops its entry computation calls; it dispatches none itself.
+
+    What is lowered is compiled without LLVM's optimisation: that comes after what XLA tells of here, and takes long.
+    """
+
+    def count(program):
+        if isinstance(program, jax.stages.Lowered):
+            program = program.compile(compiler_options={"xla_backend_optimization_level": 0})
+        text = program.as_text()
+        entry = text[text.index("\nENTRY ") :]
+        assert " while(" not in entry
+        return entry.count("xla_cpu_small_call")
+
+    return count
+
+
 # ---- statistics -----------------------------------------------------------------------------------------------------
 
 

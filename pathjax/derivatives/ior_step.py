@@ -29,14 +29,17 @@ _PILOTS, _PILOT_DEPTH = 1024, 12
 
 def steps(scene: Scene, rows: tuple[int, ...], step: float | Float[Array, ""] | None) -> Float[Array, " G"]:
     """Steps of the relative IOR of some dielectrics; `step`, if that is not None."""
-    dtype = scene.camera.origin.dtype
     if not rows:
-        return jnp.zeros((0,), dtype)
-    rows = jnp.asarray(rows, jnp.int32)
+        return jnp.asarray(np.zeros(0, scene.camera.origin.dtype))
+    return _steps(scene, np.array(rows, np.int32), step)
+
+
+@jax.jit
+def _steps(scene, rows, step):
     ratio = dielectric.relative_ior(ior.table(scene))[rows]
     if step is not None:
         # Twice the step must leave a positive IOR.
-        return jnp.minimum(jnp.asarray(step, dtype), 0.4 * ratio)
+        return jnp.minimum(jnp.asarray(step, ratio.dtype), 0.4 * ratio)
     motion = motions(scene, rows)
     wished = STEP_PIXELS / jnp.where(motion > 0, motion, 1)
     # Glass that no pilot saw (small, or met after a diffuse bounce) gets a step in the middle of the range.

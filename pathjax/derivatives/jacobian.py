@@ -197,13 +197,23 @@ def pixel_jacobians(
     derivatives, biases, used = {}, {}, {}
     for name, parameter in wanted.items():
         if name in colors:
-            slope = by_color[:, colors.index(name)]
-            derivatives[name] = tangents.by_channel(slope) if parameter.shape else slope
+            derivatives[name] = _slope(by_color, colors.index(name), bool(parameter.shape))
         else:
             place, scale = glass.index(parameter.index[0]), ior.ratio_by(scene, parameter)
-            derivatives[name], biases[name] = by_ior[:, place] * scale, bias[:, place] * scale
-            used[name] = steps[place]
+            derivatives[name], biases[name], used[name] = _of_glass(by_ior, bias, steps, place, scale)
     return image, derivatives, biases, used
+
+
+# One program for each of these, where JAX would compile one for each operation.
+@partial(jax.jit, static_argnums=2)
+def _slope(by_color, place, of_channels):
+    slope = by_color[:, place]
+    return tangents.by_channel(slope) if of_channels else slope
+
+
+@jax.jit
+def _of_glass(by_ior, bias, steps, place, scale):
+    return by_ior[:, place] * scale, bias[:, place] * scale, steps[place]
 
 
 def takes_sweep(scene: Scene, parameters, options: Options, form: str | None = None, devices: int | None = None):

@@ -6,6 +6,7 @@ import itertools
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -118,9 +119,7 @@ class ParameterVector:
         """Unbounded (n,) to values: logistic between two bounds; above one, exponential where small, else linear."""
         (low, high), two = self._limits
         width = jnp.asarray(np.where(two, high - low, 1), x.dtype)
-        beyond = jnp.where(two, width * jax.nn.sigmoid(x), jax.nn.softplus(jnp.where(two, 0, x)))
-        y = jnp.asarray(low, x.dtype) + beyond
-        return jnp.where(self._logarithmic, jnp.exp(jnp.where(self._logarithmic, y, 0)), y)
+        return _bounded(x, jnp.asarray(low, x.dtype), width, two, self._logarithmic)
 
     def unbounded(self, values) -> np.ndarray:
         """Inverse of `bounded`; values at a bound are taken a little inside."""
@@ -137,6 +136,13 @@ class ParameterVector:
         origin = np.where(self._logarithmic, 0, np.maximum(low, 0))
         least = np.where(self._logarithmic, low, _EDGE)
         return np.where(ranges, high - low, np.maximum(np.abs(values - origin), least))
+
+
+@partial(jax.jit, inline=True)
+def _bounded(x, low, width, two, logarithmic):
+    beyond = jnp.where(two, width * jax.nn.sigmoid(x), jax.nn.softplus(jnp.where(two, 0, x)))
+    y = low + beyond
+    return jnp.where(logarithmic, jnp.exp(jnp.where(logarithmic, y, 0)), y)
 
 
 def _is_color(parameter: Parameter) -> bool:

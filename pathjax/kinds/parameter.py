@@ -77,7 +77,7 @@ class Parameter:
     def put(self, values: Shaped[Array, "R ..."], value: Shaped[Array, "..."]) -> Shaped[Array, "R ..."]:
         """The array with another value of the parameter; a number stands for all channels of a texel."""
         if not self.is_texture:
-            return values.at[self.index].set(value)
+            return _with_entry(values, self.index, value)
         return with_textures(values, [(self, value)])
 
     def of_rows(self, values: Shaped[Array, "R ..."], value: Shaped[Array, "..."]) -> Shaped[Array, "rows ..."]:
@@ -112,6 +112,11 @@ def with_textures(
     for first, rows in new:
         values = values.at[first : first + len(rows)].set(rows)
     return values
+
+
+@functools.partial(jax.jit, inline=True)  # one program, where JAX would compile one for each of its operations
+def _with_entry(values, index, value):
+    return values.at[index].set(value)
 
 
 @dataclass(frozen=True, eq=False)

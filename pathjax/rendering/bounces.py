@@ -129,9 +129,9 @@ def _check_depth(depth) -> None:
 
 def _bounces(scene, depth, pixels, samples, seed, options, errors) -> Bounces:
     """samples: (H, W); pixels: as many, or all of a film that shares samples."""
-    shares = replicates.shares(samples.ravel()) if errors else samples.reshape(1, -1)
+    shares = _shares(samples) if errors else samples.reshape(1, -1)
     seeds = replicates.seeds(seed) if errors else jnp.asarray(seed, jnp.uint32)[None]
-    most = None if is_traced(shares) else int(shares.max())
+    most = None if is_traced(shares) else int(np.asarray(shares).max())
     estimator = _TermSums(depth, replace(options, by_vertex=True))
     scene = on_all_devices(replace(scene, max_depth=jnp.int32(depth)))
     if most is None or most <= _PORTION:
@@ -143,6 +143,11 @@ def _bounces(scene, depth, pixels, samples, seed, options, errors) -> Bounces:
             sums = sums + rules.estimate(estimator, scene, pixels, first, portion, seeds)
     own = scene.film if options.shared else film.with_own_samples(scene.film)
     return Bounces(*_moments(sums, shares, shape=samples.shape), samples, film.correlation(own))
+
+
+@jax.jit
+def _shares(samples):
+    return replicates.shares(samples.ravel())
 
 
 @partial(jax.jit, static_argnames="shape")

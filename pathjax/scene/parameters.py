@@ -100,7 +100,10 @@ def checked(name, value, parameter: Parameter, dtype):
     """The value as an array of the parameter's shape; values that are known must lie within its bounds."""
     given = value
     try:
-        value = jnp.broadcast_to(jnp.asarray(given, dtype), parameter.shape)
+        # Of what is no array of JAX's yet, NumPy compiles nothing.
+        own = isinstance(given, jax.Array) or is_traced(given)
+        value = given if own else np.broadcast_to(np.asarray(given, dtype), parameter.shape)
+        value = jnp.broadcast_to(jnp.asarray(value, dtype), parameter.shape)
     except (TypeError, ValueError):
         if parameter.is_texture:
             given = " x ".join(map(str, np.shape(given)))

@@ -22,8 +22,13 @@ _BLOCK = 1 << 13
 
 def seeds(seed) -> np.ndarray | jax.Array:
     """(COUNT,) uint32 seeds of the replicates of a seed; a JAX array within `jax.jit`."""
-    seeds = sampler.combine(jnp.arange(COUNT, dtype=jnp.uint32), jnp.uint32(seed))
+    seeds = _seeds(jnp.uint32(seed))
     return seeds if is_traced(seeds) else np.asarray(seeds)
+
+
+@jax.jit
+def _seeds(seed):
+    return sampler.combine(jnp.arange(COUNT, dtype=jnp.uint32), seed)
 
 
 def shares(count: np.ndarray | jax.Array) -> np.ndarray | jax.Array:
