@@ -59,16 +59,17 @@ def test_terms_add_up_to_the_render_of_the_same_seed(shipped, name):
     assert one.terms.shape == one.variance.shape == (DEPTH, 16, 16, 3)
     np.testing.assert_allclose(one.terms.sum(0), pj.render(scene, 13, 3), **SUMS)
     assert np.isnan(one.variance).all()
-    four = pj.render_bounces(scene, DEPTH, 13, 3)
+    scene = shipped(name, res=64)  # the manual's, with its kernels
+    four = pj.render_bounces(scene, 8, 13, 3)
     np.testing.assert_allclose(four.terms.sum(0), pj.render_until(scene, spp=13, seed=3).image, **SUMS)
     assert np.isfinite(four.standard_error).all()
 
 
 def test_terms_of_an_adaptive_render_add_up_to_it(shipped):
-    scene = with_depth(shipped("cornell_box", res=16), DEPTH)
+    scene = shipped("cornell_box", res=64)
     result = pj.render_until(scene, 0.1, seed=2)
     assert len(np.unique(result.samples)) > 1
-    terms = pj.render_bounces(scene, DEPTH, result.samples, 2).terms
+    terms = pj.render_bounces(scene, 8, result.samples, 2).terms
     np.testing.assert_allclose(terms.sum(0), result.image, **SUMS)
 
 

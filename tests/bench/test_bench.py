@@ -18,7 +18,7 @@ from pathjax.images import rel_mse
 
 ROOT = Path(__file__).resolve().parents[2]
 CORNELL, FURNACE = (str(ROOT / "scenes" / f"{name}.xml") for name in ("cornell_box", "furnace"))
-SMALL = ["-D", "res=8", "--spp", "2,32", "--reference-spp", "512", "--repeat", "2"]
+SMALL = ["-D", "res=16", "--spp", "2,32", "--reference-spp", "512", "--repeat", "2"]
 
 needs_mitsuba = pytest.mark.skipif(not importlib.util.find_spec("mitsuba"), reason="Mitsuba is not installed")
 needs_matplotlib = pytest.mark.skipif(not importlib.util.find_spec("matplotlib"), reason="no matplotlib")
@@ -54,7 +54,7 @@ def test_speed_against_error(folder, scene):
     assert 3 * many["rel_mse"] < few["rel_mse"]
     for row in (few, many):
         assert row["efficiency"] == pytest.approx(1 / (row["rel_mse"] * row["run_seconds"]))
-        assert row["mpaths_per_second"] == pytest.approx(64 * row["spp"] / row["run_seconds"] / 1e6)
+        assert row["mpaths_per_second"] == pytest.approx(256 * row["spp"] / row["run_seconds"] / 1e6)
         assert row["rel_mse"] == pytest.approx(row["rel_mse_to_reference"] - scene["reference_rel_mse"])
     assert scene["slopes"]["pathjax"]["spp"] < -0.3
     assert scene["mitsuba"] == [] and scene["failures"] == []
@@ -75,7 +75,7 @@ def test_sampler_beside_independent_numbers(scene):
         assert row["independent_rel_mse"] == pytest.approx(sampler["single_rel_mse"] / row["spp"])
         assert row["ratio"] == pytest.approx(row["independent_rel_mse"] / row["rel_mse"])
     # The mean of images of one sample has the error that the table says.
-    small = pathjax.load_scene(CORNELL, res=8)
+    small = pathjax.load_scene(CORNELL, res=16)
     truth = pathjax.render(small, 4096, 1 << 10)
     singles = np.stack([pathjax.render(small, 1, 2000 + k) for k in range(512)])
     means = singles.reshape(16, 32, *singles.shape[1:]).mean(1)
@@ -223,7 +223,7 @@ def test_names_that_are_not_utf8(measured, tmp_path):
     shutil.copy(FURNACE, scene)
     measured(None)
     run(str(scene), "-o", str(tmp_path / "r\udcff"))
-    assert r"s\udcff.xml, 8 x 8" in (tmp_path / "r\udcff" / "bench.md").read_text(encoding="utf-8")
+    assert r"s\udcff.xml, 16 x 16" in (tmp_path / "r\udcff" / "bench.md").read_text(encoding="utf-8")
 
 
 def test_a_folder_without_parent_is_refused(tmp_path, capsys):
@@ -246,7 +246,7 @@ def test_a_missing_peer_is_told_before_anything_is_measured(capsys, monkeypatch)
 
 def test_the_best_sampler_is_named_and_one_that_fails_is_told(tmp_path, capsys, monkeypatch):
     """A peer that renders as pathjax does, with one sampler in no time and another not at all."""
-    scene = pathjax.load_scene(FURNACE, res=8)
+    scene = pathjax.load_scene(FURNACE, res=16)
 
     def call(peer, request):
         runs, images = [], {}
