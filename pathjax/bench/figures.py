@@ -51,9 +51,9 @@ class Reference(NamedTuple):
 def moments(images) -> tuple[np.ndarray, np.ndarray, int]:
     """Mean, estimated variance of that mean (0 of one image), and count of images; Welford's, one in memory."""
     count, mean, squares = 0, 0.0, 0.0
-    for image in images:
+    for image in (np.asarray(image, float) for image in images):
         count += 1
-        change = np.asarray(image, float) - mean
+        change = image - mean
         mean = mean + change / count
         squares = squares + change * (image - mean)
     return mean, squares / max(count - 1, 1) / count, count
@@ -94,7 +94,7 @@ def row(asked_spp: int, spp: int, seconds, errors, noise: float, paths: int, cpu
 
 def deviation(image, exact) -> dict:
     """How images differ from exact ones: relMSE, and the largest |I - E| / sqrt(E^2 + 0.01)."""
-    exact = np.asarray(exact, float)
+    image, exact = np.asarray(image, float), np.asarray(exact, float)
     relative = np.abs(image - exact) / np.sqrt(exact**2 + RELATIVE_FLOOR)
     return {"rel_mse": rel_mse(image, exact), "largest_deviation": float(relative.max())}
 

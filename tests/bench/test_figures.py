@@ -2,6 +2,7 @@
 
 import math
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -39,6 +40,15 @@ def test_the_error_of_the_reference_is_known_and_subtracted():
     assert row["efficiency"] == pytest.approx(1 / (row["rel_mse"] * 2))
     assert not row["reference_too_noisy"]
     assert figures.row(4, 4, [1], [1.5 * reference.noise], reference.noise, 4096)["reference_too_noisy"]
+
+
+def test_moments_of_renders_have_the_digits_of_float64():
+    """Images that differ by two ulps of float32, as of a scene of little noise."""
+    images = [jnp.full((2, 2, 3), 1 + k * 2**-23, jnp.float32) for k in (0, 1, 2)]
+    mean, variance, count = figures.moments(images)
+    assert mean.dtype == variance.dtype == np.float64 and count == 3
+    np.testing.assert_allclose(variance, 2.0**-46 / 3, rtol=1e-6)
+    assert figures.deviation(images[1], np.ones((2, 2, 3)))["largest_deviation"] == pytest.approx(2**-23 / 1.01**0.5)
 
 
 def test_what_is_not_known_is_told_as_such():

@@ -28,6 +28,7 @@ N = 60_000
 ROUNDING = 2e-5
 RADIANCE = np.array([3.0, 2.0, 1.0])
 GREY = Diffuse.instance("grey")
+choice_of = jax.jit(emitters.choice, static_argnums=1)  # as in kernels, and one program
 
 
 def affine(linear, translation):
@@ -143,14 +144,14 @@ def _sample(scene, choice, refs, u, u_part):
 def sampled_primitives(scene, ref, strategy="mis"):
     """Primitives of N samples of the lights from one point."""
     refs = jnp.broadcast_to(jnp.asarray(ref, jnp.float32), (N, 3))
-    choice = emitters.choice(scene.emitters, strategy)
+    choice = choice_of(scene.emitters, strategy)
     return np.asarray(_sample(replace(scene, about=None), choice, refs, *uniform(N, 1)).primitive)
 
 
 def sample_and_trace(scene, refs, strategy="mis"):
     """N samples of the lights, shared out in blocks to `refs` (K, 3), and what a ray along each finds."""
     refs = jnp.asarray(np.repeat(refs, N // len(refs), 0), jnp.float32)
-    choice = emitters.choice(scene.emitters, strategy)
+    choice = choice_of(scene.emitters, strategy)
     # Without its names: scenes of one structure then share a kernel, which saves most of the time of these tests.
     out = _sample_and_trace(replace(scene, about=None), choice, refs, *uniform(len(refs), 1))
     return jax.tree.map(lambda x: np.asarray(x, np.float64) if x.dtype == jnp.float32 else np.asarray(x), out)
@@ -264,7 +265,7 @@ def test_distant_sphere_keeps_its_solid_angle():
 
 def test_a_light_of_no_power_is_harmless():
     scene = scene_of(shape(Rectangle(PLACED), radiance=np.zeros(3)), shape(BALL, radiance=np.zeros(3), name="b"))
-    choice = emitters.choice(scene.emitters, "mis")
+    choice = choice_of(scene.emitters, "mis")
     np.testing.assert_allclose(choice.pdf, 0.5)
     drawn, _, Le, pdf = sample_and_trace(scene, FRONT)
     assert np.isfinite(drawn.pdf).all() and not drawn.Le.any() and np.isfinite(pdf).all()
@@ -285,7 +286,7 @@ def test_lights_are_chosen_by_power(strategy):
         shape(Disk(SHEARED), np.array([0.01, 0.02, 0.03]), name="disk"),
     ]
     scene = scene_of(*shapes, background=np.ones(3))
-    choice = emitters.choice(scene.emitters, strategy)
+    choice = choice_of(scene.emitters, strategy)
     areas = [4 * 0.15, np.pi, trimesh.Trimesh(*mesh_arrays(shapes[2].geometry)).area]
     sheared = np.cross(*SHEARED[:3, :2].T)
     areas.append(np.pi * np.linalg.norm(sheared))
@@ -345,8 +346,8 @@ def test_lights_are_sampled_by_their_weights(make_scene):
       <emitter type="area">{}</emitter></shape>"""
     weight = '<float name="sampling_weight" value="{}"/>'
     scene = make_scene(lamp.format(0, weight.format(3)) + lamp.format(3, "") + lamp.format(6, weight.format(0)))
-    np.testing.assert_allclose(emitters.choice(scene.emitters, "mis").pdf, [3 / 4, 1 / 4, 0], rtol=1e-6)
-    np.testing.assert_allclose(emitters.choice(scene.emitters, "light").pdf, [1 / 3] * 3, rtol=1e-6)
+    np.testing.assert_allclose(choice_of(scene.emitters, "mis").pdf, [3 / 4, 1 / 4, 0], rtol=1e-6)
+    np.testing.assert_allclose(choice_of(scene.emitters, "light").pdf, [1 / 3] * 3, rtol=1e-6)
     plain = make_scene(lamp.format(0, "") + lamp.format(3, ""))
     assert plain.emitters[0].table.column("sampling_weight") is None
     for kind in ("point", "spot", "projector", "directional"):
