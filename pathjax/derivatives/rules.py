@@ -80,6 +80,7 @@ def _estimate_jvp(static, primals, tangents):
     named.refuse_constant(scene, wanted)
     free = {name: wanted.pop(name) for name in sorted(estimator.matrix_free(scene, wanted))}
     if free:
+        # Not attached, which would copy texels.
         scene, _ = differentiated_once((scene, varied), "an image in a texture, or in many colours,")
     else:
         # Attached, for derivatives of the derivative.

@@ -162,6 +162,7 @@ def sums(
         devices: of `native_map`; of the same rows, sums are bitwise the same for every number of them.
     """
     by_name, by_column = vector.unpack(values), vector.by_column(scale)
+    groups = [views.placed(by_name) for views in groups]
     count = min(GROUPS, *(len(_blocks(*views.targets.shape[1:3], side)) for views in groups))
     parts, first = [], 0
     for views in groups:
@@ -192,7 +193,7 @@ def _rows(numbers, vector, devices, pixels, there):
     counts = jnp.where(there, spp, 1)
 
     def of_view(scene, seed):
-        scene = named.attached(views.with_values(scene, by_name))
+        scene = views.with_values(scene, by_name)
         wanted = {name: named.find(scene, name) for name in views.names}
         work = wanted, pixels, 0, counts, seed, Options()
         image, J, *_ = pixel_jacobians(named.nameless(scene), *work, devices=devices)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -61,8 +62,33 @@ class Views:
         """The fitted parameters that these views hold."""
         return {name: named.find(self.scene, name) for name in self.names}
 
+    def placed(self, values) -> Views:
+        """The views with the values of textures in their arrays, for `with_values`.
+
+        A kernel that put them there would copy, each time that it runs, the texels of all textures of the scene.
+        """
+        scene, axes = self.scene, jax.tree.unflatten(jax.tree.structure(self.scene), self.axes)
+        for name, parameter in self.wanted.items():
+            if parameter.is_texture:
+                stacked = named.get(axes, parameter.path) == 0
+                array = _put(named.get(scene, parameter.path), values[name], parameter, stacked)
+                scene = named.put(scene, parameter.path, array)
+        return replace(self, scene=scene)
+
     def with_values(self, scene: Scene, values) -> Scene:
-        return named.with_parameters(scene, {name: values[name] for name in self.names})
+        """A scene of `map` with the values of parameters, of textures those that are `placed`."""
+        textures = {name: values[name] for name, parameter in self.wanted.items() if parameter.is_texture}
+        scene = named.with_parameters(scene, {name: values[name] for name in self.names if name not in textures})
+        known = {name: lax.stop_gradient(value) for name, value in textures.items()}
+        scene = named.with_values(scene, known, self.wanted, placed=True)
+        return replace(scene, varied=scene.varied | textures)
+
+
+@partial(jax.jit, static_argnums=(2, 3))
+def _put(array, value, parameter: Parameter, stacked: bool):
+    """An array where a texture stands, or those of all views, with another value of it."""
+    put = partial(parameter.put, value=value)
+    return jax.vmap(put)(array) if stacked else put(array)
 
 
 @dataclass(frozen=True)

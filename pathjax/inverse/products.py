@@ -7,6 +7,7 @@ Each evaluation is one kernel for a part of the pixels, so that a fit compiles f
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
@@ -14,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pathjax.compile import devices_of_a_call
+from pathjax.compile import devices_of_a_call, on_all_devices
 from pathjax.derivatives import backward
 from pathjax.derivatives.kept import kept as kept_of
 from pathjax.derivatives.kept import of_parameter
@@ -51,15 +52,16 @@ class Products:
         self.problem, self.vector, self.seed = problem, problem.vector, jnp.uint32(seed)
         self.dtype = problem.groups[0].targets.dtype
         self.compile_seconds, self.draws = 0.0, 0
+        self.placed: tuple[np.ndarray, list[Views]] | None = None  # values, and the groups that hold them
         self.keep([np.ones(t.image.shape[:2], bool) for t in problem.targets])
 
     def keep(self, masks: list[np.ndarray]) -> None:
         """Evaluate from now on the pixels (H, W) bool of each view."""
         self.masks = masks
-        self.parts: list[tuple[Views, jax.Array, np.ndarray]] = []  # group, pixels (V, part), where they are in (N,)
+        self.parts: list[tuple[int, jax.Array, np.ndarray]] = []  # group, pixels (V, part), where they are in (N,)
         first = np.cumsum([0, *(int(mask.sum()) for mask in masks)])
         self.count = int(first[-1])
-        for views in self.problem.groups:
+        for group, views in enumerate(self.problem.groups):
             own = [np.flatnonzero(masks[number].ravel()) for number in views.numbers]
             part = min(max(masks[views.numbers[0]].size // PARTS, LEAST_PART), masks[views.numbers[0]].size)
             for begin in range(0, max(map(len, own), default=0), part):
@@ -69,7 +71,7 @@ class Products:
                     here = mine[begin : begin + part]
                     pixels[row, : len(here)] = here
                     places[row, : len(here)] = first[number] + begin + np.arange(len(here))
-                self.parts.append((views, jnp.asarray(pixels), places))
+                self.parts.append((group, jnp.asarray(pixels), places))
 
     def next_draw(self) -> jax.Array:
         """A number for renders that are independent of all before."""
@@ -79,25 +81,25 @@ class Products:
     def images(self, values: np.ndarray, spp: int, draw) -> np.ndarray:
         """(N, 3), exposed."""
         found = np.zeros((self.count + 1, 3))
-        for views, pixels, places in self.parts:
-            found[places] = self._run(_image, values, views, pixels, spp, draw)
+        for group, pixels, places in self.parts:
+            found[places] = self._run(_image, values, group, pixels, spp, draw)
         return found[:-1]
 
     def push(self, values: np.ndarray, change: np.ndarray, spp: int, draw) -> np.ndarray:
         """J change: (n,) -> (N, 3)."""
         found = np.zeros((self.count + 1, 3))
         change = jnp.asarray(change, self.dtype)
-        for views, pixels, places in self.parts:
-            found[places] = self._run(_push, values, views, pixels, spp, draw, change)
+        for group, pixels, places in self.parts:
+            found[places] = self._run(_push, values, group, pixels, spp, draw, change)
         return found[:-1]
 
     def pull(self, values: np.ndarray, adjoint: np.ndarray, spp: int, draw) -> np.ndarray:
         """J^T adjoint: (N, 3) -> (n,)."""
         padded = np.concatenate([adjoint, np.zeros((1, 3))])
         total = np.zeros(len(values))
-        for views, pixels, places in self.parts:
+        for group, pixels, places in self.parts:
             mine = jnp.asarray(padded[places], self.dtype)
-            total += self._run(_pull, values, views, pixels, spp, draw, mine)
+            total += self._run(_pull, values, group, pixels, spp, draw, mine)
         return total
 
     @property
@@ -111,7 +113,7 @@ class Products:
 
         All parameters are colours, Q in all, and light keeps its channel: J[c] is that of channel c in channel c.
         """
-        for views, pixels, places in self.parts:
+        for group, pixels, places in self.parts:
             most = max(self.most_rows // len(pixels), 1)
             each = -(-pixels.shape[1] // -(-pixels.shape[1] // most))
             for first in range(0, pixels.shape[1], each):
@@ -119,7 +121,7 @@ class Products:
                 here = places[:, begin : begin + each]
                 new = here < self.count
                 new[:, : first - begin] = False
-                calls = [self._call(_rows, values, views, pixels[:, begin : begin + each], spp, d) for d in draws]
+                calls = [self._call(_rows, values, group, pixels[:, begin : begin + each], spp, d) for d in draws]
                 yield RowsPart(here[new], new, calls)
 
     def spread(self, kept: np.ndarray) -> list[np.ndarray]:
@@ -139,9 +141,18 @@ class Products:
     def _run(self, *call):
         return self._call(*call)()
 
-    def _call(self, function: Callable, values, views: Views, pixels, spp: int, draw, *more) -> Callable:
+    def _at(self, values: np.ndarray) -> list[Views]:
+        """The groups with these values in them, as kernels of all devices take them."""
+        if self.placed is None or not np.array_equal(values, self.placed[0]):
+            self.placed = None  # memory for one at a time
+            by_name = self.vector.unpack(jnp.asarray(values, self.dtype))
+            groups = [views.placed(by_name) for views in self.problem.groups]
+            self.placed = values.copy(), [replace(views, scene=on_all_devices(views.scene)) for views in groups]
+        return self.placed[1]
+
+    def _call(self, function: Callable, values, group: int, pixels, spp: int, draw, *more) -> Callable:
         """Compile, in the thread that asks for it, and return what runs the kernel, in any."""
-        values = jnp.asarray(values, self.dtype)
+        views, values = self._at(values)[group], jnp.asarray(values, self.dtype)
         arguments = values, views, pixels, jnp.uint32(spp), views.seeds(self.seed, draw, 0), *more
         bound = partial(function, vector=self.vector)
         program, seconds = compiled((function, self.vector), lambda *a: jax.jit(bound).lower(*a).compile(), *arguments)
@@ -174,7 +185,7 @@ def _rows(values, views, pixels, spp, seeds, vector):
 
     def one(scene, work):
         seed, pixels = work
-        scene = named.nameless(named.attached(views.with_values(scene, by_name)))
+        scene = named.nameless(views.with_values(scene, by_name))
         kept = kept_of(scene, views.wanted.values())
         how = dict(kept=kept, options=options, ring=backward.longest_ring(scene))
         numbers = pixel.numbers(pixels, 0, spp, seed)

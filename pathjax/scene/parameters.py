@@ -50,12 +50,19 @@ def attached(scene: Scene) -> Scene:
     return with_values(scene, scene.varied, scene.described.parameters) if scene.varied else scene
 
 
-def with_values(scene: Scene, values: Mapping[str, jax.Array], parameters: Mapping[str, Parameter]) -> Scene:
-    """The scene with values of parameters in its tables, unchecked."""
+def with_values(
+    scene: Scene, values: Mapping[str, jax.Array], parameters: Mapping[str, Parameter], placed: bool = False
+) -> Scene:
+    """The scene with values of parameters in its tables, unchecked.
+
+    placed: the arrays hold the values already, and only what follows from them is set.
+    """
     textures: dict[tuple, list[tuple[Parameter, jax.Array]]] = {}
     for name, value in values.items():
         parameter = parameters[name]
-        if parameter.is_texture:
+        if placed:
+            pass
+        elif parameter.is_texture:
             textures.setdefault(parameter.path, []).append((parameter, value))
         else:
             scene = put(scene, parameter.path, parameter.put(get(scene, parameter.path), value))

@@ -1,18 +1,22 @@
 """Textures from images: recovery within stated errors, texels that no pixel sees, what is supposed, bad input."""
 
+from functools import partial
 from types import SimpleNamespace
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 import pytest
 
 import pathjax as pj
 from pathjax.images import write_exr
-from pathjax.inverse import dense
+from pathjax.inverse import dense, problem, products
 from pathjax.inverse.many import Search
 from pathjax.inverse.parameter_vector import ParameterVector
 from pathjax.inverse.prior import KINDS, Prior
 from pathjax.kinds.parameter import Parameter
+from pathjax.scene import parameters as named
 from pathjax.system import memory
 
 NAME = "picture.reflectance"
@@ -229,3 +233,76 @@ def test_total_variation_keeps_an_edge_that_the_laplacian_blurs():
             prior.estimate(values, deviation, weight * np.diag(covariance))
         errors[kind] = np.sqrt(np.mean((values - step) ** 2))
     assert errors["total variation"] < 0.85 * errors["laplacian"], errors
+
+
+SIDE = 160  # of a picture that is not fitted
+
+
+def made(program, size):
+    """Names of what makes arrays of so many numbers or more in a program, and in the programs that it calls."""
+    found = []
+    for eqn in program.eqns:
+        inner = jax.tree.leaves(list(eqn.params.values()), is_leaf=lambda x: hasattr(x, "eqns") or hasattr(x, "jaxpr"))
+        inner = [each for each in (getattr(x, "jaxpr", x) for x in inner) if hasattr(each, "eqns")]
+        for each in inner:
+            found += made(each, size)
+        if not inner:
+            found += [eqn.primitive.name for x in eqn.outvars if getattr(x.aval, "size", 0) >= size]
+    return found
+
+
+@pytest.fixture(scope="module")
+def pictures():
+    """A wall with a picture of 4 x 6 texels beside one of many, whose texels stand in one array."""
+    random, T = np.random.default_rng(3), pj.Transform
+    camera = {"type": "perspective", "to_world": T().look_at(origin=[0, 0, 4], target=[0, 0, 0], up=[0, 1, 0])}
+    scene = {
+        "type": "scene",
+        "integrator": {"type": "path", "max_depth": 3},
+        "sensor": camera | {"film": {"type": "hdrfilm", "width": 8, "height": 8, "rfilter": {"type": "box"}}},
+        "sky": {"type": "constant"},
+    }
+    for name, (x, shape) in {"large": (-1, (SIDE, SIDE, 3)), "small": (1, (4, 6, 3))}.items():
+        data = random.uniform(0.2, 0.8, shape).astype(np.float32)
+        bsdf = {"type": "diffuse", "id": name, "reflectance": {"type": "bitmap", "data": data, "raw": True}}
+        scene[f"{name}-wall"] = {"type": "rectangle", "to_world": T().translate([x, 0, 0]), "bsdf": bsdf}
+    return pj.load_dict(scene)
+
+
+def evaluated(scenes, name):
+    """The products of a fit of one texture, and the views with the start in them."""
+    given = problem.build(scenes, [np.ones((8, 8, 3))] * len(scenes), [name], {name: 0.5})
+    found = products.Products(given, seed=0)
+    (group,) = found._at(given.start)
+    assert found._at(given.start.copy())[0] is group
+    return found, group
+
+
+def test_no_kernel_of_a_fit_copies_texels_that_are_not_fitted(pictures):
+    """Values are set once a step, and arrays are on all devices before: a kernel makes no array of all texels."""
+    views, group = evaluated([pictures, pj.with_parameters(pictures, {"sky.radiance": 2.0})], "small.reflectance")
+    large = [x for x in jax.tree.leaves(group.scene) if x.size >= 3 * SIDE**2]
+    assert len(large) == 1 and len(large[0].devices()) == len(jax.devices())
+    _, pixels, _ = views.parts[0]
+    values = jnp.asarray(views.problem.start, jnp.float32)
+    work = values, group, pixels, jnp.uint32(4), group.seeds(jnp.uint32(0), 0, 0)
+    calls = {
+        products._image: work,
+        products._push: (*work, values),
+        products._pull: (*work, jnp.ones((*pixels.shape, 3))),
+        products._rows: work,
+    }
+    for function, arguments in calls.items():
+        program = jax.make_jaxpr(partial(function, vector=views.vector))(*arguments)
+        assert not made(program.jaxpr, 3 * SIDE**2), function.__name__
+
+
+def test_values_of_a_texture_are_set_in_views_that_share_an_array_and_in_others(pictures):
+    other = pj.with_parameters(pictures, {"large.reflectance": 0.1})
+    for scenes, stacked in (([pictures], False), ([pictures, pictures], False), ([pictures, other], True)):
+        _, group = evaluated(scenes, "small.reflectance")
+        parameter = group.wanted["small.reflectance"]
+        texels = np.asarray(named.get(group.scene, parameter.path))
+        for view, scene in zip(texels if stacked else [texels] * len(scenes), scenes, strict=True):
+            wanted = pj.with_parameters(scene, {"small.reflectance": 0.5})
+            assert (view == np.asarray(named.get(wanted, parameter.path))).all()
