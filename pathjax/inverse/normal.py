@@ -114,7 +114,8 @@ def normal_equations(
     flat = jnp.asarray(views.flat(by_view) / views.exposure**2, dtype)
     values = jnp.asarray(views.start, dtype)
     numbers = (jnp.uint32(x) for x in (spp, seed, 0))
-    found = _compiled(views.groups, values, jnp.ones_like(values), flat, *numbers, vector=views.vector, side=views.side)
+    groups, ones = [group.everywhere() for group in views.groups], jnp.ones_like(values)
+    found = _compiled(groups, values, ones, flat, *numbers, vector=views.vector, side=views.side)
     return replace(found, residuals=found.residuals / views.exposure)
 
 

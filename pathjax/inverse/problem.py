@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from pathjax.compile import register_dataclass
+from pathjax.compile import on_all_devices, register_dataclass
 from pathjax.errors import InputError
 from pathjax.images.metrics import ROUNDING
 from pathjax.inverse.parameter_vector import ParameterVector
@@ -74,6 +74,10 @@ class Views:
                 array = _put(named.get(scene, parameter.path), values[name], parameter, stacked)
                 scene = named.put(scene, parameter.path, array)
         return replace(self, scene=scene)
+
+    def everywhere(self) -> Views:
+        """The views with arrays on all devices, where kernels would copy them each time that they run."""
+        return replace(self, scene=on_all_devices(self.scene))
 
     def with_values(self, scene: Scene, values) -> Scene:
         """A scene of `map` with the values of parameters, of textures those that are `placed`."""

@@ -7,7 +7,6 @@ Each evaluation is one kernel for a part of the pixels, so that a fit compiles f
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
@@ -15,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pathjax.compile import devices_of_a_call, on_all_devices
+from pathjax.compile import devices_of_a_call
 from pathjax.derivatives import backward
 from pathjax.derivatives.kept import kept as kept_of
 from pathjax.derivatives.kept import of_parameter
@@ -52,7 +51,8 @@ class Products:
         self.problem, self.vector, self.seed = problem, problem.vector, jnp.uint32(seed)
         self.dtype = problem.groups[0].targets.dtype
         self.compile_seconds, self.draws = 0.0, 0
-        self.placed: tuple[np.ndarray, list[Views]] | None = None  # values, and the groups that hold them
+        # Values, and the groups that hold them: for kernels of all devices, and for those of one.
+        self.placed: tuple[np.ndarray, list[Views], list[Views]] | None = None
         self.keep([np.ones(t.image.shape[:2], bool) for t in problem.targets])
 
     def keep(self, masks: list[np.ndarray]) -> None:
@@ -141,18 +141,19 @@ class Products:
     def _run(self, *call):
         return self._call(*call)()
 
-    def _at(self, values: np.ndarray) -> list[Views]:
-        """The groups with these values in them, as kernels of all devices take them."""
+    def _at(self, values: np.ndarray, everywhere: bool = True) -> list[Views]:
+        """The groups with these values in them, whose arrays kernels take as they are: on all devices, or on one."""
         if self.placed is None or not np.array_equal(values, self.placed[0]):
             self.placed = None  # memory for one at a time
             by_name = self.vector.unpack(jnp.asarray(values, self.dtype))
             groups = [views.placed(by_name) for views in self.problem.groups]
-            self.placed = values.copy(), [replace(views, scene=on_all_devices(views.scene)) for views in groups]
-        return self.placed[1]
+            self.placed = values.copy(), [views.everywhere() for views in groups], groups
+        return self.placed[1 if everywhere else 2]
 
     def _call(self, function: Callable, values, group: int, pixels, spp: int, draw, *more) -> Callable:
         """Compile, in the thread that asks for it, and return what runs the kernel, in any."""
-        views, values = self._at(values)[group], jnp.asarray(values, self.dtype)
+        views = self._at(values, everywhere=function is not _rows)[group]
+        values = jnp.asarray(values, self.dtype)
         arguments = values, views, pixels, jnp.uint32(spp), views.seeds(self.seed, draw, 0), *more
         bound = partial(function, vector=self.vector)
         program, seconds = compiled((function, self.vector), lambda *a: jax.jit(bound).lower(*a).compile(), *arguments)

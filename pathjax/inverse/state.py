@@ -25,7 +25,8 @@ class State:
     def __init__(
         self, problem: Problem, spp: int, seed: int, solver, progress: Callable | None, interrupts: Interrupts
     ):
-        self.problem, self.vector, self.groups = problem, problem.vector, problem.groups
+        self.problem, self.vector = problem, problem.vector
+        self.groups = [views.everywhere() for views in problem.groups]
         self.spp, self.seed, self.solver = spp, jnp.uint32(seed), solver
         self.progress, self.interrupts = progress, interrupts
         self.dtype = self.groups[0].targets.dtype

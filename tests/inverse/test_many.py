@@ -15,6 +15,7 @@ from pathjax.inverse import dense, problem, products
 from pathjax.inverse.many import Search
 from pathjax.inverse.parameter_vector import ParameterVector
 from pathjax.inverse.prior import KINDS, Prior
+from pathjax.inverse.state import State
 from pathjax.kinds.parameter import Parameter
 from pathjax.scene import parameters as named
 from pathjax.system import memory
@@ -283,6 +284,8 @@ def test_no_kernel_of_a_fit_copies_texels_that_are_not_fitted(pictures):
     views, group = evaluated([pictures, pj.with_parameters(pictures, {"sky.radiance": 2.0})], "small.reflectance")
     large = [x for x in jax.tree.leaves(group.scene) if x.size >= 3 * SIDE**2]
     assert len(large) == 1 and len(large[0].devices()) == len(jax.devices())
+    (alone,) = views._at(views.problem.start, everywhere=False)  # for rows, which each device makes by itself
+    assert all(len(x.devices()) == 1 for x in jax.tree.leaves(alone.scene))
     _, pixels, _ = views.parts[0]
     values = jnp.asarray(views.problem.start, jnp.float32)
     work = values, group, pixels, jnp.uint32(4), group.seeds(jnp.uint32(0), 0, 0)
@@ -306,3 +309,11 @@ def test_values_of_a_texture_are_set_in_views_that_share_an_array_and_in_others(
         for view, scene in zip(texels if stacked else [texels] * len(scenes), scenes, strict=True):
             wanted = pj.with_parameters(scene, {"small.reflectance": 0.5})
             assert (view == np.asarray(named.get(wanted, parameter.path))).all()
+
+
+def test_fits_of_few_numbers_have_large_arrays_on_all_devices(pictures):
+    """What is on one of them is copied to the others at each call."""
+    given = problem.build(pictures, np.ones((8, 8, 3)), ["sky.radiance"], {})
+    (group,) = State(given, 8, 0, None, None, None).groups
+    large = [x for x in jax.tree.leaves(group.scene) if x.size >= 3 * SIDE**2]
+    assert large and all(len(x.devices()) == len(jax.devices()) for x in large)
