@@ -23,6 +23,7 @@ __all__ = [
     "Literal",
     "Primitive",
     "ad",
+    "aval_of",
     "batching",
     "bytes_of_program",
     "call_of_identity",
@@ -81,6 +82,11 @@ def register_dataclass(cls: Class) -> Class:
 
     jax.tree_util.register_pytree_with_keys(cls, flatten_with_keys, unflatten, flatten)
     return cls
+
+
+def aval_of(shape: tuple[int, ...], dtype):
+    """What a primitive says of an array that it gives."""
+    return jax.core.ShapedArray(shape, dtype)
 
 
 def is_traced(x) -> bool:

@@ -19,6 +19,7 @@ from pathjax.compile.jax_compat import (
     ClosedJaxpr,
     Primitive,
     ad,
+    aval_of,
     batching,
     call_of_identity,
     jaxpr_as_fun,
@@ -225,7 +226,7 @@ def _identity(*, count, dtype):
 
 
 basis_p.def_impl(_identity)
-basis_p.def_abstract_eval(lambda *, count, dtype: jax.core.ShapedArray((count, count), dtype))
+basis_p.def_abstract_eval(lambda *, count, dtype: aval_of((count, count), dtype))
 mlir.register_lowering(basis_p, mlir.lower_fun(_identity, multiple_results=False))
 
 

@@ -60,11 +60,9 @@ def with_values(
     textures: dict[tuple, list[tuple[Parameter, jax.Array]]] = {}
     for name, value in values.items():
         parameter = parameters[name]
-        if placed:
-            pass
-        elif parameter.is_texture:
+        if parameter.is_texture and not placed:
             textures.setdefault(parameter.path, []).append((parameter, value))
-        else:
+        elif not placed:
             scene = put(scene, parameter.path, parameter.put(get(scene, parameter.path), value))
         for path, row in parameter.means:
             # Known values as builders take them, to the last bit.
