@@ -325,7 +325,7 @@ def rows(
 ) -> tuple[Float[Array, "N 3"], Rows]:
     """Means of pixels, and derivatives of each channel in the same channel of each colour that is kept, or in a number.
 
-    Arguments as for `pullback`; no colour is looked up by its luminance. A row is (N, 4), and the last number is none.
+    Arguments as for `pullback`; no texture is looked up by its luminance. A row is (N, 4), and the last number is none.
     """
     scene, choice, structure, sweep_of = _kernel(scene, kept, options)
 

@@ -49,7 +49,7 @@ class Slots:
     wrappers: tuple[Columns, ...]  # by table of bsdfs that hold others
     choices: tuple[tuple[int, int, int], ...]  # of `tree.steps`: the step, its wrapper, and which of its columns
     on_the_way: int  # wrappers that `tree.on_the_way` tells; each has a slot for each column
-    by_luminance: bool  # whether a colour may be looked up as one of the numbers of bsdfs, by its luminance
+    by_luminance: bool  # whether a texture may be looked up as one of the numbers of bsdfs, by its luminance
     corners: bool  # whether what meshes carry is differentiated
     grids: tuple[str, ...]  # of `media.Nudges`: what is nudged of media
 
@@ -180,10 +180,10 @@ def slots(scene: Scene, paths: Paths, fields: Fields) -> Slots:
     met = {place for level in scene.materials.passing for place in level if wrappers}
     passed = any(column is not None for place in met for column in wrappers[place])
     on_the_way = tree.most_on_the_way(scene.materials) if passed else 0
-    colored = {key: path for key, path in in_textures(scene, paths, TEXTURES).items() if of_colors(scene, path)}
+    texels = in_textures(scene, paths, TEXTURES)
     scattering = [(*BSDFS, i) for i in range(len(scene.materials.tables))] + [(*WRAPPERS, i) for i in choosing]
     by_luminance = any(
-        named.get(scene, table).columns[i].values.ndim == 1 for table in scattering for i in filled(table, colored)
+        named.get(scene, table).columns[i].values.ndim == 1 for table in scattering for i in filled(table, texels)
     )
     corners = any(path[0] == "geometry" for path in paths)
     of_scattering = () if scene.scatters else ("extinction", "albedo")

@@ -44,8 +44,8 @@ METHODS = ("difference", "attached")
 MOST_TANGENTS = 2
 # Where a sweep finds them, `takes_sweep`.
 UNLESS = (
-    " unless no IOR of smooth glass is named with it, pixels share no samples, as under a box filter, and no colour of "
-    "those named stands for a number, too"
+    " unless no IOR of smooth glass is named with it, pixels share no samples, as under a box filter, and none of the "
+    "textures named stands for a number"
 )
 
 
@@ -112,7 +112,7 @@ def jacobian(
         image and Jacobian.
     Raises:
         InputError: unknown name, method or strategy; spp, seed or step out of range; a texture, where pixels share
-            samples, or where its colours stand for numbers, too; a value that counts as a larger one, as a roughness
+            samples, or where it stands for a number; a value that counts as a larger one, as a roughness
             of 0 does; more derivatives than fit into memory.
     """
     if isinstance(names, str):
@@ -232,7 +232,7 @@ def has_rows(scene: Scene, parameters) -> bool:
     paths = {parameter.path for parameter in parameters}
     if not paths <= differentiated.paths(scene):
         return False
-    # A colour that also stands for a number has a derivative across channels.
+    # A texture that stands for a number has derivatives across channels.
     return not differentiated.slots(scene, tuple(paths), differentiated.places_of_textures(parameters)).by_luminance
 
 

@@ -41,7 +41,7 @@ class Slot:
     shares: tuple[Float[Array, "..."], ...] | None
     now: Float[Array, "3"]  # d(Le + n)
     later: Float[Array, "3"] | None  # dw, to be multiplied by R
-    # The number is the luminance of colours, if it is one of those.
+    # The number may be the luminance of a texture.
     by_luminance: bool = field(default=False, metadata={"static": True})
 
 
