@@ -17,6 +17,7 @@ from pathjax.compile.lanes import lanes
 from pathjax.compile.lanes.interpreter import Interpreter
 from pathjax.compile.lanes.scheduling import from_queue
 from pathjax.derivatives import backward, ior_step, jacobian, tangents, totals
+from pathjax.derivatives.kept import kept
 from pathjax.integrators import pixel
 from pathjax.integrators.options import DEFAULTS, Options
 from pathjax.rendering import aovs, bounces, query
@@ -154,10 +155,9 @@ def test_a_sweep_is_native(native_kernels, monkeypatch, shipped, few, near):
     backward.pullback.clear_cache()
     scene = shipped("cornell_box", res=16)
     pixels = jnp.arange(pixel_count(scene.film), dtype=jnp.int32)
-    paths = tuple({parameter.path for parameter in scene.about.parameters.values()})
     options = Options(derivative=True, by_vertex=True)
     work = jnp.ones((len(pixels), 3)), pixels, *pixel.numbers(pixels, 0, 4, 1)
-    how = dict(paths=paths, options=options, ring=backward.RING)
+    how = dict(kept=kept(scene, scene.about.parameters.values()), options=options, ring=backward.RING)
     assert native_kernels(backward.pullback.lower(named.nameless(scene), *work, **how)) == 3
 
 

@@ -53,8 +53,8 @@ def basis(count: int, dtype):
     """Tangents (count, count) of as many numbers, one after another: the identity.
 
     `jax.vmap` pushes them through a function all at once. Lanes know the zeros, and compute nothing of what is zero
-    because of them: so the tangent of a number costs only what depends on the number. It stands in no other place of a
-    function with a `persistent_loop` than the loop's body.
+    because of them: so the tangent of a number costs only what depends on the number. In a function that has a
+    `persistent_loop` it stands in the loop's body.
     """
     return basis_p.bind(count=count, dtype=np.dtype(dtype))
 

@@ -1,4 +1,4 @@
-"""J^T v, and J in many colours, at the price of about one image, whatever the number of parameters: a recorded sweep.
+"""J^T v, and J in many numbers, at the price of about one image, whatever the number of parameters: a recorded sweep.
 
 A path's derivative has entries at the parameters of the vertices that it meets, and nowhere else. So each vertex is
 recorded as it is met (`record`, which has the equations), and when the path has ended its vertices are gone through

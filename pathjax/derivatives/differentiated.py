@@ -148,9 +148,9 @@ def slots(scene: Scene, paths: Paths, fields: Fields) -> Slots:
     def filled(table, textures):
         """Columns of a table that look up some of these textures."""
         held = named.get(scene, table)
-        columns = zip(held.kind.declared, held.columns, strict=True) if textures else ()
-        allowed = [column is not None and (fields is None or name in fields) for name, column in columns]
-        return [i for i, each in enumerate(allowed) if each and held.columns[i].texture is not None]
+        may_be = [fields is None or name in fields for name in held.kind.declared]
+        looks_up = [column is not None and column.texture is not None for column in held.columns]
+        return [i for i in range(len(looks_up)) if textures and may_be[i] and looks_up[i]]
 
     def joined(found):
         """All colours, and all numbers behind the most colours that any table has."""

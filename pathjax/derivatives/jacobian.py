@@ -1,6 +1,6 @@
 """Image and Jacobian: how every pixel changes with the parameters of materials and lights.
 
-Colours (reflectances, radiances, a metal's eta and k) change what paths carry, not where they go: the derivative is
+Most parameters (reflectances, radiances, roughnesses) change what paths carry, not where they go: the derivative is
 that of the weights (detached sampling), unbiased (`tangents`; of many numbers `backward`). The IOR of smooth glass
 moves the path itself, which takes differences (`ior_difference`). No general derivative exists here for moving geometry
 or cameras.
@@ -197,7 +197,7 @@ def pixel_jacobians(
     derivatives, biases, used = {}, {}, {}
     for name, parameter in wanted.items():
         if name in colors:
-            derivatives[name] = _slope(by_color, colors.index(name), bool(parameter.shape))
+            derivatives[name] = _slope_of(by_color, colors.index(name), bool(parameter.shape))
         else:
             place, scale = glass.index(parameter.index[0]), ior.ratio_by(scene, parameter)
             derivatives[name], biases[name], used[name] = _of_glass(by_ior, bias, steps, place, scale)
@@ -206,9 +206,8 @@ def pixel_jacobians(
 
 # One program for each of these, where JAX would compile one for each operation.
 @partial(jax.jit, static_argnums=2)
-def _slope(by_color, place, of_channels):
-    slope = by_color[:, place]
-    return tangents.by_channel(slope) if of_channels else slope
+def _slope_of(by_color, place, of_color):
+    return tangents.in_parameter(by_color[:, place], of_color)
 
 
 @jax.jit

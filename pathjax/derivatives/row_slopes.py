@@ -65,8 +65,7 @@ class RowSlopes(Mapping[str, Array]):
 @partial(jax.jit, static_argnames=("of_color", "shape"))
 def _slope(rows: Rows, number, of_color: bool, shape: tuple[int, ...]) -> Float[Array, "..."]:
     row = rows[number][..., :3]
-    slope = row.reshape(*row.shape[:-2], *shape, 3)
-    return tangents.by_channel(slope) if of_color else slope
+    return tangents.in_parameter(row.reshape(*row.shape[:-2], *shape, 3), of_color)
 
 
 @partial(jax.jit, static_argnames=("place", "shape"))

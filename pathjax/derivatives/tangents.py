@@ -37,9 +37,9 @@ def places(parameters: Iterable[Parameter]) -> Places:
     return tuple((parameter.path, parameter.index) for parameter in parameters)
 
 
-def by_channel(slope: Float[Array, "*shape 3"]) -> Float[Array, "*shape 3 3"]:
-    """Derivative in a colour, from that of each channel in the same channel of the colour."""
-    return slope[..., None] * jnp.eye(3, dtype=slope.dtype)
+def in_parameter(slope: Float[Array, "*shape 3"], of_color: bool) -> Float[Array, "*shape 3 ..."]:
+    """In a colour (*shape, 3, 3), from the derivative of each channel in its own; in a number, that of each channel."""
+    return slope[..., None] * jnp.eye(3, dtype=slope.dtype) if of_color else slope
 
 
 def unit_tangents(scene: Scene, colors: Places) -> list[Float[Array, "colors ..."]]:

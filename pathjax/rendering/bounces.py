@@ -192,7 +192,7 @@ class _TermSums:
         colors, options = tangents.places(wanted.values()), replace(self.options, derivative=bool(wanted))
         sums, by_color = _kernel(scene, *work, depth=self.depth, options=options, colors=colors)
         slopes = {name: by_color[:, :, place] for place, name in enumerate(wanted)}
-        return sums, {name: tangents.by_channel(s) if wanted[name].shape else s for name, s in slopes.items()}
+        return sums, {name: tangents.in_parameter(s, bool(wanted[name].shape)) for name, s in slopes.items()}
 
 
 @partial(jax.jit, static_argnames=("depth", "options", "colors"))
