@@ -240,7 +240,7 @@ def test_two_halves_of_the_samples_average_to_the_whole(cornell):
 
 
 def test_chosen_pixels_are_those_of_the_whole_image(cornell):
-    pixels = jnp.asarray([3, 203, 117], jnp.int32)
+    pixels = jnp.asarray([3, 203, 117, 117], jnp.int32)
     chosen = render_pixels(cornell, pixels, 0, 4, 5)
     # Another number of pixels is another kernel, which may round differently.
     np.testing.assert_allclose(chosen, pj.render(cornell, 4, 5).reshape(-1, 3)[pixels], rtol=1e-5)

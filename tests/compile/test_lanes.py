@@ -22,7 +22,7 @@ def agrees(f, *xs, shared=(TABLE,), width=WIDTH):
         return f(*x, *shared)
 
     shared = tuple(map(jnp.asarray, shared))
-    expected = jax.vmap(of, in_axes=(0, *(None for _ in shared)))(xs, *shared)
+    expected = jax.jit(jax.vmap(of, in_axes=(0, *(None for _ in shared))))(xs, *shared)
     found = jax.jit(lanes(of, width))(xs, *shared)
     assert jax.tree.structure(found) == jax.tree.structure(expected)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6), found, expected)

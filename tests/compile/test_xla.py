@@ -130,7 +130,8 @@ print(json.dumps([pathjax.compile.native(), image.tolist()]))
 """
 
 
-@pytest.mark.parametrize("opted_out", [True, pytest.param(False, marks=pytest.mark.slow)])
+@pytest.mark.slow  # what opts out is compared with native loops, image and derivatives, in test_vectorised.py
+@pytest.mark.parametrize("opted_out", [True, False])
 def test_renders_are_right_without_native_loops(python, root, opted_out):
     """Opted out, or imported too late."""
     code = RENDER.format(scene=(root / "scenes" / "furnace.xml").as_posix())

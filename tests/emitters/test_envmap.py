@@ -29,6 +29,7 @@ BALLS = """<shape type="sphere"><point name="center" x="-1" y="0.8" z="0"/><floa
   <shape type="sphere"><point name="center" x="0.2" y="0.5" z="1.5"/><float name="radius" value="0.5"/>
     <bsdf type="dielectric"/></shape>"""
 VIEW = {"origin": "0.5, 2, 5", "target": "0, 0.5, 0"}
+LARGE = 33, 64  # texels of pictures above the floor, 8 pixels wide, of which all images are made by one kernel
 
 
 def picture(height, width, seed=0, hot=()):
@@ -249,7 +250,7 @@ def test_an_even_picture_is_a_constant_background(make_scene, sky, estimate, agr
 @pytest.mark.parametrize("strategy", ["mis", pytest.param("light", marks=pytest.mark.slow)])
 def test_a_bright_texel_lights_a_floor(make_scene, sky, estimate, agree, strategy):
     """It is a tent over two patches, of the azimuth and the polar angle each, whose integral over sin cos is known."""
-    texels = np.zeros((33, 64, 3), np.float32)
+    texels = np.zeros((*LARGE, 3), np.float32)
     texels[10, 37] = [3000, 1000, 500]
     theta, step = 10 * np.pi / 32, np.pi / 32
     irradiance = texels[10, 37] * (2 * np.pi / 64) * step * (np.sin(step) / step) ** 2 * np.sin(2 * theta) / 2
@@ -268,9 +269,9 @@ def test_images_are_linear_in_the_scale(make_scene, sky):
 
 def test_texels_are_a_parameter(make_scene, sky):
     """Set anew, traced or not, they are drawn as those of a file are; the image is linear in them."""
-    old, new = picture(3, 4), picture(3, 4, seed=5, hot=[(1, 2)])
-    scene = make_scene(FLOOR + sky(old, name="texels"), **VIEW, res=4)
-    read = make_scene(FLOOR + sky(new, name="texels"), **VIEW, res=4)
+    old, new = picture(*LARGE), picture(*LARGE, seed=5, hot=[(1, 2)])
+    scene = make_scene(FLOOR + sky(old, name="texels"), **VIEW, res=8)
+    read = make_scene(FLOOR + sky(new, name="texels"), **VIEW, res=8)
     for key in Envmap.declared:
         both = pj.with_parameters(scene, {"texels.radiance": new}), read
         mine, theirs = (each.emitters[0].table.column(key) for each in both)
@@ -283,8 +284,8 @@ def test_texels_are_a_parameter(make_scene, sky):
     np.testing.assert_allclose(seen, pj.render(read, 4), rtol=1e-6)
     assert pull.shape == new.shape and (pull >= 0).all()
     np.testing.assert_allclose((pull * new).sum(), (np.asarray(seen, float) ** 2).sum(), rtol=1e-5)
-    with pytest.raises(pj.InputError, match=r"\(3, 4, 3\), and cannot be set to 4 x 3 x 3"):
-        pj.with_parameters(scene, {"texels.radiance": np.ones((4, 3, 3))})
+    with pytest.raises(pj.InputError, match=r"\(33, 64, 3\), and cannot be set to 64 x 33 x 3"):
+        pj.with_parameters(scene, {"texels.radiance": np.ones((64, 33, 3))})
     with pytest.raises(pj.InputError, match=r"outside its bounds \[0, inf\]"):
         pj.with_parameters(scene, {"texels.radiance": -new})
 
@@ -293,7 +294,6 @@ def test_terms_first_hits_and_hidden_emitters(make_scene, sky):
     light = sky(picture(16, 32))
     shown, hidden = (make_scene(FLOOR + light, res=16, hide=hide, **VIEW) for hide in ("false", "true"))
     above = np.s_[:2]
-    assert np.asarray(pj.render(shown, 4))[above].min() > 0
     assert not np.asarray(pj.render(hidden, 4))[above].any() and np.asarray(pj.render(hidden, 4))[8:].any()
     terms = np.asarray(pj.render_bounces(shown, 3, 4).terms)
     assert terms[0][above].min() > 0 and not terms[1:][:, above].any() and terms[1].any()
@@ -355,7 +355,7 @@ def test_one_picture_alone_is_taken(make_scene, sky):
 
 def test_a_black_picture_is_told(write_scene, sky):
     with pytest.warns(pj.errors.InputWarning, match="the radiance of every light is 0"):
-        scene = pj.load_scene(write_scene(FLOOR + sky(PICTURES["black"]), res=2))
+        scene = pj.load_scene(write_scene(FLOOR + sky(np.zeros((*LARGE, 3), np.float32)), res=8))
     assert not np.asarray(pj.render(scene, 4)).any()
     with warnings.catch_warnings():
         warnings.simplefilter("error")

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from pathjax.compile import on_all_devices
 from pathjax.integrators import pixel, reference
 from pathjax.integrators.options import DEFAULTS
 from pathjax.rendering.render import pixel_means
@@ -25,10 +26,10 @@ ROUNDING, ASTRAY = {jnp.float32: 1e-3, jnp.float64: 1e-9}, {jnp.float32: 5e-3, j
 
 
 def rendered(scene):
-    """(SPP, H, W, 3) samples of `path`, each an image of one, by the kernel that other tests have of this size."""
-    pixels, shape = film.pixels(scene.film), film.image_shape(scene.film)
+    """(SPP, H, W, 3) samples of `path`, each an image of one, by the kernel of `render`, which other tests have."""
+    pixels, how = film.pixels(scene.film), {"options": DEFAULTS, "shape": film.image_shape(scene.film)}
     numbers = (pixel.numbers(pixels, sample, 1, SEED) for sample in range(SPP))
-    return np.stack([pixel_means(scene, pixels, *each, options=DEFAULTS).reshape(*shape, 3) for each in numbers])
+    return np.stack([pixel_means(on_all_devices(scene), pixels, *each, None, **how) for each in numbers])
 
 
 def assert_same_samples(scene, dtype):
