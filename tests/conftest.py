@@ -72,6 +72,26 @@ def compiled_anew():
     compilation_cache.reset_cache()
 
 
+class Compilations:
+    """Counts what JAX's backend compiles."""
+
+    def __init__(self):
+        self.count, self.on = 0, True
+        jax.monitoring.register_event_duration_secs_listener(self.hear)
+
+    def hear(self, event, seconds, **_):
+        self.count += self.on and event == "/jax/core/compile/backend_compile_duration"
+
+
+@pytest.fixture
+def compilations():
+    counter = Compilations()
+    jax.jit(lambda x: x + 1)(0)  # no other function's
+    assert counter.count == 1  # it hears
+    yield counter
+    counter.on = False
+
+
 @pytest.fixture(scope="session")
 def root():
     """The checkout."""

@@ -321,26 +321,6 @@ def test_background_is_sampled_by_strategy_light_alone(shipped):
 # ---- no recompilation -----------------------------------------------------------------------------------------------
 
 
-class Compilations:
-    """Counts what JAX's backend compiles."""
-
-    def __init__(self):
-        self.count, self.on = 0, True
-        jax.monitoring.register_event_duration_secs_listener(self.hear)
-
-    def hear(self, event, seconds, **_):
-        self.count += self.on and event == "/jax/core/compile/backend_compile_duration"
-
-
-@pytest.fixture
-def compilations():
-    counter = Compilations()
-    jax.jit(lambda x: x + 1)(0)  # no other function's
-    assert counter.count == 1  # it hears
-    yield counter
-    counter.on = False
-
-
 def test_a_first_render_compiles_its_kernel_and_nothing_else(make_scene, compilations):
     scene = make_scene('<emitter type="constant"/>', res=17)  # of which nothing else is
     before = compilations.count
