@@ -26,16 +26,17 @@ from pathjax import bsdfs, emitters
 from pathjax.compile import Rows, compute_once, is_traced, native_fold, native_rows, persistent_loop, together
 from pathjax.compile.lanes import flags
 from pathjax.core import sampler
-from pathjax.core.math import LUMINANCE
+from pathjax.core.math import LUMINANCE, luminance
 from pathjax.derivatives import differentiated, totals
 from pathjax.derivatives.kept import Kept
-from pathjax.derivatives.record import Record, extend
+from pathjax.derivatives.record import Record, Slot, extend
 from pathjax.derivatives.totals import Total
 from pathjax.emitters import Choice
 from pathjax.errors import InputError
 from pathjax.integrators import path, pixel
 from pathjax.integrators.options import Options
 from pathjax.integrators.random_numbers import bounce_numbers
+from pathjax.integrators.reconstruction import images
 from pathjax.scene.scene import Scene
 
 # Trips between two sweeps, and those that the ring holds: powers of 2. Where the longest path is not known when a
@@ -214,7 +215,7 @@ def pixel_sweep(
     scene: Scene,
     choice: Choice | None,
     scale: Float[Array, "3"],
-    place_of: Callable,
+    of_slot: Callable,
     memory: Memory,
     *,
     options: Options,
@@ -224,7 +225,7 @@ def pixel_sweep(
 ) -> tuple[Float[Array, "3"], Memory]:
     """Add what the samples of a pixel give, and their mean.
 
-    scale: of the derivatives of the mean; place_of: from the list of entries to the total.
+    scale: of the derivatives of the mean; of_slot: Slots of the list of entries as those of the total.
     """
     pixel_number, first_sample, spp, seed = work
     stream = sampler.pixel_stream(seed, pixel_number)
@@ -237,8 +238,7 @@ def pixel_sweep(
         u = bounce_numbers(scene, stream, number, path.vertices(now), options.sampler, bool(slots.grids))
         of_sample = weight * (share * scale)
         on, record, itself = extend(scene, choice, now, u, options, slots, paths, of_sample, passed)
-        there = [replace(slot, places=tuple(map(place_of, slot.places))) for slot in record.slots]
-        record = record._replace(begins=begins, slots=there)
+        record = record._replace(begins=begins, slots=list(map(of_slot, record.slots)))
         memory = together(partial(remember, structure))(memory, columns_of(record))
         gain = weight * now.throughput * record.gathered
         if slots.of_passed:
@@ -268,7 +268,8 @@ class _Kernel(NamedTuple):
     of_pixel: Callable  # `pixel_sweep`
 
 
-def _kernel(scene: Scene, kept: Kept, options: Options) -> _Kernel:
+def _kernel(scene: Scene, kept: Kept, options: Options, of_slot: Callable = lambda slot: slot) -> _Kernel:
+    """of_slot: what becomes of a Slot, whatever its places are."""
     scene = options.applied(scene)
     choice = emitters.choice(scene.emitters, options.strategy)
     paths, slots = kept.paths, differentiated.slots(scene, kept.paths, kept.fields)
@@ -276,11 +277,24 @@ def _kernel(scene: Scene, kept: Kept, options: Options) -> _Kernel:
     def record(scene, choice, x):
         now, _ = pixel.camera_path(scene, jnp.int32(0), x, x, options)
         u = bounce_numbers(scene, x, x, path.vertices(now), options.sampler, bool(slots.grids))
-        return extend(scene, choice, now, u, options, slots, paths, now.throughput, jnp.int32(0))[1]
+        found = extend(scene, choice, now, u, options, slots, paths, now.throughput, jnp.int32(0))[1]
+        return found._replace(slots=list(map(of_slot, found.slots)))
 
     structure = jax.eval_shape(record, scene, choice, jnp.uint32(0))
     of_pixel = partial(pixel_sweep, options=options, slots=slots, paths=paths, structure=structure)
     return _Kernel(scene, choice, structure, of_pixel)
+
+
+def moved(place_of: Callable, slot: Slot) -> Slot:
+    return replace(slot, places=tuple(map(place_of, slot.places)))
+
+
+def in_numbers(slot: Slot) -> Slot:
+    """What adds to the derivatives in the number itself where it may be the luminance of a texture."""
+    if not slot.by_luminance:
+        return slot
+    shares = slot.shares and tuple(luminance(share) if share.ndim else share for share in slot.shares)
+    return replace(slot, shares=shares, by_luminance=False)
 
 
 @partial(jax.jit, static_argnames=("kept", "options", "ring", "form", "devices"))
@@ -312,7 +326,7 @@ def pullback(
 
     def of_pixel(work, scene, choice, memory):
         adjoint, work = work
-        return sweep_of(work, scene, choice, adjoint, kept.place, memory)[1]
+        return sweep_of(work, scene, choice, adjoint, partial(moved, kept.place), memory)[1]
 
     begin, end = partial(start, scene, structure, kept.count, ring), partial(finish, structure)
     work = adjoint, (pixels, first_sample, spp, seed)
@@ -325,14 +339,16 @@ def rows(
 ) -> tuple[Float[Array, "N 3"], Rows]:
     """Means of pixels, and derivatives of each channel in the same channel of each colour that is kept, or in a number.
 
-    Arguments as for `pullback`; no texture is looked up by its luminance. A row is (N, 4), and the last number is none.
+    A texture of colours that stands for a number has derivatives in the number, so it stands nowhere for colours.
+    Arguments as for `pullback`, and work as for `map_pixels`. A row is (N, 4), and the last number is none.
     """
-    scene, choice, structure, sweep_of = _kernel(scene, kept, options)
+    scene, choice, structure, sweep_of = _kernel(scene, kept, options, in_numbers)
 
     def of_pixel(work, number, scene, choice, memory):
         pixels = totals.count(memory.total) // kept.count
         ones = jnp.ones_like(scene.camera.origin)
-        return sweep_of(work, scene, choice, ones, lambda entry: pixels * kept.place(entry) + number, memory)
+        of_slot = partial(moved, lambda entry: pixels * kept.place(entry) + number)
+        return sweep_of(work, scene, choice, ones, lambda slot: of_slot(in_numbers(slot)), memory)
 
     def begin(lanes, pixels, scene, choice):
         return start(scene, structure, pixels * kept.count, ring, lanes)
@@ -340,5 +356,15 @@ def rows(
     def end(memory):
         return finish(structure, memory).reshape(kept.count, -1, totals.WIDTH)
 
-    work = pixels, first_sample, spp, seed
-    return native_rows(of_pixel, work, scene, choice, start=begin, finish=end, form=form, devices=devices)
+    work, how = (pixels, first_sample, spp, seed), dict(form=form, devices=devices)
+    if not options.shared:
+        return native_rows(of_pixel, work, scene, choice, start=begin, finish=end, **how)
+
+    def of_samples(work, scene, choice):
+        means, rows = native_rows(of_pixel, work, scene, choice, start=begin, finish=end, **how)
+        return means, jnp.moveaxis(rows.all(), 0, 1)
+
+    dtype = scene.camera.origin.dtype
+    like = jax.ShapeDtypeStruct((3,), dtype), jax.ShapeDtypeStruct((kept.count, totals.WIDTH), dtype)
+    image, of_images = images(of_samples, like, work, scene, choice, options=options, devices=devices)
+    return image, Rows((jnp.moveaxis(of_images, 0, 1)[None],), of_images.shape[::2])

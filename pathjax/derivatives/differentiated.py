@@ -267,6 +267,13 @@ def of_colors(scene: Scene, path: tuple) -> bool:
     return known.shared and known.colors
 
 
+def is_both(scene: Scene, parameter: Parameter) -> bool:
+    """Whether colours may count as such in one place, and by their luminance in another one."""
+    if not parameter.is_color:
+        return False
+    return slots(scene, (parameter.path,), places_of_textures([parameter])).by_luminance
+
+
 def may_be_wider(scene: Scene, path: tuple) -> bool:
     """Whether the rows of an array may have numbers behind their colours."""
     if "columns" not in path:

@@ -44,8 +44,8 @@ METHODS = ("difference", "attached")
 MOST_TANGENTS = 2
 # Where a sweep finds them, `takes_sweep`.
 UNLESS = (
-    " unless no IOR of smooth glass is named with it, pixels share no samples, as under a box filter, and none of the "
-    "textures named stands for a number"
+    " unless no IOR of smooth glass is named with it, and none of the textures named stands for colours and for "
+    "numbers both"
 )
 
 
@@ -111,9 +111,9 @@ def jacobian(
     Returns:
         image and Jacobian.
     Raises:
-        InputError: unknown name, method or strategy; spp, seed or step out of range; a texture, where pixels share
-            samples, or where it stands for a number; a value that counts as a larger one, as a roughness
-            of 0 does; more derivatives than fit into memory.
+        InputError: unknown name, method or strategy; spp, seed or step out of range; a texture beside the IOR of smooth
+            glass, or one that stands for colours and for numbers both; a value that counts as a larger one, as a
+            roughness of 0 does; more derivatives than fit into memory.
     """
     if isinstance(names, str):
         raise InputError(f"names is a list of names; write [{names!r}]")
@@ -218,21 +218,18 @@ def _of_glass(by_ior, bias, steps, place, scale):
 def takes_sweep(scene: Scene, parameters, options: Options, form: str | None = None, devices: int | None = None):
     """Whether a recorded sweep finds all derivatives: of textures, or of so many numbers that tangents would cost more.
 
-    It knows of pixels that draw their own samples alone, and of native kernels.
+    It knows of native kernels alone.
     """
     lanes = form == "lanes" or (form is None and native())
     few = len(parameters) <= MOST_TANGENTS and not any(parameter.is_texture for parameter in parameters)
-    return lanes and not options.shared and not few and has_rows(scene, parameters)
+    return lanes and not few and has_rows(scene, parameters)
 
 
 def has_rows(scene: Scene, parameters) -> bool:
     """Whether `backward.rows` finds the derivatives in them, which move no path."""
     parameters = list(parameters)
-    paths = {parameter.path for parameter in parameters}
-    if not paths <= differentiated.paths(scene):
-        return False
-    # A texture that stands for a number has derivatives across channels.
-    return not differentiated.slots(scene, tuple(paths), differentiated.places_of_textures(parameters)).by_luminance
+    known = differentiated.paths(scene)
+    return all(each.path in known and not differentiated.is_both(scene, each) for each in parameters)
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0, 1, 2, 3))
@@ -248,7 +245,7 @@ def _swept(wanted, options, ring, how, scene, pixels, *numbers):
         shape = named.get(scene, parameter.path).shape
         return Place(kept.of(scene, parameter), parameter, shape, differentiated.of_colors(scene, parameter.path))
 
-    return image, RowSlopes(rows, tuple((name, place(each)) for name, each in wanted.items()), (len(pixels),))
+    return image, RowSlopes(rows, tuple((name, place(each)) for name, each in wanted.items()), (len(image),))
 
 
 @partial(_swept.defjvp, symbolic_zeros=True)

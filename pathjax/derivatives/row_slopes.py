@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from pathjax.compile import Rows, register_dataclass
+from pathjax.core.math import LUMINANCE
 from pathjax.derivatives import tangents
 from pathjax.derivatives.kept import of_parameter
 from pathjax.kinds.parameter import Parameter
@@ -74,7 +75,11 @@ def _slopes(rows: Rows, place: Place, shape: tuple[int, ...]) -> Float[Array, ".
     found = jnp.moveaxis(found, -3, -2)
     before = *found.shape[:-3], *shape
     found = found.reshape(-1, *found.shape[-2:])
-    same = jnp.eye(3, dtype=found.dtype)
-    of_channels = found[:, None] * same[:, None] if place.of_colors else jnp.moveaxis(found, -1, 1)
+    if place.parameter.is_color:
+        of_channels = found[:, None] * jnp.eye(3, dtype=found.dtype)[:, None]
+    else:
+        of_channels = jnp.moveaxis(found, -1, 1)
+        if place.of_colors:  # which are all as the number
+            of_channels = of_channels[..., None] * jnp.asarray(LUMINANCE, found.dtype)
     slopes = jax.vmap(jax.vmap(partial(of_parameter, place.parameter, place.array)))(of_channels)
     return slopes.reshape(*before, 3, *place.parameter.shape)

@@ -61,11 +61,21 @@ def map_pixels(
     """
     if not options.shared:
         return _own_samples(of_pixel, work, scene, *shared, means=means, **how)
+    one = jax.tree.map(lambda x: jax.ShapeDtypeStruct((), x.dtype), work)
+    like = jax.eval_shape(of_pixel, one, replace(scene, film=film.of_samples(scene.film)), *shared)
+    of_samples = partial(native_map, of_pixel, **how)
+    return images(of_samples, like, work, scene, *shared, options=options, devices=how.get("devices"))
+
+
+def images(
+    of_samples: Callable, like, work: Works, scene: Scene, *shared, options: Options, devices: int | None = None
+) -> object:
+    """What `map_pixels` gives of a film that shares samples. of_samples, like: of `sums`."""
     count = film.pixel_count(film.of_samples(scene.film))
     _, first_sample, spp, seed = (x.reshape(-1, count) for x in work)
     scale = 1 / jnp.maximum(spp, 1).astype(scene.camera.origin.dtype)
     run = jnp.int32(0), first_sample, spp, seed, scale
-    totals, weights = sums(of_pixel, run, scene, *shared, options=options, **how)
+    totals, weights = sums(of_samples, like, run, scene, *shared, options=options, devices=devices)
     return jax.tree.map(lambda total: _images(scene.film, total, weights), totals)
 
 
@@ -108,18 +118,20 @@ def halo(made: Film) -> int:
 
 
 def sums(
-    of_pixel: Callable, run: Run, scene: Scene, *shared, options: Options, **how
+    of_samples: Callable, like, run: Run, scene: Scene, *shared, options: Options, devices: int | None = None
 ) -> tuple[object, Float[Array, "R m"]]:
     """A and W of the samples of pixels in a row: pytree of (R, m, ...), (R, m), m = n + 2 `halo`, which begin before.
 
-    Arguments as for `map_pixels`.
+    Args:
+        of_samples: (Works of N pixels with a sample each, or none; scene, *shared) -> pytree of (N, ...).
+        like: that of one sample, shapes and dtypes.
+        devices: of `native_map`.
     """
     first_pixel, first_sample, spp, seed, scale = run
     through, sampled = scene.film, replace(scene, film=film.of_samples(scene.film))
     copies, count = spp.shape
     pixels = first_pixel + jnp.arange(count, dtype=jnp.int32)
-    one = jax.tree.map(lambda x: jax.ShapeDtypeStruct((), x.dtype), (pixels, first_sample, spp, seed))
-    leaves, structure = jax.tree.flatten(jax.eval_shape(of_pixel, one, sampled, *shared))
+    leaves, structure = jax.tree.flatten(like)
     places = np.cumsum([prod(leaf.shape) for leaf in leaves])
     block = max(min(_SAMPLES // spp.size, _NUMBERS // (spp.size * places[-1]), _OF_PIXEL), 1)
 
@@ -129,11 +141,11 @@ def sums(
         numbers, there = first_sample + done, done < spp
         work = pixels, numbers, there.astype(jnp.uint32), seed
         work = tuple(jnp.broadcast_to(x, numbers.shape).ravel() for x in work)
-        values = jax.tree.leaves(native_map(of_pixel, work, sampled, *shared, **how))
+        values = jax.tree.leaves(of_samples(work, sampled, *shared))
         values = jnp.concatenate([x.reshape(*numbers.shape, -1) for x in values], -1)
         values = jnp.where(there[..., None], values, 0)
         u = film_numbers(sampled, pixels, numbers, seed, options.sampler)
-        spread = spread_samples(through, first_pixel, u, jnp.where(there, scale, 0), values, how.get("devices"))
+        spread = spread_samples(through, first_pixel, u, jnp.where(there, scale, 0), values, devices)
         return add_compensated(state, spread)
 
     zero = jnp.zeros((copies, places[-1] + 1, count + 2 * halo(through)), scale.dtype)

@@ -44,7 +44,7 @@ def is_dense(problem: Problem) -> bool:
     if count > MOST_NUMBERS or pixels * (count // 3) ** 2 > MOST_PRODUCTS:
         return False
     wanted = [(views.scene, list(views.wanted.values())) for views in problem.groups]
-    colored = all(parameter.shape[-1:] == (3,) for _, parameters in wanted for parameter in parameters)
+    colored = all(parameter.is_color for _, parameters in wanted for parameter in parameters)
     return colored and all(has_rows(scene, parameters) for scene, parameters in wanted)
 
 

@@ -76,8 +76,9 @@ class Fit:
     @property
     def seen(self) -> dict[str, np.ndarray]:
         """By name, which texels and other parameters the images determine: bool, of the shape but for channels."""
+        known = self.scene.described.parameters
         return {
-            name: np.isfinite(error).all(-1) if error.shape[-1:] == (3,) else np.isfinite(error)
+            name: np.isfinite(error).all(-1) if known[name].is_color else np.isfinite(error)
             for name, error in self.standard_errors.items()
         }
 

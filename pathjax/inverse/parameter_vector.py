@@ -32,7 +32,7 @@ class ParameterVector:
     @property
     def labels(self) -> list[str]:
         """Names of the components: `glass.int_ior`, `white.reflectance.r`, `wall.reflectance[0, 2].r`."""
-        return [f"{name}{suffix}" for name, p in self.parameters for suffix in _suffixes(p.shape)]
+        return [f"{name}{suffix}" for name, p in self.parameters for suffix in _suffixes(p)]
 
     @property
     def bounds(self) -> np.ndarray:
@@ -57,7 +57,7 @@ class ParameterVector:
     @property
     def runs(self) -> list[tuple[bool, int]]:
         """Runs of columns that are alike: whether they are colours, and how many. A column is a number or a colour."""
-        kinds = itertools.groupby(self.parameters, lambda item: _is_color(item[1]))
+        kinds = itertools.groupby(self.parameters, lambda item: item[1].is_color)
         return [(color, sum(map(_count, (p for _, p in group)))) for color, group in kinds]
 
     @property
@@ -80,8 +80,8 @@ class ParameterVector:
         for name, p in self.parameters:
             by_channel = [jnp.zeros((*image.shape[:-1], _count(p)), image.dtype)] * 3
             if name in jacobian:
-                J = jacobian[name].reshape(*image.shape, _count(p), *([3] if _is_color(p) else []))
-                by_channel = [J[..., c, :, c] if _is_color(p) else J[..., c, :] for c in range(3)]
+                J = jacobian[name].reshape(*image.shape, _count(p), *([3] if p.is_color else []))
+                by_channel = [J[..., c, :, c] if p.is_color else J[..., c, :] for c in range(3)]
             parts.append(jnp.stack(by_channel, -1))
         return jnp.concatenate(parts, -2)
 
@@ -145,17 +145,13 @@ def _bounded(x, low, width, two, logarithmic):
     return jnp.where(logarithmic, jnp.exp(jnp.where(logarithmic, y, 0)), y)
 
 
-def _is_color(parameter: Parameter) -> bool:
-    return parameter.shape[-1:] == (3,)
-
-
 def _count(parameter: Parameter) -> int:
     """The number of colours, or of numbers, in a parameter."""
-    return math.prod(parameter.shape[:-1] if _is_color(parameter) else parameter.shape)
+    return math.prod(parameter.shape[:-1] if parameter.is_color else parameter.shape)
 
 
-def _suffixes(shape: tuple[int, ...]) -> list[str]:
-    """What is added to a parameter's name for each of its components; a last axis of length 3 is r, g, b."""
-    channels = [".r", ".g", ".b"] if shape[-1:] == (3,) else [""]
-    places = np.ndindex(shape[:-1] if shape[-1:] == (3,) else shape)
+def _suffixes(parameter: Parameter) -> list[str]:
+    """What is added to a parameter's name for each of its components."""
+    channels = [".r", ".g", ".b"] if parameter.is_color else [""]
+    places = np.ndindex(parameter.shape[:-1] if parameter.is_color else parameter.shape)
     return [f"{list(place) if place else ''}{channel}" for place in places for channel in channels]

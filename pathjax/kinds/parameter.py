@@ -53,10 +53,16 @@ class Parameter:
     # Of a texture: the parameters of bsdfs and lights in whose places it stands, by what kinds call them; None: it may
     # be any.
     stands_in: frozenset[str] | None = None
+    of_numbers: bool = False  # of a texture: a last axis of 3 is three texels, and no channels
 
     @property
     def is_texture(self) -> bool:
         return self.rows is not None
+
+    @property
+    def is_color(self) -> bool:
+        """Whether its last axis is r, g, b."""
+        return self.shape[-1:] == (3,) and not self.of_numbers
 
     def get(self, values: Shaped[Array, "R ..."]) -> Shaped[Array, "..."]:
         """Its value, of the array where it lives; of a texture of numbers the luminance of its texels."""
@@ -154,5 +160,6 @@ class Parameters:
             now = self.known.get(first, replace(color, shape=shape, bounds=bounds, stands_in=frozenset()))
             low, high = zip(now.bounds, bounds, strict=True)
             shape, bounds = max(now.shape, shape, key=len), (max(low), min(high))
+            numbers = len(shape) < len(color.shape)
             places = None if field is None or now.stands_in is None else now.stands_in | {field}
-            self.known[first] = replace(now, shape=shape, bounds=bounds, stands_in=places)
+            self.known[first] = replace(now, shape=shape, bounds=bounds, stands_in=places, of_numbers=numbers)

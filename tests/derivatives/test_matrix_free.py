@@ -401,7 +401,10 @@ def alpha(file):
 
 @pytest.mark.slow
 def test_textures_that_are_not_asked_for_take_no_part(make_scene, picture):
-    """Of a texture in the place of a reflectance, those that are roughnesses or colours of a board are not recorded."""
+    """Of a texture in the place of a reflectance, those that are roughnesses or colours of a board are not recorded.
+
+    A Jacobian takes roughnesses as numbers, though they are the luminance of colours.
+    """
     board = f'<texture type="checkerboard" name="reflectance">{rgb("color0", "0.2, 0.5, 0.7")}</texture>'
     bsdfs = diffuse("wall", texture(picture(2, 3))), diffuse("board", board), alpha(picture(3, 3))
     inside = "".join(
@@ -430,11 +433,12 @@ def test_textures_that_are_not_asked_for_take_no_part(make_scene, picture):
         for name, x in found.items():
             first = pulled.setdefault(name, x)
             np.testing.assert_allclose(x, first, rtol=1e-5, atol=1e-6 * np.abs(first).max())
-    assert jacobian.has_rows(scene, [known["wall.reflectance"]])
-    # Its colours stand for numbers, so each of their channels counts in all of the image's.
-    assert not jacobian.has_rows(scene, [known["rough.alpha"]])
-    with pytest.raises(pj.InputError, match="rough.alpha is a texture, .* stands for a number"):
-        pj.jacobian(scene, ["rough.alpha"], 1)
+    assert not jacobian.has_rows(scene, [known[board]])  # which may stand for a number
+    image, J = pj.jacobian(scene, ["wall.reflectance", "rough.alpha"], SPP, 3)
+    for name in J:
+        terms = np.asarray(J[name], float)
+        assert terms.shape == (*image.shape, *known[name].shape)
+        np.testing.assert_allclose(terms.sum((0, 1, 2)), pulled[name], rtol=1e-4, atol=1e-5 * np.abs(terms).max())
 
 
 @pytest.mark.parametrize("count", [1, MOST_RUNS, MOST_RUNS + 3])
@@ -451,10 +455,14 @@ def test_entries_of_few_runs_are_kept(count):
     assert few([range(3, 4), range(0, 3), range(3, 6)][1:]) == (range(0, 6),)
 
 
-def test_what_takes_a_derivative_of_each_number_refuses_textures_that_it_cannot_take(screen):
-    wide = replace(screen, film=replace(screen.film, shared=True))
-    with pytest.raises(pj.InputError, match=f"{NAME} is a texture, .* unless .* pixels share no samples"):
-        pj.jacobian(wide, [NAME], 1)
+def test_what_takes_a_derivative_of_each_number_refuses_textures_that_it_cannot_take(screen, make_scene, picture):
+    image = f'<texture type="bitmap" id="image"><string name="filename" value="{picture(2, 3)}"/></texture>'
+    places = '<ref id="image" name="specular_reflectance"/><ref id="image" name="alpha"/>'
+    metal = f'<bsdf type="roughconductor" id="metal">{places}</bsdf>'
+    scene = make_scene(f'{image}<shape type="sphere">{metal}</shape><emitter type="constant"/>', res=RES)
+    (name,) = (name for name, each in scene.about.parameters.items() if each.is_texture)
+    with pytest.raises(pj.InputError, match=f"{name} is a texture, .* stands for colours and for numbers both"):
+        pj.jacobian(scene, [name], 1)
     with pytest.raises(pj.InputError, match="second derivatives are not"):
         jax.hessian(lambda x: pj.render(pj.with_parameters(screen, {NAME: x}), 1).sum())(pj.parameters(screen)[NAME])
 

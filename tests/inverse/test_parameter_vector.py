@@ -36,6 +36,15 @@ def test_components_of_textures_and_tables_are_named_by_their_place():
     assert len(vector.bounds) == 10
 
 
+def test_three_numbers_in_a_row_of_a_texture_are_no_colour():
+    texture = Parameter(("alpha",), (0,), (2, 3), (0, 1), rows=6, of_numbers=True)
+    vector = ParameterVector((("metal.alpha", texture),))
+    assert vector.labels == [f"metal.alpha[{row}, {column}]" for row in range(2) for column in range(3)]
+    assert vector.runs == [(False, 6)]
+    J = np.arange(3 * 6, dtype=np.float32).reshape(3, 2, 3)
+    np.testing.assert_array_equal(vector.columns({"metal.alpha": J}, J[:, 0, 0]), J.reshape(3, 6).T)
+
+
 def test_unpack_inverts_pack():
     again = BOTH.unpack(BOTH.pack(VALUES))
     assert again.keys() == VALUES.keys()

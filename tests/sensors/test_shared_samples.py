@@ -11,6 +11,8 @@ from scipy import stats
 
 import pathjax as pj
 from pathjax import images, transport
+from pathjax.derivatives import jacobian
+from pathjax.derivatives.row_slopes import RowSlopes
 from pathjax.integrators import pixel, reconstruction
 from pathjax.integrators.options import DEFAULTS, Options
 from pathjax.rendering.progressive import passes
@@ -129,6 +131,19 @@ def test_derivatives_go_the_same_way(ball):
     # The image is a polynomial of each channel, for max_depth 3 of its second power, and roulette begins at depth 5.
     difference = (of(present + 0.1) - of(present - 0.1)) / 0.2
     np.testing.assert_allclose(tangent, difference, rtol=1e-3, atol=1e-4)
+
+
+def test_a_recorded_jacobian_goes_the_same_way(ball, monkeypatch):
+    """As tangents do, from the same samples, beyond the border of the crop window too."""
+    scene = through(ball, Gaussian(), True, (2, 1, 5, 4))
+    names = list(pj.parameters(scene))
+    image, J = pj.jacobian(scene, names, 3, 5)
+    monkeypatch.setattr(jacobian, "MOST_TANGENTS", 0)
+    other, rows = pj.jacobian(scene, names, 3, 5)
+    assert isinstance(rows.derivatives, RowSlopes) and not isinstance(J.derivatives, RowSlopes)
+    for one, two in zip([image, *J.values()], [other, *rows.values()], strict=True):
+        assert one.shape[:2] == (4, 5)
+        np.testing.assert_allclose(two, one, rtol=1e-5, atol=1e-6 * np.abs(one).max())
 
 
 @pytest.mark.slow

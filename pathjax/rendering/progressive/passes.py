@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pathjax import distributed, emitters
-from pathjax.compile import MANY_ITEMS, calls_at_once, compiled, devices_of_a_call
+from pathjax.compile import MANY_ITEMS, calls_at_once, compiled, devices_of_a_call, native_map
 from pathjax.integrators import pixel, reconstruction
 from pathjax.integrators.options import Options
 from pathjax.rendering.progressive import replicates
@@ -262,9 +262,10 @@ def _sums_of_replicates(scene, numbers, seed, scale, *, options):
     scales = jnp.broadcast_to(scale.astype(scene.camera.origin.dtype), spp.shape)
     run = pixels[0], first_sample.astype(jnp.uint32), spp.astype(jnp.uint32), seeds, scales
     choice = emitters.choice(scene.emitters, options.strategy)
-    sums, weights = reconstruction.sums(
-        partial(pixel.mean, options=options), run, scene, choice, options=options, devices=devices_of_a_call()
-    )
+    devices = devices_of_a_call()
+    of_samples = partial(native_map, partial(pixel.mean, options=options), devices=devices)
+    like = jax.ShapeDtypeStruct((3,), scales.dtype)
+    sums, weights = reconstruction.sums(of_samples, like, run, scene, choice, options=options, devices=devices)
     return jnp.concatenate([sums, weights[..., None]], -1).astype(jnp.float32)
 
 
