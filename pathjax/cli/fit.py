@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
 from rich.console import Console
 from rich.markup import escape
 
@@ -14,7 +13,6 @@ from pathjax.cli.inputs import load, numbers
 from pathjax.inverse import report
 from pathjax.inverse.fitting import step_text
 from pathjax.io.load import save_scene
-from pathjax.scene.parameters import parameters
 from pathjax.system.files import check_writable, write_text
 from pathjax.system.interrupts import Interrupts
 from pathjax.system.json_text import json_text
@@ -34,7 +32,7 @@ def run(options, output: Output) -> int:
             start[name] = numbers("--param", name, value)
     target = distributed.of_file(options.target, lambda: inverse.read_target(options.target))
     scene = load(options)
-    if first and any(np.ndim(value) == 3 for name, value in parameters(scene).items() if name in names):
+    if first and any(known.is_texture for name, known in scene.described.parameters.items() if name in names):
         check_writable(Path(f"{options.output}.xml"), [options.target, options.scene])
     with Interrupts():
         with Console(stderr=True, quiet=not first).status("compiling") as status:
@@ -53,7 +51,9 @@ def run(options, output: Output) -> int:
             output.file(picture, lambda path: images.write_png(path, report.picture(fit, [target.image])))
         for name in report.textures(fit):
             of_layers = {"": fit.values[name], "error.": fit.standard_errors[name]}
-            layers = {f"{layer}{c}": x[..., i] for layer, x in of_layers.items() for i, c in enumerate("RGB")}
+            channels = "RGB" if fit.values[name].ndim == 3 else "Y"
+            of_layers = {layer: x.reshape(*x.shape[:2], -1) for layer, x in of_layers.items()}
+            layers = {f"{layer}{c}": x[..., i] for layer, x in of_layers.items() for i, c in enumerate(channels)}
             path = Path(f"{options.output}.{name}.exr")
             output.file(path, lambda path, layers=layers: images.write_exr(path, layers, {}))
         if report.summed_up(fit):

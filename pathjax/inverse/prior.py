@@ -45,7 +45,8 @@ class Prior:
         self.scales = {name: _scale(p, values[name]) for name, p in vector.parameters}
         self.scale = vector.pack(self.scales)  # (n,)
         self.precision = 1 / self.scale**2
-        self.shapes = {name: p.shape for name, p in vector.parameters if is_grid(p)}
+        # (h, w, C) of those that are images; where they are of numbers, C = 1.
+        self.shapes = {name: p.shape if p.is_color else (*p.shape, 1) for name, p in vector.parameters if is_grid(p)}
         if kind not in KINDS:
             raise InputError(f"prior = {kind!r}; use {' or '.join(map(repr, KINDS))}")
         self.total_variation = kind == "total variation"
@@ -92,12 +93,17 @@ class Prior:
 
     def _between(self, x: np.ndarray) -> np.ndarray:
         """What the differences add to `times`."""
-        total = self.vector.unpack(np.zeros(len(x)))
-        for name, value in self.vector.unpack(x).items():
+        total = self._by_name(np.zeros(len(x)))
+        for name, value in self._by_name(x).items():
             for axis in (0, 1) if name in self.links else ():
                 first, _ = _ends(axis)
                 total[name] += _transposed(self.links[name][first] * np.diff(value, axis=axis), axis)
-        return self.vector.pack(total)
+        return _joined(total)
+
+    def _by_name(self, x: np.ndarray) -> dict[str, np.ndarray]:
+        """(n,) as parts of it, images as (h, w, C)."""
+        parts = self.vector.unpack(x)
+        return {name: part.reshape(self.shapes.get(name, part.shape)) for name, part in parts.items()}
 
     def gradient(self, values: np.ndarray) -> np.ndarray:
         """(n,) of minus the logarithm of the density."""
@@ -105,23 +111,23 @@ class Prior:
 
     def diagonal(self) -> np.ndarray:
         """(n,) of the precision matrix."""
-        total = self.vector.unpack(self.precision.copy())
+        total = self._by_name(self.precision.copy())
         for name, link in self.links.items():
             for axis in (0, 1):
                 first, last = _ends(axis)
                 total[name][first] += link[first]
                 total[name][last] += link[first]
-        return self.vector.pack(total)
+        return _joined(total)
 
     def draw(self, random: np.random.Generator) -> np.ndarray:
         """(n,) of a normal distribution whose covariance is the precision matrix."""
-        total = self.vector.unpack(np.sqrt(self.precision) * random.normal(size=len(self.precision)))
+        total = self._by_name(np.sqrt(self.precision) * random.normal(size=len(self.precision)))
         for name, link in self.links.items():
             for axis in (0, 1):
                 first, _ = _ends(axis)
                 normal = random.normal(size=np.diff(total[name], axis=axis).shape)
                 total[name] += _transposed(np.sqrt(link[first]) * normal, axis)
-        return self.vector.pack(total)
+        return _joined(total)
 
     def estimate(self, values: np.ndarray, deviation: np.ndarray, told: np.ndarray) -> None:
         """Take the differences that are most likely, given the mean of the posterior and a deviation drawn from it.
@@ -129,8 +135,8 @@ class Prior:
         As many of them as the images determine are as large, in the mean square, as they were taken for: the fixed
         point of MacKay (1992), Neural Computation 4(3). told: (n,) how much of each number the images determine.
         """
-        deviations, tolds = self.vector.unpack(deviation), self.vector.unpack(told)
-        for name, value in self.vector.unpack(values).items():
+        deviations, tolds = self._by_name(deviation), self._by_name(told)
+        for name, value in self._by_name(values).items():
             if name not in self.links:
                 continue
             known, uncertain = _squares(value), _squares(deviations[name])
@@ -146,8 +152,12 @@ class Prior:
 
 
 def is_grid(parameter: Parameter) -> bool:
-    """Whether it is an image, whose numbers have neighbours."""
-    return parameter.is_texture and len(parameter.shape) == 3
+    """Whether it is an image, of colours or numbers, whose texels have neighbours."""
+    return parameter.is_texture and len(parameter.shape) == 2 + parameter.is_color
+
+
+def _joined(parts: dict[str, np.ndarray]) -> np.ndarray:
+    return np.concatenate([part.ravel() for part in parts.values()])
 
 
 def _scale(parameter: Parameter, start: np.ndarray) -> float:

@@ -8,6 +8,8 @@ import numpy as np
 
 from pathjax.images.picture import GAP, side_by_side, signed_colors
 from pathjax.inverse.fitting import Fit
+from pathjax.inverse.prior import is_grid
+from pathjax.kinds.parameter import Parameter
 
 _FACTS = (
     *("converged", "message", "values", "standard_errors", "components", "covariance", "undetermined", "at_bound"),
@@ -19,12 +21,16 @@ _FULL_SCALE = 3
 
 def textures(fit: Fit) -> list[str]:
     """Names of the parameters that are images."""
-    return [name for name, value in fit.values.items() if value.ndim == 3]
+    return [name for name in fit.values if is_grid(_parameter(fit, name))]
 
 
 def summed_up(fit: Fit) -> list[str]:
-    """Names of the parameters of which a summary is told: images, and grids of volumes."""
-    return [name for name, value in fit.values.items() if value.ndim > 2]
+    """Names of the parameters of which a summary is told: images, grids of volumes, and what meshes carry."""
+    return [name for name in fit.values if _parameter(fit, name).is_texture]
+
+
+def _parameter(fit: Fit, name: str) -> Parameter:
+    return fit.scene.described.parameters[name]
 
 
 def facts(fit: Fit) -> dict:
@@ -44,7 +50,7 @@ def _summary(fit: Fit, name: str) -> dict:
     value, error, seen = fit.values[name], fit.standard_errors[name], fit.seen[name]
     return {
         "shape": value.shape,
-        "mean": value.mean(tuple(range(value.ndim - 1))),
+        "mean": value.mean(tuple(range(seen.ndim))),
         "seen": float(seen.mean()),
         "median_standard_error": float(np.median(error[seen])) if seen.any() else math.inf,
     }
@@ -60,9 +66,9 @@ def text(fit: Fit) -> str:
     width, lines = max(map(len, [*listed, *images])), []
     for name in images:
         known = _summary(fit, name)
-        size = " x ".join(map(str, known["shape"][:-1]))
+        size = " x ".join(map(str, fit.seen[name].shape))
         typical = f"+- {known['median_standard_error']:.3g} in the median" if known["seen"] else "not determined"
-        parts = "texels" if len(known["shape"]) == 3 else "values"
+        parts = "texels" if is_grid(_parameter(fit, name)) else "values"
         lines.append(f"{name:<{width}}  {size} {parts}, {known['seen']:.0%} of them seen, {typical}")
     for label, value, error in zip(listed, values, errors, strict=True):
         digits = 6 if not 0 < error < math.inf else min(max(1 - math.floor(math.log10(error)), 0), 8)

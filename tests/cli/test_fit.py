@@ -139,3 +139,31 @@ def test_a_fitted_texture_becomes_an_image_beside_its_report(run, root, tmp_path
     for i, c in enumerate("RGB"):
         np.testing.assert_allclose(found[c], fitted[..., i], atol=1e-6)
         assert np.abs(found[c] - texels[i]).max() < 0.05 and (found[f"error.{c}"] < 0.05).all()
+
+
+@pytest.mark.slow
+def test_a_fitted_map_of_roughness_becomes_an_image_of_one_channel(run, tmp_path):
+    """Three texels in a row are no colour; and neighbours are smoothed, as those of colours are."""
+    texels = np.array([[0.2, 0.3, 0.4], [0.3, 0.4, 0.5]], np.float32)
+    write_exr(tmp_path / "alpha.exr", dict.fromkeys("RGB", texels), {})
+    image = '<string name="filename" value="alpha.exr"/><boolean name="raw" value="true"/>'
+    (tmp_path / "scene.xml").write_text(
+        f"""<scene version="3.0.0"><integrator type="path"><integer name="max_depth" value="2"/></integrator>
+        <sensor type="perspective"><float name="fov" value="32"/>
+            <transform name="to_world"><lookat origin="0, 3.2, 2.5" target="0, 0, 0" up="0, 1, 0"/></transform>
+            <film type="hdrfilm"><integer name="width" value="16"/><integer name="height" value="16"/></film></sensor>
+        <shape type="rectangle"><transform name="to_world"><rotate x="1" angle="-90"/></transform>
+            <bsdf type="roughconductor" id="metal"><texture type="bitmap" name="alpha">{image}</texture></bsdf></shape>
+        <emitter type="point"><point name="position" x="-1" y="2" z="-2"/></emitter>
+        <emitter type="constant"><float name="radiance" value="0.2"/></emitter></scene>"""
+    )
+    scene = pj.load_scene(tmp_path / "scene.xml")
+    layers = np.moveaxis(np.asarray(pj.render(scene, 1024, seed=1)), -1, 0)
+    write_exr(tmp_path / "target.exr", dict(zip("RGB", layers, strict=True)), {})
+    arguments = "--param", "metal.alpha=0.3", "--smoothness", "auto", "--spp", "64"
+    _, out, _ = run("fit", tmp_path / "scene.xml", tmp_path / "target.exr", *arguments, "-o", tmp_path / "f")
+    assert "2 x 3 texels, 100% of them seen" in out, out
+    found, _ = read_exr(tmp_path / "f.metal.alpha.exr")
+    assert sorted(found) == ["Y", "error.Y"]
+    np.testing.assert_allclose(found["Y"], pj.parameters(pj.load_scene(tmp_path / "f.xml"))["metal.alpha"], atol=1e-6)
+    assert np.abs(found["Y"] - texels).max() < 0.05
