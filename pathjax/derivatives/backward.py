@@ -36,7 +36,7 @@ from pathjax.errors import InputError
 from pathjax.integrators import path, pixel
 from pathjax.integrators.options import Options
 from pathjax.integrators.random_numbers import bounce_numbers
-from pathjax.integrators.reconstruction import images
+from pathjax.integrators.reconstruction import images, pulled
 from pathjax.scene.scene import Scene
 
 # Trips between two sweeps, and those that the ring holds: powers of 2. Where the longest path is not known when a
@@ -317,7 +317,7 @@ def pullback(
     Args:
         scene: without names.
         adjoint: (N, 3) of the means of the pixels.
-        pixels, first_sample, spp, seed: (N,) each.
+        pixels, first_sample, spp, seed: (N,) each, as for `map_pixels`.
         kept: of arrays that `differentiated` knows.
         ring: of `longest_ring`.
         form, devices: of `native_fold`.
@@ -328,9 +328,16 @@ def pullback(
         adjoint, work = work
         return sweep_of(work, scene, choice, adjoint, partial(moved, kept.place), memory)[1]
 
-    begin, end = partial(start, scene, structure, kept.count, ring), partial(finish, structure)
-    work = adjoint, (pixels, first_sample, spp, seed)
-    return native_fold(of_pixel, work, scene, choice, start=begin, finish=end, form=form, devices=devices)
+    def of_samples(adjoint, work, scene, choice):
+        begin, end = partial(start, scene, structure, kept.count, ring), partial(finish, structure)
+        how = dict(start=begin, finish=end, form=form, devices=devices)
+        return native_fold(of_pixel, (adjoint, work), scene, choice, **how)
+
+    work = pixels, first_sample, spp, seed
+    if not options.shared:
+        return of_samples(adjoint, work, scene, choice)
+    zero = jnp.zeros((kept.count, totals.WIDTH), adjoint.dtype)
+    return pulled(of_samples, zero, adjoint, work, scene, choice, options=options, devices=devices)
 
 
 @partial(jax.jit, static_argnames=("kept", "options", "ring", "form", "devices"))

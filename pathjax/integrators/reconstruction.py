@@ -62,7 +62,7 @@ def map_pixels(
     if not options.shared:
         return _own_samples(of_pixel, work, scene, *shared, means=means, **how)
     one = jax.tree.map(lambda x: jax.ShapeDtypeStruct((), x.dtype), work)
-    like = jax.eval_shape(of_pixel, one, replace(scene, film=film.of_samples(scene.film)), *shared)
+    like = jax.eval_shape(of_pixel, one, _sampled(scene), *shared)
     of_samples = partial(native_map, of_pixel, **how)
     return images(of_samples, like, work, scene, *shared, options=options, devices=how.get("devices"))
 
@@ -71,12 +71,48 @@ def images(
     of_samples: Callable, like, work: Works, scene: Scene, *shared, options: Options, devices: int | None = None
 ) -> object:
     """What `map_pixels` gives of a film that shares samples. of_samples, like: of `sums`."""
-    count = film.pixel_count(film.of_samples(scene.film))
-    _, first_sample, spp, seed = (x.reshape(-1, count) for x in work)
-    scale = 1 / jnp.maximum(spp, 1).astype(scene.camera.origin.dtype)
-    run = jnp.int32(0), first_sample, spp, seed, scale
+    run = _whole(work, scene)
     totals, weights = sums(of_samples, like, run, scene, *shared, options=options, devices=devices)
     return jax.tree.map(lambda total: _images(scene.film, total, weights), totals)
+
+
+def pulled(
+    of_samples: Callable,
+    zero: Float[Array, "..."],
+    adjoint: Float[Array, "pixels 3"],
+    work: Works,
+    scene: Scene,
+    *shared,
+    options: Options,
+    devices: int | None = None,
+) -> Float[Array, "..."]:
+    """The transpose of `images`: of their adjoint, the sum of what samples give of theirs.
+
+    Args:
+        of_samples: (adjoint (N, 3) of the values of samples, Works, scene, *shared) -> what is added up, like `zero`.
+        work, options, devices: of `images`.
+    """
+    run = first_pixel, *_, scale = _whole(work, scene)
+    through, channels = scene.film, adjoint.shape[-1]
+    _, weights = sums(lambda *_: (), (), run, scene, options=options, devices=devices)
+    like = jax.ShapeDtypeStruct((*weights.shape, channels), scale.dtype)
+    (of_sums,) = jax.linear_transpose(partial(_images, through, weights=weights), like)(adjoint)
+    count, of_block = _blocks(run, scene, channels, options)
+
+    def add(number, total):
+        work, there, u = of_block(number)
+        of_values = gather_samples(through, first_pixel, u, jnp.where(there, scale, 0), of_sums, devices)
+        new = of_samples(of_values.reshape(-1, channels), work, _sampled(scene), *shared)
+        return total + new
+
+    return lax.fori_loop(0, count, add, zero)
+
+
+def _whole(work: Works, scene: Scene) -> Run:
+    """All pixels of an image or of some."""
+    count = film.pixel_count(film.of_samples(scene.film))
+    _, first_sample, spp, seed = (x.reshape(-1, count) for x in work)
+    return jnp.int32(0), first_sample, spp, seed, 1 / jnp.maximum(spp, 1).astype(scene.camera.origin.dtype)
 
 
 def _own_samples(of_pixel: Callable, work: Works, scene: Scene, *shared, means: bool, **how) -> object:
@@ -127,33 +163,53 @@ def sums(
         like: that of one sample, shapes and dtypes.
         devices: of `native_map`.
     """
-    first_pixel, first_sample, spp, seed, scale = run
-    through, sampled = scene.film, replace(scene, film=film.of_samples(scene.film))
-    copies, count = spp.shape
-    pixels = first_pixel + jnp.arange(count, dtype=jnp.int32)
+    first_pixel, _, spp, _, scale = run
+    through = scene.film
     leaves, structure = jax.tree.flatten(like)
-    places = np.cumsum([prod(leaf.shape) for leaf in leaves])
-    block = max(min(_SAMPLES // spp.size, _NUMBERS // (spp.size * places[-1]), _OF_PIXEL), 1)
+    sizes = [prod(leaf.shape) for leaf in leaves]
+    channels, places = sum(sizes), np.cumsum(sizes, dtype=int)
+    count, of_block = _blocks(run, scene, channels, options)
 
-    def add(number_of_block, state):
-        done = jnp.uint32(block) * number_of_block.astype(jnp.uint32) + jnp.arange(block, dtype=jnp.uint32)
+    def add(number, state):
+        work, there, u = of_block(number)
+        values = jax.tree.leaves(of_samples(work, _sampled(scene), *shared))
+        none = jnp.zeros((*there.shape, 0), scale.dtype)
+        values = jnp.concatenate([none, *(x.reshape(*there.shape, -1) for x in values)], -1)
+        values = jnp.where(there[..., None], values, 0)
+        spread = spread_samples(through, first_pixel, u, jnp.where(there, scale, 0), values, devices)
+        return add_compensated(state, spread)
+
+    zero = jnp.zeros((len(spp), channels + 1, spp.shape[1] + 2 * halo(through)), scale.dtype)
+    total, _ = lax.fori_loop(0, count, add, (zero, zero))
+    parts = jnp.split(jnp.moveaxis(total, 1, 2), places, axis=-1)
+    parts = [part.reshape(*part.shape[:2], *leaf.shape) for part, leaf in zip(parts, leaves, strict=False)]
+    return jax.tree.unflatten(structure, parts), total[:, -1]
+
+
+def _sampled(scene: Scene) -> Scene:
+    """The scene whose pixels look through a box."""
+    return replace(scene, film=film.of_samples(scene.film))
+
+
+def _blocks(run: Run, scene: Scene, channels: int, options: Options) -> tuple[Int[Array, ""], Callable]:
+    """In how many calls of a kernel, of so many numbers of each sample, all samples are; and number -> those of one:
+
+    Works of all B samples of each pixel, of which some are not (B, R, n) there, and `film_numbers` (B, R, n, 2).
+    """
+    first_pixel, first_sample, spp, seed, _ = run
+    pixels = first_pixel + jnp.arange(spp.shape[1], dtype=jnp.int32)
+    block = max(min(_SAMPLES // spp.size, _NUMBERS // (spp.size * max(channels, 1)), _OF_PIXEL), 1)
+
+    def of_block(number):
+        done = jnp.uint32(block) * number.astype(jnp.uint32) + jnp.arange(block, dtype=jnp.uint32)
         done = done[:, None, None]
         numbers, there = first_sample + done, done < spp
         work = pixels, numbers, there.astype(jnp.uint32), seed
         work = tuple(jnp.broadcast_to(x, numbers.shape).ravel() for x in work)
-        values = jax.tree.leaves(of_samples(work, sampled, *shared))
-        values = jnp.concatenate([x.reshape(*numbers.shape, -1) for x in values], -1)
-        values = jnp.where(there[..., None], values, 0)
-        u = film_numbers(sampled, pixels, numbers, seed, options.sampler)
-        spread = spread_samples(through, first_pixel, u, jnp.where(there, scale, 0), values, devices)
-        return add_compensated(state, spread)
+        return work, there, film_numbers(_sampled(scene), pixels, numbers, seed, options.sampler)
 
-    zero = jnp.zeros((copies, places[-1] + 1, count + 2 * halo(through)), scale.dtype)
-    blocks = (jnp.max(spp) + jnp.uint32(block - 1)) // jnp.uint32(block)
-    total, _ = lax.fori_loop(0, blocks.astype(jnp.int32), add, (zero, zero))
-    parts = jnp.split(jnp.moveaxis(total, 1, 2), places, axis=-1)
-    parts = [part.reshape(*part.shape[:2], *leaf.shape) for part, leaf in zip(parts, leaves, strict=False)]
-    return jax.tree.unflatten(structure, parts), total[:, -1]
+    count = (jnp.max(spp) + jnp.uint32(block - 1)) // jnp.uint32(block)
+    return count.astype(jnp.int32), of_block
 
 
 def film_numbers(
@@ -213,22 +269,66 @@ def _spread(
     through: Film, pixels: Int[Array, " n"], u: Float[Array, "2 n"], weighted: Float[Array, "C n"]
 ) -> Float[Array, "C m"]:
     """One sample of each of n pixels in a row, spread; m = n - 2 `halo`, so that all that reach a pixel are there."""
-    reach, width, edge = through.reach, film.of_samples(through).crop[2], halo(through)
-    steps = jnp.arange(-reach, reach + 1)[:, None]
+    edge, total = halo(through), 0
+    by_x, by_y, weighted = lax.optimization_barrier((*_weights(through, pixels, u), weighted))
+    for b, a, step in _steps(through):
+        here = np.s_[..., edge - step : len(pixels) - edge - step]
+        weight = by_x[a][here] * by_y[b][here]
+        # What is not finite spoils no pixel in which it does not count.
+        total = total + jnp.where(weight != 0, weight * weighted[here], 0)
+    return total
+
+
+def _weights(
+    through: Film, pixels: Int[Array, " n"], u: Float[Array, "2 n"]
+) -> tuple[Float[Array, "S n"], Float[Array, "S n"]]:
+    """The two factors of what samples weigh in pixels -reach, ..., reach away."""
+    width = film.of_samples(through).crop[2]
+    steps = jnp.arange(-through.reach, through.reach + 1)[:, None]
     by_x, by_y = (through.filter.evaluate(u[axis] - 0.5 - steps.astype(u.dtype)) for axis in (0, 1))
     # What lies beyond a row's ends is in no pixel.
     x = pixels % width + steps
-    by_x = jnp.where((x >= 0) & (x < width), by_x, 0)
-    by_x, by_y, weighted = lax.optimization_barrier((by_x, by_y, weighted))
-    total = 0
-    for b in range(2 * reach + 1):
-        for a in range(2 * reach + 1):
-            first = edge - (b - reach) * width - (a - reach)
-            here = np.s_[..., first : first + len(pixels) - 2 * edge]
-            weight = by_x[a][here] * by_y[b][here]
-            # What is not finite spoils no pixel in which it does not count.
-            total = total + jnp.where(weight != 0, weight * weighted[here], 0)
-    return total
+    return jnp.where((x >= 0) & (x < width), by_x, 0), by_y
+
+
+def _steps(through: Film) -> list[tuple[int, int, int]]:
+    """Of all pixels around one, the numbers of their factors of `_weights` in y and x, and how far on they are."""
+    reach, width = through.reach, film.of_samples(through).crop[2]
+    around = range(2 * reach + 1)
+    return [(b, a, (b - reach) * width + a - reach) for b in around for a in around]
+
+
+def gather_samples(
+    through: Film,
+    first_pixel: Int[Array, ""],
+    u: Float[Array, "B R n 2"],
+    scale: Float[Array, "B R n"],
+    of_sums: Float[Array, "R m C"],
+    devices: int | None = None,
+) -> Float[Array, "B R n C"]:
+    """The transpose of `spread_samples` but for the weights: of the adjoint of sums, that of the values of samples."""
+    edge, count = halo(through), u.shape[2]
+    spare = [(0, 0), (0, 0), (0, len(jax.devices()))]  # what the last device has too many
+    adjoint = jnp.pad(jnp.moveaxis(of_sums, -1, 1), spare)
+    u, scale = jnp.pad(jnp.moveaxis(u, -1, 2), [(0, 0), *spare]), jnp.pad(scale, spare)
+
+    def of_run(first, size, u, scale, adjoint):
+        def window(x, more=0):
+            return lax.dynamic_slice_in_dim(x, first, size + more, axis=-1)
+
+        pixels, around = first_pixel + first + jnp.arange(size), window(adjoint, 2 * edge)
+
+        def gather(u, scale, around):
+            by_x, by_y, around = lax.optimization_barrier((*_weights(through, pixels, u), around))
+            total = 0
+            for b, a, step in _steps(through):
+                total = total + by_x[a] * by_y[b] * around[:, edge + step : edge + step + size]
+            return scale * total
+
+        return lax.map(lambda sample: jax.vmap(gather)(*sample, around), (window(u), window(scale)))
+
+    found = split_map(of_run, count, u, scale, adjoint, devices=devices)
+    return jnp.moveaxis(found, 2, -1)
 
 
 def image_of_samples(

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 
 import jax
-import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from pathjax import emitters
@@ -133,26 +132,17 @@ class _PixelMeans:
 
     def push(self, scene, wanted, changes, control, pixels, *numbers):
         self.options.check_differentiable()
-        options, *work = self._own_samples(scene, pixels, *numbers)
-        return self._shaped(matrix_free.push(scene, wanted, changes, *work, options, **dict(self.how)))
+        work = pixels, *numbers, self.options
+        return self._shaped(matrix_free.push(scene, wanted, changes, *work, **dict(self.how)))
 
     def pull(self, scene, wanted, adjoint, control, pixels, *numbers):
         self.options.check_differentiable()
-        options, *work = self._own_samples(scene, pixels, *numbers)
-        adjoint = adjoint.reshape(-1, 3)
-        return matrix_free.pull(scene, wanted, adjoint, *work, options, self.ring, **dict(self.how))
+        work = pixels, *numbers, self.options, self.ring
+        return matrix_free.pull(scene, wanted, adjoint.reshape(-1, 3), *work, **dict(self.how))
 
     def _shaped(self, values):
         """(N, ...) -> (*shape, ...)"""
         return values.reshape(*self.shape, *values.shape[1:])
-
-    def _own_samples(self, scene, pixels, *numbers):
-        """What a sweep takes: it knows of pixels that draw their own samples alone, whose means are the same."""
-        if not self.options.shared:
-            return self.options, pixels, *numbers
-        pixels = jnp.arange(film.pixel_count(scene.film), dtype=jnp.int32)
-        numbers = (film.cropped(scene.film, x[None])[0] for x in numbers)
-        return replace(self.options, shared=False), pixels, *numbers
 
 
 @partial(jax.jit, static_argnames=("options", "form", "devices", "shape"))

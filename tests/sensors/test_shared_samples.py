@@ -11,12 +11,13 @@ from scipy import stats
 
 import pathjax as pj
 from pathjax import images, transport
-from pathjax.derivatives import jacobian
+from pathjax.derivatives import jacobian, matrix_free
 from pathjax.derivatives.row_slopes import RowSlopes
 from pathjax.integrators import pixel, reconstruction
 from pathjax.integrators.options import DEFAULTS, Options
 from pathjax.rendering.progressive import passes
 from pathjax.rendering.render import pixel_means
+from pathjax.scene import parameters as named
 from pathjax.sensors import film
 from pathjax.sensors.filters import Box, Gaussian, Tent
 
@@ -144,6 +145,22 @@ def test_a_recorded_jacobian_goes_the_same_way(ball, monkeypatch):
     for one, two in zip([image, *J.values()], [other, *rows.values()], strict=True):
         assert one.shape[:2] == (4, 5)
         np.testing.assert_allclose(two, one, rtol=1e-5, atol=1e-6 * np.abs(one).max())
+
+
+def test_products_with_a_jacobian_go_the_same_way(ball):
+    scene = through(ball, Gaussian(), True, (2, 1, 5, 4))
+    wanted, bare, random = scene.about.parameters, named.nameless(scene), np.random.default_rng(0)
+    work = film.pixels(scene.film), 0, 3, 5, Options(shared=True)
+    changes = {name: jnp.asarray(random.normal(size=p.shape), jnp.float32) for name, p in wanted.items()}
+    v = jnp.asarray(random.normal(size=(4, 5, 3)), jnp.float32)
+    _, J = pj.jacobian(scene, list(wanted), 3, 5)
+    moved = sum(jnp.einsum("yxck,k->yxc", J[name], change) for name, change in changes.items())
+    size = np.abs(moved).max()
+    np.testing.assert_allclose(
+        matrix_free.push(bare, wanted, changes, *work), moved.reshape(-1, 3), rtol=1e-5, atol=1e-5 * size
+    )
+    for name, pulled in matrix_free.pull(bare, wanted, v.reshape(-1, 3), *work).items():
+        np.testing.assert_allclose(pulled, jnp.tensordot(v, J[name], 3), rtol=1e-5, atol=1e-6 * np.abs(J[name]).sum())
 
 
 @pytest.mark.slow
