@@ -116,13 +116,12 @@ def test_sensors_of_one_number_agree_with_mitsuba(case):
     assert (abs(one.mean(0) - other.mean(0)) < 5 * error + 1e-6 * one.mean(0)).all()
 
 
-@pytest.mark.parametrize("case", ["radiancemeter", "distant"])
-def test_derivatives_through_glass_are_finite(case):
+@pytest.mark.parametrize(("case", "lights"), [("radiancemeter", ("sky", "lamp")), ("distant", ("sky",))])
+def test_derivatives_through_glass_are_finite(case, lights):
     """Where paths move with a parameter, though no ray moves with its place on the film."""
     glass = {"type": "sphere", "bsdf": {"type": "dielectric", "id": "clear"}}
-    lights = {name: around()[name] for name in ("sky", "lamp")}
-    scene = pj.load_dict(seen(SENSORS[case], **lights, glass=glass))
-    image, J = pj.jacobian(scene, ["clear.int_ior", "lamp.radiance"], spp=64)
+    scene = pj.load_dict(seen(SENSORS[case], **{name: around()[name] for name in lights}, glass=glass))
+    image, J = pj.jacobian(scene, ["clear.int_ior", f"{lights[-1]}.radiance"], spp=64)
     assert np.isfinite(image).all() and all(np.isfinite(each).all() for each in J.values())
 
 

@@ -71,32 +71,45 @@ PAIRS = {
 }
 
 
-@pytest.mark.parametrize("pair", PAIRS)
-def test_coplanar_shapes_swallow_no_light(make_scene, obj, pair):
+@pytest.fixture
+def among_others(obj):
+    """(pair, steps) -> its shapes, moved by these steps, and others deep below, where nothing is seen of them.
+
+    Of each kind there are four, two of which lie in one another at least: one structure, and one kernel for all pairs.
+    """
     square = obj(SQUARE, HALVES)
+
+    def body(pair, steps):
+        hidden = '<scale value="0.01"/><translate z="-20"/>'
+        kinds = ("rectangle", "disk", "cube", "obj")
+        others = [(kind, hidden) for kind in kinds for _ in range(4 - sum(kind == k for k, _ in PAIRS[pair]))]
+        return "".join(
+            shape(kind, transform + steps, square if kind == "obj" else GREY)
+            for kind, transform in (*PAIRS[pair], *others)
+        )
+
+    return body
+
+
+@pytest.mark.parametrize("pair", PAIRS)
+def test_coplanar_shapes_swallow_no_light(make_scene, among_others, pair):
     for angle in ANGLES:
-        both = [
-            shape(kind, transform + turned(angle), square if kind == "obj" else GREY) for kind, transform in PAIRS[pair]
-        ]
+        body = among_others(pair, turned(angle))
         above = f"0, {float(-5 * np.sin(np.radians(angle)))}, {float(5 * np.cos(np.radians(angle)))}"
-        scene = make_scene("".join(both) + SKY, origin=above, up="1, 0, 0", fov=10, depth=2, res=8)
+        scene = make_scene(body + SKY, origin=above, up="1, 0, 0", fov=10, depth=2, res=8)
         assert_half_everywhere(scene)
 
 
 @pytest.mark.parametrize("scale, shift", [(1e-3, 0), (1e5, 0), (1, 1e4), (1e5, 1e3)])
 @pytest.mark.parametrize("pair", ["a rectangle twice", "a cube twice", "a small mesh in a large one"])
-def test_coplanar_shapes_swallow_no_light_at_any_scale_and_place(make_scene, obj, pair, scale, shift):
-    square = obj(SQUARE, HALVES)
+def test_coplanar_shapes_swallow_no_light_at_any_scale_and_place(make_scene, among_others, pair, scale, shift):
     move = f'<scale value="{scale!r}"/><translate x="{scale * shift!r}" y="{-scale * shift!r}" z="{scale * shift!r}"/>'
-    both = [
-        shape(kind, transform + turned(10) + move, square if kind == "obj" else GREY) for kind, transform in PAIRS[pair]
-    ]
     origin, target = (
         ", ".join(repr(scale * float(c + s * shift)) for c, s in zip(p, (1, -1, 1), strict=True))
         for p in ((0, -5 * np.sin(np.radians(10)), 5 * np.cos(np.radians(10))), (0, 0, 0))
     )
     scene = make_scene(
-        "".join(both) + SKY, origin=origin, target=target, up="1, 0, 0", fov=10, depth=2, res=8,
+        among_others(pair, turned(10) + move) + SKY, origin=origin, target=target, up="1, 0, 0", fov=10, depth=2, res=8,
         near=0.01 * scale, far=100 * scale,
     )  # fmt: skip
     assert_half_everywhere(scene)
