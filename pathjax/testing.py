@@ -37,6 +37,7 @@ LEAST_EXPECTED = 10
 # Step of differences: float32 keeps five digits of them, and their error is of second order.
 STEP = 0.01
 # All that kinds of the package ask of a surface: where textures are looked up.
+FEW = 2000  # samples of checks of each one by itself, which share what is compiled
 _SURFACE = SimpleNamespace(uv=jnp.full(2, 0.5, jnp.float32))
 
 
@@ -106,7 +107,7 @@ def check_range(materials: Materials, wi):
     """Values, densities, weights and their derivatives are finite and not negative, at the ends of all ranges too."""
     ends = np.array([0, 2**-24, 0.5, 1 - 2**-24], np.float32)
     width = random_numbers(materials, 1, 0).shape[1]
-    u = jnp.asarray(np.stack(np.meshgrid(*[ends] * width), -1).reshape(-1, width))
+    u = jnp.asarray(np.resize(np.stack(np.meshgrid(*[ends] * width), -1), (FEW, width)))
     grazing = [np.array([math.sqrt(1 - z * z), 0, z], np.float32) for z in (1e-4, 1e-7, 0.0)]
     for each in [wi, *grazing]:
         drawn = sample(materials, each, u)
@@ -121,7 +122,7 @@ def check_range(materials: Materials, wi):
 
 def check_weights(materials: Materials, wi):
     """Sampled directions are unit, and weight times density is the value that `evaluate` has there."""
-    drawn = sample(materials, wi, random_numbers(materials, 2000, 1))
+    drawn = sample(materials, wi, random_numbers(materials, FEW, 1))
     length = np.linalg.norm(drawn.wo, axis=1)
     assert np.allclose(length, 1, atol=1e-5), f"a direction has length {length[np.argmax(abs(length - 1))]}"
     kept = ~np.asarray(drawn.delta) & (np.asarray(drawn.pdf) > 0)
@@ -200,7 +201,7 @@ def check_reciprocity(materials: Materials, seed: int = 4):
 
 def check_detached(materials: Materials, wi):
     """Directions and densities carry no derivative in parameters: the weights do, for samples drawn at their values."""
-    u = random_numbers(materials, 64, 5)
+    u = random_numbers(materials, FEW, 5)
     for name, tangent in _material_tangents(materials, but_moving=True).items():
         drawn = sample_tangent(materials, tangent, wi, u)
         for what in ("wo", "pdf"):

@@ -47,16 +47,16 @@ def test_map_over_trees_with_shared_trees(form):
         (a, b), index = item["pair"], item["index"]
         return {"sum": a + b * number, "picked": (table["rows"][index],)}
 
-    xs = {"pair": (jnp.arange(5.0), jnp.ones(5)), "index": jnp.asarray([2, 0, 1, 1, 2])}
-    table = {"rows": jnp.arange(12.0).reshape(3, 4)}
-    out = native_map(f, xs, table, 3.0, form=form)
+    xs = {"pair": (np.arange(5, dtype=np.float32), np.ones(5, np.float32)), "index": np.array([2, 0, 1, 1, 2])}
+    table = {"rows": np.arange(12, dtype=np.float32).reshape(3, 4)}
+    out = jax.jit(lambda xs, table: native_map(f, xs, table, 3.0, form=form))(xs, table)
     np.testing.assert_array_equal(out["sum"], np.arange(5) + 3)
     np.testing.assert_array_equal(out["picked"][0], table["rows"][xs["index"]])
 
 
 @pytest.mark.skipif(MANY < 2, reason="needs two devices")
 def test_order_is_kept_for_every_number_of_devices():
-    xs = jnp.arange(101.0)
+    xs = np.arange(101, dtype=np.float32)
     for devices in range(1, MANY + 1):
         np.testing.assert_array_equal(native_map(lambda x: 2 * x, xs, devices=devices), 2 * xs)
 

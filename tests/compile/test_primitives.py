@@ -55,7 +55,7 @@ def of_x(f):
 @pytest.mark.parametrize("transform", [lambda f: f, jax.jit], ids=["eager", "jit"])
 def test_values(pair, transform):
     said, plain = pair
-    same(transform(said)(X, N), plain(X, N))
+    same(transform(said)(X, N), jax.jit(plain)(X, N))
 
 
 @pytest.mark.parametrize("axes", [(0, None), (None, 0), (0, 0)])
@@ -63,23 +63,23 @@ def test_vmap(pair, axes):
     said, plain = pair
     xs = X * jnp.arange(1.0, 5)[:, None] if axes[0] == 0 else X
     ns = jnp.arange(4, dtype=jnp.int32) if axes[1] == 0 else N
-    same(jax.jit(jax.vmap(said, axes))(xs, ns), jax.vmap(plain, axes)(xs, ns))
+    same(jax.jit(jax.vmap(said, axes))(xs, ns), jax.jit(jax.vmap(plain, axes))(xs, ns))
 
 
 def test_forward_derivatives(pair):
-    same(*(jax.jvp(f, (X,), (X + 1,)) for f in map(of_x, pair)))
-    same(*(jax.jacfwd(f)(X) for f in map(of_x, pair)))
+    same(*(jax.jit(lambda x, f=f: jax.jvp(f, (x,), (x + 1,)))(X) for f in map(of_x, pair)))
+    same(*(jax.jit(jax.jacfwd(f))(X) for f in map(of_x, pair)))
 
 
 def test_reverse_derivatives(pair):
     same(*(jax.jit(jax.jacrev(f))(X) for f in map(of_x, pair)))
-    same(*(jax.jvp(jax.jacrev(f), (X,), (X,)) for f in map(of_x, pair)))
+    same(*(jax.jit(lambda x, f=f: jax.jvp(jax.jacrev(f), (x,), (x,)))(X) for f in map(of_x, pair)))
 
 
 def test_derivatives_within_lanes(pair):
     xs = jnp.asarray(np.random.default_rng(0).normal(size=(7, 3)), jnp.float32)
     said, plain = (lambda x, f=f: (jax.jacfwd(f)(x), jax.jacrev(f)(x)) for f in map(of_x, pair))
-    same(jax.jit(lanes(said, 4))(xs), jax.vmap(plain)(xs))
+    same(jax.jit(lanes(said, 4))(xs), jax.jit(jax.vmap(plain))(xs))
 
 
 def test_what_has_no_tangent_gets_none():
@@ -114,8 +114,8 @@ def test_a_persistent_loop_is_a_loop():
     said, plain = power(persistent_loop), power(lax.while_loop)
     same(said(X, N), plain(X, N))
     ns = jnp.arange(4, dtype=jnp.int32)
-    same(jax.jit(jax.vmap(said, (None, 0)))(X, ns), jax.vmap(plain, (None, 0))(X, ns))
-    same(*(jax.jacfwd(f)(X, N) for f in (said, plain)))
+    same(*(jax.jit(jax.vmap(f, (None, 0)))(X, ns) for f in (said, plain)))
+    same(*(jax.jit(jax.jacfwd(f))(X, N) for f in (said, plain)))
 
 
 def collatz(n, scale):

@@ -55,6 +55,22 @@ def plate(*steps, inside=GREY):
 FLOOR = plate()
 
 
+# One of each kind that gives no light, and a sheet that is out of the way: for scenes that share a kernel.
+DARK = {
+    kind: emitter(kind, color(name, 0, 0, 0), f"dark {kind}")
+    for kind, name in (
+        *(("point", "intensity"), ("spot", "intensity"), ("directional", "irradiance")),
+        ("projector", "irradiance"),
+    )
+}
+BELOW = plate('<translate y="-9"/>', inside='<bsdf type="diffuse"/>')
+
+
+def under(kind, light, floor=FLOOR, sheet=BELOW):
+    """A floor under one light of this kind, and what lets all such scenes share a kernel."""
+    return floor + sheet + light + "".join(dark for other, dark in DARK.items() if other != kind)
+
+
 def reflected(irradiance):
     return ALBEDO / np.pi * irradiance
 
@@ -70,7 +86,8 @@ INTENSITY = np.array([6.0, 3.0, 1.0])
 @pytest.mark.parametrize("where", [(0, 2, 0), (0.5, 0.3, -2), (-3, 40, 1)])
 @pytest.mark.parametrize("strategy", ["mis", "light"])
 def test_a_point_light_falls_with_the_square_of_the_distance(make_scene, where, strategy):
-    scene = make_scene(FLOOR + emitter("point", color("intensity", *INTENSITY) + vector("position", where)), **VIEW)
+    light = emitter("point", color("intensity", *INTENSITY) + vector("position", where))
+    scene = make_scene(under("point", light), **VIEW)
     distance = np.linalg.norm(where)
     expected = reflected(INTENSITY * where[1] / distance**3)
     np.testing.assert_allclose(rendered(scene, strategy=strategy), expected, rtol=NEAR)
@@ -78,9 +95,8 @@ def test_a_point_light_falls_with_the_square_of_the_distance(make_scene, where, 
 
 def test_to_world_moves_the_origin_to_a_point_light(make_scene):
     moved = placed('<scale value="2"/>', '<translate x="0.25" y="1"/>', '<scale x="2" y="1" z="-1"/>')
-    one, other = (
-        make_scene(FLOOR + emitter("point", inside), **VIEW) for inside in (moved, vector("position", (0.5, 1, 0)))
-    )
+    lights = (emitter("point", inside) for inside in (moved, vector("position", (0.5, 1, 0))))
+    one, other = (make_scene(under("point", light), **VIEW) for light in lights)
     np.testing.assert_array_equal(pj.render(one, 1), pj.render(other, 1))
 
 
@@ -114,7 +130,7 @@ def cone(cutoff=None, beam=None):
     ],
 )
 def test_a_spot_falls_linearly_in_the_angle(make_scene, cutoff, beam, angle, falloff):
-    scene = make_scene(FLOOR + spot(angle, cone(cutoff, beam)), **VIEW)
+    scene = make_scene(under("spot", spot(angle, cone(cutoff, beam))), **VIEW)
     # Samples lie within 1e-3 degrees, seen from the light; the narrowest ramp is 0.4 degrees wide.
     np.testing.assert_allclose(rendered(scene), reflected(INTENSITY * falloff / 4), rtol=3e-3 if falloff % 1 else NEAR)
 
@@ -125,7 +141,8 @@ def test_a_directional_light_falls_with_the_cosine(make_scene, tilt, given):
     towards = np.array([-1.0, -2.0, 0.5])
     where = vector("direction", 7e-30 * towards) if given == "direction" else lookat((5, 6, 7), (5, 6, 7) + towards)
     floor = plate(f'<rotate z="1" angle="{tilt}"/>')
-    scene = make_scene(floor + emitter("directional", color("irradiance", 1, 2, 3) + where), **VIEW)
+    light = emitter("directional", color("irradiance", 1, 2, 3) + where)
+    scene = make_scene(under("directional", light, floor), **VIEW)
     normal = np.array([-math.sin(math.radians(tilt)), math.cos(math.radians(tilt)), 0])
     cosine = max(-towards @ normal / np.linalg.norm(towards), 0)
     # The camera is behind the floor that is tilted most.
@@ -137,7 +154,8 @@ def test_defaults_are_mitsubas(make_scene):
     """1 in the origin, along z, within 20 degrees; a uniform spectrum has the colour that it has as a radiance."""
     wall = plate('<rotate x="1" angle="-90"/>', '<translate z="1"/>')
     for kind in ("point", "spot", "directional"):
-        scene = make_scene(wall + f'<emitter type="{kind}"/>', **VIEW | {"target": "0, 0, 1", "origin": "0.1, 0.2, 0"})
+        light = f'<emitter type="{kind}" id="{kind}"/>'
+        scene = make_scene(under(kind, light, wall), **VIEW | {"target": "0, 0, 1", "origin": "0.1, 0.2, 0"})
         np.testing.assert_allclose(rendered(scene), reflected(1.0), rtol=NEAR)
         assert {f"{kind}.{name}" for name in ("intensity", "irradiance")} & pj.parameters(scene).keys()
     uniform = emitter("point", '<spectrum name="intensity" value="2"/>')
@@ -151,7 +169,7 @@ def test_a_projector_lights_a_screen_evenly(make_scene, at, lit):
     x, z = -2 * at[0], -2 * at[1]
     above = lookat((x, 2, z), (x, 0, z), (0, 0, 1))
     light = emitter("projector", color("irradiance", 1, 2, 3) + lens(90) + above)
-    found = rendered(make_scene(plate('<scale value="4"/>') + light, **VIEW))
+    found = rendered(make_scene(under("projector", light, plate('<scale value="4"/>')), **VIEW))
     np.testing.assert_allclose(found, lit * reflected(np.pi * np.array([1, 2, 3]) / 4), rtol=NEAR)
 
 
@@ -177,11 +195,11 @@ def test_what_stands_in_the_way_casts_a_shadow(make_scene, name, kind):
     sheet = plate('<scale value="0.1"/>', '<translate y="0.5"/>', inside=f'<bsdf type="{kind}"/>')
     beside = sheet.replace('y="0.5"', 'x="0.3" y="0.5"')
     above = sheet.replace('y="0.5"', 'y="3"')
-    assert not np.any(pj.render(make_scene(FLOOR + sheet + light, **VIEW | {"depth": 8}), 4))
-    lit = rendered(make_scene(FLOOR + beside + light, **VIEW))
-    assert lit.min() > 0
-    over = rendered(make_scene(FLOOR + above + light, **VIEW))
-    np.testing.assert_allclose(over, 0 if light is SUN else lit, rtol=NEAR)
+    assert not np.any(pj.render(make_scene(under(name, light, sheet=sheet), **VIEW | {"depth": 8}), 1))
+    plain = rendered(make_scene(under(name, light, sheet=beside), **VIEW))
+    assert plain.min() > 0
+    over = rendered(make_scene(under(name, light, sheet=above), **VIEW))
+    np.testing.assert_allclose(over, 0 if light is SUN else plain, rtol=NEAR)
 
 
 def test_a_light_shines_off_the_wall_that_it_lies_in(make_scene):
@@ -272,12 +290,13 @@ LIGHTS = {
 
 @pytest.mark.parametrize("strategy", ["mis", pytest.param("light", marks=pytest.mark.slow)])
 def test_lights_of_all_kinds_add_up(make_scene, estimate, agree, strategy):
-    """z-test with the false-alarm rate of `agree`, 1e-4: one of them is chosen for each sample. Alone they are exact,
-    but the lamp, and the sky that it hides a part of, which 16,384 samples know to `NEAR`."""
-    unlit = LAMP.replace("3, 2, 1", "0, 0, 0")
-    alone = [make_scene(FLOOR + light + (unlit if light is SKY else ""), **VIEW) for light in LIGHTS.values()]
-    expected = sum(np.asarray(pj.render(scene, 4096), float).mean((0, 1)) for scene in alone)
+    """z-test with the false-alarm rate of `agree`, 1e-4: one of them is chosen for each sample. Where the others are
+    dark each is exact, but the lamp, and the sky that it hides a part of, which 16,384 samples know to `NEAR`."""
     together = make_scene(FLOOR + "".join(LIGHTS.values()), **VIEW)
+    names = [name for name in pj.parameters(together) if not name.endswith("reflectance")]
+    assert len(names) == len(LIGHTS)
+    alone = [pj.with_parameters(together, dict.fromkeys({*names} - {name}, 0.0)) for name in names]
+    expected = sum(np.asarray(pj.render(scene, 4096), float).mean((0, 1)) for scene in alone)
     kinds = ["area", "point", "spot", "constant", "directional"]
     assert [emitters.name(lights) for lights in together.emitters] == kinds
     agree(estimate(together, 1024, 24, strategy=strategy), expected, pixelwise=False, rounding=NEAR)
