@@ -56,10 +56,9 @@ def test_import_turns_native_loops_on_with_a_device_per_core(untouched):
     assert "Warning" not in err
 
 
-@pytest.mark.parametrize("mine", ["--xla_cpu_prefer_vector_width=128", "--xla_backend_optimization_level=3"])
-def test_users_flags_are_kept(python, untouched, mine):
-    """Those that pathjax does not know, and each of those that it sets too; the others it adds."""
-    users = f"--xla_cpu_enable_fast_math=false {mine}"
+def test_users_flags_are_kept(python, untouched):
+    """Those that pathjax does not know, and those that it sets too; the others it adds."""
+    users = "--xla_cpu_enable_fast_math=false --xla_cpu_prefer_vector_width=128 --xla_backend_optimization_level=3"
     if "terminate_timeout" in xla._PATIENCE_FLAGS:  # jaxlib 0.7 has no such flag
         users += " --xla_cpu_collective_call_terminate_timeout_seconds=50"
     (flags, _, native), _ = python(FLAGS_AND_DEVICES, XLA_FLAGS=users)
@@ -68,10 +67,11 @@ def test_users_flags_are_kept(python, untouched, mine):
     assert flags.removeprefix(f"{users} ").split() == ours
 
 
-def test_users_own_threshold_is_kept(python):
+def test_users_own_threshold_and_number_of_threads_are_kept(python):
     mine = f"--xla_backend_extra_options={OPTION}=2048"
-    (flags, _, _), _ = python(FLAGS_AND_DEVICES, XLA_FLAGS=mine)
-    assert flags == mine
+    code = FLAGS_AND_DEVICES.replace("[", "[os.environ['PJRT_NPROC'], ", 1)
+    (threads, flags, _, _), _ = python(code, XLA_FLAGS=mine, PJRT_NPROC="3")
+    assert flags == mine and threads == "3"
 
 
 @pytest.mark.parametrize(
@@ -89,10 +89,13 @@ def test_users_number_of_devices_is_kept(python, code, environment):
     assert "Warning" not in err
 
 
-def test_setting_up_again_changes_nothing(python):
-    (flags, _, native), _ = python("import pathjax.compile; pathjax.compile.setup()" + FLAGS_AND_DEVICES)
+def test_import_after_jax_is_in_time_and_setting_up_again_changes_nothing(python):
+    """In time, that is before JAX's backend starts."""
+    again = "import jax\nimport pathjax.compile; pathjax.compile.setup()"
+    (flags, _, native), err = python(again + FLAGS_AND_DEVICES)
     assert flags.count(OPTION) == 1
     assert native
+    assert "Warning" not in err
 
 
 STARTED = "import jax; jax.devices()\n"
@@ -112,12 +115,6 @@ def test_import_after_the_backend_warns_once_with_the_remedy(python, number):
 def test_import_after_the_backend_is_silent_where_the_user_set_the_option(python):
     remedy = f"{xla._FLAG} {xla._WIDTH_FLAG}"
     (_, _, native), err = python(STARTED + FLAGS_AND_DEVICES, XLA_FLAGS=remedy)
-    assert native
-    assert "Warning" not in err
-
-
-def test_import_after_jax_but_before_its_backend_is_in_time(python):
-    (_, _, native), err = python("import jax\n" + FLAGS_AND_DEVICES)
     assert native
     assert "Warning" not in err
 
@@ -207,11 +204,6 @@ def test_many_operations_may_wait_for_a_kernel_on_several_devices(python):
     """
     limits = "".join(f" --xla_cpu_collective_call_{what}_timeout_seconds=10" for what in ("warn_stuck", "terminate"))
     python(AHEAD, JAX_NUM_CPU_DEVICES="2", XLA_FLAGS=limits if xla._PATIENCE_FLAGS else "")
-
-
-def test_users_number_of_threads_is_kept(python):
-    number, _ = python("import os, pathjax\nprint(json.dumps(os.environ['PJRT_NPROC']))", PJRT_NPROC="3")
-    assert number == "3"
 
 
 IMPORTS = """
