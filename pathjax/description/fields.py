@@ -296,7 +296,10 @@ class Fields:
         self._taken.add(name)
         if name not in self._values:
             if default is REQUIRED:
-                raise self.element.error(f'{self.element} needs <{tags[0]} name="{name}" ...>')
+                given = [self._values[other] for other in self._values if other not in self._taken]
+                misspelt = [each for each in given if nearest(each.attributes.get("name", ""), [name])]
+                instead = f"; is it {misspelt[0]} at {misspelt[0].place}?" if misspelt else ""
+                raise self.element.error(f'{self.element} needs <{tags[0]} name="{name}" ...>{instead}')
             return None
         element = self._values[name]
         if element.tag not in tags:

@@ -27,10 +27,13 @@ def field_of_view(fields: Fields) -> tuple[float, str]:
     """Degrees, and the axis along which they are measured; a focal length is one of 35 mm film, 36 x 24 mm."""
     if fields.has("focal_length") and (fields.has("fov") or fields.has("fov_axis")):
         raise fields.error("focal_length", "excludes fov and fov_axis; give one or the other")
-    if fields.has("fov"):
-        axis = fields.string("fov_axis", "x", choices=("x", "y", "diagonal", "smaller", "larger"))
-        return fields.float("fov", above=0, below=180), axis
+    if fields.has("fov_axis") and not fields.has("fov"):
+        raise fields.error("fov_axis", "needs fov beside it; a focal length is of the diagonal")
+    fov = fields.float("fov", None, above=0, below=180)
+    axis = fields.string("fov_axis", "x", choices=("x", "y", "diagonal", "smaller", "larger"))
     text = fields.string("focal_length", "50mm").strip()
+    if fov is not None:
+        return fov, axis
     length = re.fullmatch(r"(\d{1,9}(\.\d{1,9})?)\s*(mm)?", text)
     if not length or float(length[1]) == 0:
         raise fields.error("focal_length", f'must be like "50mm", is "{text[:40]}"')

@@ -532,6 +532,7 @@ def test_a_board_that_stands_for_a_number_and_for_a_colour_is_refused(read):
     [
         ("wood", "", "use one of bitmap, checkerboard"),
         ("bitmap", "", 'needs <string name="filename"'),
+        ("bitmap", '<string name="filenme" value="a.png"/>', '...>; is it <string name="filenme"> at'),
         ("bitmap", '<string name="filename" value="no.png"/>', 'no file "no.png"'),
         ("bitmap", '<string name="filename" value="picture.png"/><string name="wrap_mode" value="none"/>', "repeat or"),
         ("checkerboard", '<rgb name="color0" value="2"/>', "between 0 and 1"),
@@ -686,6 +687,8 @@ FILM = '<film type="hdrfilm">{}</film>'
         ('<float name="fov" value="30"/><string name="focal_length" value="50mm"/>', "excludes fov"),
         ('<string name="focal_length" value="5cm"/>', 'like "50mm"'),
         ('<string name="fov_axis" value="z"/><float name="fov" value="30"/>', "use x or y"),
+        ('<string name="fov_axis" value="y"/>', "needs fov beside it"),
+        ('<float name="fv" value="30"/>', 'did you mean "fov"?'),
         ('<float name="near_clip" value="0"/>', "above 0"),
         ('<float name="near_clip" value="5"/><float name="far_clip" value="2"/>', "smaller than far_clip"),
         ('<float name="aperture_radius" value="1"/>', "is not a parameter of"),
