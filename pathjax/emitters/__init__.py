@@ -29,7 +29,7 @@ from pathjax.emitters.selection import Choice, Lights, choice, choose, probabili
 from pathjax.emitters.spot import Spot
 from pathjax.emitters.sunsky import SunSky
 from pathjax.errors import InputError
-from pathjax.kinds import Instance, Parameters, Position, Table, ordered
+from pathjax.kinds import Instance, Mean, Parameters, Position, Table, ordered
 from pathjax.kinds import register as register_kind
 from pathjax.shapes import Geometry, Lamp, geometry, lamp_table
 from pathjax.textures import Textures
@@ -102,9 +102,9 @@ def build(
         table = kind.build(instances, dtype, (*place, "table"), parameters, codes.get)
         for key in kind.declared if codes else ():
             table = _with_means(table, key, [instance.values[key] for instance in instances])
-            mean = *place, "table", "columns", kind.place(key), "values"
+            means = *place, "table", "columns", kind.place(key), "values"
             for row, instance in enumerate(instances):
-                _enter_mean(parameters, f"{instance.name}.{key}", instance.values[key], place, (mean, row))
+                _enter_mean(parameters, f"{instance.name}.{key}", instance.values[key], place, means, row)
         shining = [lamp for lamp in lamps if emitters[lamp.shape].kind is kind]  # of kinds outside of shapes: nothing
         for lamp in shining:
             light[lamp.primitive : lamp.primitive + lamp.count] = number
@@ -150,21 +150,40 @@ def _textures(instances: list[Instance], dtype, path: tuple, parameters: Paramet
     for parameter in own.known.keys() & parameters.known.keys():
         raise InputError(f"{parameter} is of a texture of a bsdf and of a light; give each a texture of its own")
     parameters.known.update(own.known)
+    for image, first in own.names.items():
+        parameters.names.setdefault(image, first)
     for image in own.textures.keys() - parameters.textures.keys():
         parameters.textures[image] = own.textures[image]
     return made, codes
 
 
-def _enter_mean(parameters: Parameters, name: str, image, lights: tuple, mean: tuple) -> None:
-    """Where the mean stands of an image that is a parameter. None is what a bsdf or other lights have, too."""
-    if not isinstance(image, Instance) or image not in parameters.textures:
+def _enter_mean(parameters: Parameters, name: str, texture, lights: tuple, path: tuple, row: int) -> None:
+    """Where the mean stands of a texture with parameters. No image is one that a bsdf or other lights have, too."""
+    if not isinstance(texture, Instance):
         return
-    if parameters.textures[image].path[: len(lights)] != lights:
+    if texture in parameters.textures and parameters.textures[texture].path[: len(lights)] != lights:
         parameters.refused[name] = f"{name} is an image that stands elsewhere, too; give the light one of its own"
         return
-    first = parameters.names[image]
-    known = parameters.known[first]
-    parameters.known[first] = replace(known, means=(*known.means, mean))
+    parts = list(_parts(parameters, name, texture))
+    known = {each: parameters.known[each] for _, each in parts if isinstance(each, str)}
+    rest = sum(share * np.broadcast_to(each, 3) for share, each in parts if not isinstance(each, str))
+    shares = tuple((share, known[each]) for share, each in parts if isinstance(each, str))
+    mean = Mean(path, row, shares, tuple(np.broadcast_to(rest, 3).tolist()))
+    for each, parameter in known.items():
+        parameters.known[each] = replace(parameter, means=(*parameter.means, mean))
+
+
+def _parts(parameters: Parameters, name: str, value, share: float = 1.0):
+    """What the mean of a texture is the sum of, and the shares: names of parameters, and values of what is none."""
+    if name not in parameters.known:
+        name = parameters.names.get(value, name) if isinstance(value, Instance) else name
+    if name in parameters.known:
+        yield share, name
+    elif isinstance(value, Instance) and (keys := value.kind.parts_of_mean(value)):
+        for key in keys:
+            yield from _parts(parameters, f"{value.name}.{key}", value.values[key], share / len(keys))
+    else:
+        yield share, _mean(value) if isinstance(value, Instance) else value
 
 
 def _with_means(table: Table, key: str, values: list) -> Table:

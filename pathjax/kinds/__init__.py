@@ -29,7 +29,7 @@ from pathjax.kinds.declared import (
     Unused,
 )
 from pathjax.kinds.kind import Instance, Kind, Stored, ordered, register
-from pathjax.kinds.parameter import Fixed, Parameter, Parameters
+from pathjax.kinds.parameter import Fixed, Mean, Parameter, Parameters
 from pathjax.kinds.table import Column, Row, Table
 
 __all__ = [
@@ -43,6 +43,7 @@ __all__ = [
     "Instance",
     "Internal",
     "Kind",
+    "Mean",
     "Number",
     "Fixed",
     "Parameter",

@@ -35,6 +35,16 @@ class Fixed:
 
 
 @dataclass(frozen=True)
+class Mean:
+    """Where the mean of a texture stands, by which lights are chosen: the row of an array."""
+
+    path: tuple[str | int, ...]
+    row: int
+    parts: tuple[tuple[float, Parameter], ...]  # what it is the sum of: parameters times their shares,
+    rest: tuple[float, ...]  # and (3,) of what is no parameter
+
+
+@dataclass(frozen=True)
 class Parameter:
     """Where a parameter lives: attributes and tuple places down to an array, and the entry in it."""
 
@@ -46,8 +56,7 @@ class Parameter:
     moves_paths: bool = False  # as the IOR of smooth glass does; others change what paths carry
     least: float = -math.inf  # smaller numbers count as this one, and images do not change with them
     rows: int | None = None  # of a texture: how many entries of the array, from the index on; None: the entry alone
-    # Paths to arrays, and rows of these, where the mean of a texture stands, by which lights are chosen.
-    means: tuple[tuple[tuple[str | int, ...], int], ...] = ()
+    means: tuple[Mean, ...] = ()  # of what it is a part of
     # (rows, 3) which of the values that vertices or faces of a mesh carry a corner has; None: they are of no mesh.
     corners: Fixed | None = None
     # Of a texture: the parameters of bsdfs and lights in whose places it stands, by what kinds call them; None: it may

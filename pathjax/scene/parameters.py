@@ -64,12 +64,18 @@ def with_values(
             textures.setdefault(parameter.path, []).append((parameter, value))
         elif not placed:
             scene = put(scene, parameter.path, parameter.put(get(scene, parameter.path), value))
-        for path, row in parameter.means:
-            # Known values as builders take them, to the last bit.
-            texels = lax.stop_gradient(value) if is_traced(value) else np.asarray(value, np.float64)
-            scene = put(scene, path, get(scene, path).at[row].set(texels.mean((0, 1))))
     for path, found in textures.items():
         scene = put(scene, path, with_textures(get(scene, path), found))
+    given = {(parameters[name].path, parameters[name].index): value for name, value in values.items()}
+    for mean in dict.fromkeys(mean for name in values for mean in parameters[name].means):
+        total = np.array(mean.rest)
+        for share, part in mean.parts:
+            value = given.get((part.path, part.index))
+            value = part.get(get(scene, part.path)) if value is None else value
+            # Known values as builders take them, to the last bit.
+            value = lax.stop_gradient(value) if is_traced(value) else np.asarray(value, np.float64)
+            total = total + share * (value.mean((0, 1)) if part.is_texture else value)
+        scene = put(scene, mean.path, get(scene, mean.path).at[mean.row].set(total))
     changed: dict[tuple, list[str]] = {}
     for parameter in (parameters[name] for name in values):
         if parameter.table is not None:

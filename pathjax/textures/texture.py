@@ -65,9 +65,14 @@ class Texture(Kind):
         return None if any(mean is None for mean in means) or not means else np.mean(means, axis=0)
 
     @classmethod
+    def parts_of_mean(cls, texture: Instance) -> list[str]:
+        """Names of what `mean` is the mean of."""
+        return [key for key, declared in cls.declared.items() if isinstance(declared, Color)]
+
+    @classmethod
     def colors(cls, texture: Instance) -> list:
         """What its colours are, (3,) or one number each, or textures."""
-        return [texture.values[key] for key, declared in cls.declared.items() if isinstance(declared, Color)]
+        return [texture.values[key] for key in cls.parts_of_mean(texture)]
 
     @classmethod
     def of_number(cls, texture: Instance, held: Callable[[Instance], Instance]) -> Instance:

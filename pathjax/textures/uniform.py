@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float, Int
 
 from pathjax.core.types import Surface
@@ -31,9 +30,5 @@ class Uniform(Texture):
         return [("value", None, jnp.ones_like(uv[0]))]
 
     @classmethod
-    def span(cls, texture: Instance) -> tuple[float, float]:
-        return (texture.values["value"],) * 2
-
-    @classmethod
-    def mean(cls, texture: Instance) -> np.ndarray:
-        return np.full(3, texture.values["value"])
+    def parts_of_mean(cls, texture: Instance) -> list[str]:
+        return ["value"]

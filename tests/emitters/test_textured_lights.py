@@ -69,6 +69,36 @@ def test_lights_are_chosen_by_the_mean_of_what_covers_them(make_scene, picture):
     np.testing.assert_allclose(lights.power(), [4 * power, 4], rtol=1e-5)
 
 
+def test_what_lights_are_chosen_by_follows_the_parameters_of_what_covers_them(make_scene, picture, tmp_path):
+    """Of boards of colours, of numbers, of pictures and of boards: as if the file had those values."""
+    board = '<texture type="checkerboard" name="{}" id="{}">{}</texture>'.format
+    uniform = '<texture type="uniform" name="color1" id="even"><float name="value" value="0.25"/></texture>'
+    inner = board("color0", "inner", '<rgb name="color0" value="0.5, 0, 0"/>' + uniform)
+    outer = board("radiance", "outer", inner + picture.replace("radiance", "color1"))
+    covers = [CHECKS, outer, picture.replace("nearest", "bilinear")]
+    scene = make_scene(FLOOR + "".join(lamp(area(each), 3 * k, name=f"l{k}") for k, each in enumerate(covers)))
+    about = scene.about.parameters
+    names = [name for name in pj.parameters(scene) if about[name].means]
+    assert len(names) == 6
+    random = np.random.default_rng(1)
+    moved = pj.with_parameters(scene, {name: np.float32(random.random(about[name].shape)) for name in names})
+    pj.save_scene(moved, tmp_path / "moved.xml")
+    (lights,), (loaded,) = moved.emitters, pj.load_scene(tmp_path / "moved.xml").emitters
+    np.testing.assert_allclose(lights.power(), loaded.power(), rtol=1e-6)
+
+
+def test_a_light_that_was_black_is_found_by_light_samples(make_scene):
+    """Beside another one, which alone had a power when the scene was loaded."""
+    black = CHECKS.replace("1, 0.5, 0", "0").replace("0, 0.1, 0.9", "0").replace("radiance", "irradiance")
+    aimed = '<transform name="to_world"><lookat origin="0, 2, 0" target="0, 0, 0" up="0, 0, 1"/></transform>'
+    projector = f'<emitter type="projector">{aimed}{black}</emitter>'
+    point = '<emitter type="point"><point name="position" value="0, 2, 0"/><rgb name="intensity" value="1"/></emitter>'
+    scene = make_scene(FLOOR + projector + point, **VIEW)
+    moved = pj.with_parameters(scene, {f"checks.color{k}": np.ones(3) for k in (0, 1)})
+    dark, lit = (np.asarray(pj.render(each, 16)).mean() for each in (scene, moved))
+    assert lit > 1.1 * dark > 0
+
+
 @pytest.mark.slow
 def test_images_are_linear_in_the_colours_of_a_light(make_scene):
     scene = make_scene(FLOOR + lamp(area(CHECKS)), **VIEW)
