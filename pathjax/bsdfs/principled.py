@@ -132,6 +132,16 @@ class Look(NamedTuple):
         """Share of what has a diffuse base."""
         return self.dielectric if self.spec_trans is None else self.dielectric * (1 - self.spec_trans)
 
+    def mixed(self) -> Look:
+        """The look by which lobes are chosen: each has a share, since without one it has a derivative in it."""
+        shares = {name: getattr(self, name) for name in ("metallic", "spec_trans", "clearcoat")}
+        return self._replace(**{name: within_shares(share) for name, share in shares.items() if share is not None})
+
+
+def within_shares(share: Float[Array, ""]) -> Float[Array, ""]:
+    """A share as one by which lobes are chosen: neither of two has none."""
+    return jnp.clip(share, LEAST_REFLECTANCE, 1 - LEAST_REFLECTANCE)
+
 
 def _look(p: Row) -> Look:
     values = {name: getattr(p, name) for name in Look._fields if name != "eta"}
@@ -180,6 +190,7 @@ class Chances(NamedTuple):
     @classmethod
     def of(cls, look: Look, cos: Float[Array, ""], inside: Bool[Array, ""] | None) -> Chances:
         reflectance, exact, _ = _reflectance(look, cos, inside)
+        look = look.mixed()
         facets = mean(reflectance) + look.clear * (1 - exact)
         outside = 1.0 if inside is None else jnp.where(inside, 0.0, 1.0)
         coat = None if look.clearcoat is None else outside * look.clearcoat * burley.schlick(burley.COAT_R0, cos) * cos
@@ -190,8 +201,9 @@ class Chances(NamedTuple):
 
 def _refracts(look: Look, reflectance: Float[Array, "3"], exact: Float[Array, ""]) -> Float[Array, ""]:
     """Chance that facets let through instead of reflecting; detached."""
-    through = look.clear * (1 - exact) * mean(safe_sqrt(look.base_color))
-    return lax.stop_gradient(safe_divide(through, through + jnp.mean(reflectance)))
+    through = look.mixed().clear * (1 - exact) * mean(safe_sqrt(look.base_color))
+    reflected = larger(jnp.mean(reflectance), LEAST_REFLECTANCE * exact)
+    return lax.stop_gradient(safe_divide(through, through + reflected))
 
 
 def _side(look: Look, wi: Float[Array, "3"]):

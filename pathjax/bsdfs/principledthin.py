@@ -14,7 +14,7 @@ from pathjax.bsdfs import burley, fresnel
 from pathjax.bsdfs.bsdf import BSDF
 from pathjax.bsdfs.ior import LEAST_IOR
 from pathjax.bsdfs.microfacet import mirrored
-from pathjax.bsdfs.principled import LEAST_REFLECTANCE, Share, mean
+from pathjax.bsdfs.principled import Share, mean, within_shares
 from pathjax.core.math import dot, normalize, safe_divide, smaller
 from pathjax.core.types import BSDFSample
 from pathjax.core.warp import chosen, square_to_cosine_hemisphere, square_to_cosine_hemisphere_pdf
@@ -111,15 +111,16 @@ class Look(NamedTuple):
         if self.spec_trans is None:
             return jnp.ones_like(wi[2])
         reflected, passed = self.reflectance(jnp.clip(wi[2], 0, 1))
-        facets = self.spec_trans * (mean(reflected) + passed * mean(self.base_color))
-        base = self.base * mean(self.base_color)
+        share = within_shares(self.spec_trans)
+        facets = share * (mean(reflected) + passed * mean(self.base_color))
+        base = (1 - share) * mean(self.base_color)
         return lax.stop_gradient(base / (base + facets))
 
     @property
     def chance_through_base(self) -> Float[Array, ""]:
         if self.diff_trans is None:
             return jnp.zeros_like(self.roughness)
-        return lax.stop_gradient(jnp.clip(self.through, LEAST_REFLECTANCE, 1 - LEAST_REFLECTANCE))
+        return lax.stop_gradient(within_shares(self.through))
 
     def chance_through_facets(self, wi: Float[Array, "3"]) -> Float[Array, ""]:
         reflected, passed = self.reflectance(jnp.clip(wi[2], 0, 1))

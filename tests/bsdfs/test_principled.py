@@ -175,6 +175,21 @@ def test_extremes_of_thin_ones_are_finite(roughness):
             testing.check_range(materials, wi)
 
 
+@pytest.mark.parametrize(
+    ("kind", "name", "share"),
+    [(kind, "spec_trans", share) for kind in (PrincipledThin, ClearPrincipled) for share in (0.0, 1.0)]
+    + [(Principled, "metallic", 1.0)],
+)
+def test_lobes_without_a_share_are_drawn_for_their_derivative_in_it(kind, name, share):
+    """Facets so smooth draw nothing of what the base has, and a base nothing of what facets let through."""
+    wi, wo = pairs(300, both=kind is not Principled)
+    values = {**ORANGE, "roughness": 0.3 * (1 - share)}
+    _, density = evaluated(kind, {**values, name: share}, wi, wo)
+    half, _ = evaluated(kind, {**values, name: 0.5}, wi, wo)
+    assert (half > 0).any()
+    assert (np.asarray(density)[:, None] >= 1e-3 * np.asarray(half)).all()
+
+
 # ---- files ----------------------------------------------------------------------------------------------------------
 
 
