@@ -241,11 +241,8 @@ def _swept(wanted, options, ring, how, scene, pixels, *numbers):
         scene, pixels, *numbers, kept=kept, options=options, ring=ring, devices=how.get("devices")
     )
 
-    def place(parameter):
-        shape = named.get(scene, parameter.path).shape
-        return Place(kept.of(scene, parameter), parameter, shape, differentiated.of_colors(scene, parameter.path))
-
-    return image, RowSlopes(rows, tuple((name, place(each)) for name, each in wanted.items()), (len(image),))
+    places = tuple((name, Place.of(scene, kept.of(scene, each), each)) for name, each in wanted.items())
+    return image, RowSlopes(rows, places, (len(image),))
 
 
 @partial(_swept.defjvp, symbolic_zeros=True)

@@ -13,9 +13,11 @@ from jaxtyping import Array, Float
 
 from pathjax.compile import Rows, register_dataclass
 from pathjax.core.math import LUMINANCE
-from pathjax.derivatives import tangents
+from pathjax.derivatives import differentiated, tangents
 from pathjax.derivatives.kept import of_parameter
 from pathjax.kinds.parameter import Parameter
+from pathjax.scene import parameters as named
+from pathjax.scene.scene import Scene
 
 
 class Place(NamedTuple):
@@ -25,6 +27,11 @@ class Place(NamedTuple):
     parameter: Parameter
     array: tuple[int, ...]  # shape of what it lives in
     of_colors: bool  # else it holds numbers
+
+    @classmethod
+    def of(cls, scene: Scene, rows: range, parameter: Parameter) -> Place:
+        path = parameter.path
+        return cls(rows, parameter, named.get(scene, path).shape, differentiated.of_colors(scene, path))
 
 
 @register_dataclass
@@ -75,11 +82,22 @@ def _slopes(rows: Rows, place: Place, shape: tuple[int, ...]) -> Float[Array, ".
     found = jnp.moveaxis(found, -3, -2)
     before = *found.shape[:-3], *shape
     found = found.reshape(-1, *found.shape[-2:])
+    return jax.vmap(partial(by_channel, place))(found).reshape(*before, 3, *place.parameter.shape)
+
+
+def by_channel(place: Place, row: Float[Array, "entries 3"]) -> Float[Array, "3 ..."]:
+    """Derivatives of the channels of a pixel in a parameter, from those of each in its own entries."""
     if place.parameter.is_color:
-        of_channels = found[:, None] * jnp.eye(3, dtype=found.dtype)[:, None]
+        of_channels = row * jnp.eye(3, dtype=row.dtype)[:, None]
     else:
-        of_channels = jnp.moveaxis(found, -1, 1)
+        of_channels = row.T
         if place.of_colors:  # which are all as the number
-            of_channels = of_channels[..., None] * jnp.asarray(LUMINANCE, found.dtype)
-    slopes = jax.vmap(jax.vmap(partial(of_parameter, place.parameter, place.array)))(of_channels)
-    return slopes.reshape(*before, 3, *place.parameter.shape)
+            of_channels = of_channels[..., None] * jnp.asarray(LUMINANCE, row.dtype)
+    return jax.vmap(partial(of_parameter, place.parameter, place.array))(of_channels)
+
+
+def by_column(place: Place, row: Float[Array, "entries 3"]) -> Float[Array, "Q 3"]:
+    """The same, of each channel in each number; in colours in the same channel, as all else is 0."""
+    if place.parameter.is_color:
+        return of_parameter(place.parameter, place.array, row).reshape(-1, 3)
+    return by_channel(place, row).reshape(3, -1).T

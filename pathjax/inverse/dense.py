@@ -1,6 +1,7 @@
 """Fits of some thousand texels: Gauss-Newton with the matrix itself, solved exactly, which states exact errors.
 
-Light keeps its channel, so each channel has equations of its own, in Q colours:
+Light keeps its channel, so of Q colours each channel has equations of its own. Of Q numbers, as roughnesses, all
+channels have the same. Such a system of equations is
 
     (J' W J + P) step = J' W (target - image) + P (mean - values),        errors C (J' W V W J + P) C
 
@@ -23,9 +24,9 @@ from pathjax.inverse.many import BATCHES, PRETENDED, PRODUCT_SPP, Search, whole
 from pathjax.inverse.problem import Problem
 from pathjax.inverse.uncertainty import MAX_RELATIVE_ERROR
 
-# Up to so many numbers: a matrix of each channel is then 8 MB, and solved within a second. And up to so many products
-# of two entries of a pixel's row: to sum them up takes some seconds.
-MOST_NUMBERS, MOST_PRODUCTS = 3072, 1 << 34
+# Up to so many colours, or numbers: a matrix is then 8 MB, and solved within a second. And up to so many products of
+# two entries of a pixel's row: to sum them up takes some seconds.
+MOST_COLUMNS, MOST_PRODUCTS = 1024, 1 << 34
 # Samples of each of the two J: at most so many times those of the image; and for errors they are raised so often, if
 # they are too few.
 MOST_SAMPLES, RAISED = 4, 2
@@ -39,13 +40,12 @@ ROUNDS = 500
 
 
 def is_dense(problem: Problem) -> bool:
-    """Whether the fit is of colours alone, few enough for `Dense`."""
-    count, pixels = problem.vector.count, sum(target.image.size // 3 for target in problem.targets)
-    if count > MOST_NUMBERS or pixels * (count // 3) ** 2 > MOST_PRODUCTS:
+    """Whether the fit is of colours alone, or of numbers alone, few enough for `Dense`."""
+    pixels, systems = sum(target.image.size // 3 for target in problem.targets), problem.vector.systems
+    columns = problem.vector.count // max(systems, 1)
+    if not systems or columns > MOST_COLUMNS or pixels * columns**2 > MOST_PRODUCTS:
         return False
-    wanted = [(views.scene, list(views.wanted.values())) for views in problem.groups]
-    colored = all(parameter.is_color for _, parameters in wanted for parameter in parameters)
-    return colored and all(has_rows(scene, parameters) for scene, parameters in wanted)
+    return all(has_rows(views.scene, list(views.wanted.values())) for views in problem.groups)
 
 
 def least_within(
@@ -94,13 +94,13 @@ def least_within(
 
 
 class Equations(NamedTuple):
-    """The normal equations of each channel, for Q colours."""
+    """The normal equations of S systems: of each channel, for Q colours, or of all together, for Q numbers."""
 
-    matrix: np.ndarray  # (3, Q, Q) J' W J
-    gradient: np.ndarray  # (Q, 3) J' W (image - target)
-    known: np.ndarray  # (Q, 3) diagonal of J' V^-1 J, to which noise of J adds nothing
-    pretended: np.ndarray  # (3, Q, K), of which the squares have the mean D' W D
-    scatter: np.ndarray  # (3, Q, Q) J' W V W J, if asked for
+    matrix: np.ndarray  # (S, Q, Q) J' W J
+    gradient: np.ndarray  # (Q, S) J' W (image - target)
+    known: np.ndarray  # (Q, S) diagonal of J' V^-1 J, to which noise of J adds nothing
+    pretended: np.ndarray  # (S, Q, K), of which the squares have the mean D' W D
+    scatter: np.ndarray  # (S, Q, Q) J' W V W J, if asked for
 
 
 class Dense(Search):
@@ -110,10 +110,10 @@ class Dense(Search):
     least_told = 0.0
 
     def step(self) -> None:
-        self.prior_matrix = self.prior.of_channel()
+        self.prior_matrix = self.prior.of_system()
         found = self.solved()
         gradient = found.gradient.ravel() + self.prior.gradient(self.values)
-        damping = self.damping * np.einsum("cqq->qc", found.matrix).ravel()
+        damping = self.damping * np.einsum("sqq->qs", found.matrix).ravel()
         self.values = self.bounded(gradient, damping)
 
     def bounded(self, gradient: np.ndarray, damping: np.ndarray) -> np.ndarray:
@@ -121,13 +121,17 @@ class Dense(Search):
 
         A step that is merely clipped leaves neighbours where they made up for what was cut off.
         """
-        values = self.values.reshape(-1, 3).copy()
+        values = self.by_system(self.values).copy()
         self.free = np.ones(values.shape, bool)
-        by_value = (x.reshape(-1, 3) for x in (gradient, damping, self.low, self.high))
-        for c, (g, d, low, high) in enumerate(zip(*(x.T for x in by_value), strict=True)):
-            A = self.equations.matrix[c] + self.prior_matrix + np.diag(d)
-            values[:, c], self.free[:, c] = least_within(A, g, values[:, c], low, high)
+        by_value = map(self.by_system, (gradient, damping, self.low, self.high))
+        for s, (g, d, low, high) in enumerate(zip(*(x.T for x in by_value), strict=True)):
+            A = self.equations.matrix[s] + self.prior_matrix + np.diag(d)
+            values[:, s], self.free[:, s] = least_within(A, g, values[:, s], low, high)
         return values.ravel()
+
+    def by_system(self, x: np.ndarray) -> np.ndarray:
+        """(n,) as (Q, S)."""
+        return x.reshape(-1, self.vector.systems)
 
     def solved(self, variance: np.ndarray | None = None) -> Equations:
         """Find the equations and their inverse; for errors (variance: of `sums`) with as many samples of J as it takes.
@@ -140,7 +144,7 @@ class Dense(Search):
             self.equations = found = self.sums(variance)
             self.inverse = np.stack([linalg.inv(m + self.prior_matrix) for m in found.matrix])
             self.pretended = ((self.inverse @ found.pretended) ** 2).mean(-1).T.ravel()  # (n,) of their variances
-            variances = np.einsum("cqq->qc", self.inverse).ravel()
+            variances = np.einsum("sqq->qs", self.inverse).ravel()
             known = variances < (MAX_RELATIVE_ERROR * self.prior.scale) ** 2
             part = (self.pretended / variances)[known if known.any() else ...]
             self.sharp = int(np.ceil(self.product_spp * np.quantile(part, 1 - LEFT_OUT) / PRETENDED))
@@ -150,38 +154,46 @@ class Dense(Search):
 
     def times(self, x: np.ndarray) -> np.ndarray:
         """The matrix of the equations of the last step times x (n,)."""
-        x = x.reshape(-1, 3)
-        return (np.einsum("cqr,rc->qc", self.equations.matrix, x) + self.prior_matrix @ x).ravel()
+        x = self.by_system(x)
+        return (np.einsum("sqr,rs->qs", self.equations.matrix, x) + self.prior_matrix @ x).ravel()
 
     def sums(self, variance: np.ndarray | None = None) -> Equations:
         """Sum up the normal equations over the kept pixels; with `scatter`, if their variance (N, 3) is given.
 
         Parts of the pixels are dealt to devices, and to processes, and added up in their order.
         """
-        products, count = self.products, len(self.values) // 3
+        products, systems = self.products, self.vector.systems
         draws, scatter = (products.next_draw(), products.next_draw()), variance is not None
-        signs = self.random.choice([-0.5, 0.5], (products.count, SIGNS))
-        shapes = (3, count, count), (count, 3), (count, 3), (3, count, SIGNS), (3 * scatter, count, count)
+        signs = self.random.choice([-0.5, 0.5], (3, products.count, SIGNS))
+        square = systems, (count := len(self.values) // systems), count
+        shapes = square, square[1::-1], square[1::-1], (systems, count, SIGNS), (systems * scatter, count, count)
         found = Equations(*map(np.zeros, shapes))
         ends = np.cumsum([x.size for x in found])
 
         def of_part(part) -> np.ndarray:
             """Equations of a part of the pixels, and their trust, as words of float64, which JAX would round."""
             a, b = part.rows()
-            J, w = (a + b) / 2, self.weights[part.places]
+            J = (a + b) / 2
             whole = (J * J).sum((0, 2))
-            trust = np.clip((a * b).sum((0, 2)) / np.where(whole > 0, whole, 1), 0, 1)[:, None] ** 2
+            trust = np.clip((a * b).sum((0, 2)) / np.where(whole > 0, whole, 1), 0, 1) ** 2
             mine, trusts = Equations(*map(np.zeros, shapes)), np.zeros(products.most_rows)
-            trusts[: len(trust)] = trust[:, 0]
-            for c in range(3):
-                here, of_channel = (trust * w)[:, c, None] * J[c], w[:, c]
-                mine.matrix[c] = here.T @ J[c]
-                mine.gradient[:, c] = here.T @ self.residual[part.places, c]
-                mine.known[:, c] = of_channel @ (a[c] * b[c])
-                root = np.sqrt(trust * w[:, c, None]) * signs[part.places]
-                mine.pretended[c] = (a[c] - b[c]).T @ root
+            trusts[: len(trust)] = trust
+
+            def rows(x):
+                """Of the equations of each system: (3, n, ...) -> (S, 3/S n, ...)."""
+                return x.reshape(systems, -1, *x.shape[2:])
+
+            w = self.weights[part.places].T
+            w, trusted, residual = map(rows, (w, trust * w, self.residual[part.places].T))
+            a, b, J, mine_signs = map(rows, (a, b, J, signs[:, part.places]))
+            for s in range(systems):
+                here = trusted[s, :, None] * J[s]
+                mine.matrix[s] = here.T @ J[s]
+                mine.gradient[:, s] = here.T @ residual[s]
+                mine.known[:, s] = w[s] @ (a[s] * b[s])
+                mine.pretended[s] = (a[s] - b[s]).T @ (np.sqrt(trusted[s, :, None]) * mine_signs[s])
                 if scatter:
-                    mine.scatter[c] = here.T @ (variance[part.places, c, None] * here)
+                    mine.scatter[s] = here.T @ (rows(variance[part.places].T)[s, :, None] * here)
             return np.concatenate([x.ravel() for x in (*mine, trusts)]).view(np.uint32)
 
         parts = products.rows(self.values, self.product_spp, draws)
@@ -196,21 +208,21 @@ class Dense(Search):
 
     def solve(self, right: np.ndarray, damping: np.ndarray | float = 0.0) -> np.ndarray:
         """What solves the equations of the last step; 0 where values stay at a bound."""
-        right, free = right.reshape(-1, 3), self.free.reshape(-1, 3)
-        more = np.broadcast_to(damping, len(self.values)).reshape(-1, 3)
+        right, free = self.by_system(right), self.by_system(self.free)
+        more = self.by_system(np.broadcast_to(damping, len(self.values)))
         solution = np.zeros_like(right)
-        for c, matrix in enumerate(self.equations.matrix):
-            here = np.flatnonzero(free[:, c])
-            A = (matrix + self.prior_matrix + np.diag(more[:, c]))[np.ix_(here, here)]
-            solution[here, c] = linalg.solve(A, right[here, c], assume_a="pos")
+        for s, matrix in enumerate(self.equations.matrix):
+            here = np.flatnonzero(free[:, s])
+            A = (matrix + self.prior_matrix + np.diag(more[:, s]))[np.ix_(here, here)]
+            solution[here, s] = linalg.solve(A, right[here, s], assume_a="pos")
         return solution.ravel()
 
     def determined(self) -> np.ndarray:
-        return np.einsum("cqr,crq->qc", self.inverse, self.equations.matrix).ravel()
+        return np.einsum("sqr,srq->qs", self.inverse, self.equations.matrix).ravel()
 
     def draw(self) -> np.ndarray:
-        e = self.random.normal(size=(len(self.values) // 3, 3))
-        score = [linalg.cholesky(m + self.prior_matrix).T @ e[:, c] for c, m in enumerate(self.equations.matrix)]
+        e = self.by_system(self.random.normal(size=len(self.values)))
+        score = [linalg.cholesky(m + self.prior_matrix).T @ e[:, s] for s, m in enumerate(self.equations.matrix)]
         return self.solve(np.stack(score, -1).ravel())
 
     def check(self) -> float:

@@ -61,6 +61,12 @@ class ParameterVector:
         return [(color, sum(map(_count, (p for _, p in group)))) for color, group in kinds]
 
     @property
+    def systems(self) -> int:
+        """Into how many systems its linear equations part: 3, a channel each, of colours; 1 of numbers; 0 of both."""
+        kinds = {p.is_color for _, p in self.parameters}
+        return 0 if len(kinds) > 1 else 3 if kinds.pop() else 1
+
+    @property
     def entries(self) -> tuple[np.ndarray, np.ndarray]:
         """For n components: the column (n,) that holds each, and the channels (3, n) in which it shows, 1 or 0."""
         columns, seen, first = [], [], 0

@@ -85,11 +85,12 @@ class Prior:
         """The precision matrix times x (n,)."""
         return self.precision * x + self._between(x)
 
-    def of_channel(self) -> np.ndarray:
-        """(Q, Q) the precision matrix of one channel, where all parameters are colours."""
-        columns = np.zeros((len(self.mean) // 3, len(self.mean) // 3, 3))
+    def of_system(self) -> np.ndarray:
+        """(Q, Q) the precision matrix of one of `ParameterVector.systems`."""
+        systems = self.vector.systems
+        columns = np.zeros((len(self.mean) // systems, len(self.mean) // systems, systems))
         columns[..., 0] = np.eye(len(columns))
-        return np.stack([self.times(column.ravel())[::3] for column in columns])
+        return np.stack([self.times(column.ravel())[::systems] for column in columns])
 
     def _between(self, x: np.ndarray) -> np.ndarray:
         """What the differences add to `times`."""

@@ -6,6 +6,7 @@ Each evaluation is one kernel for a part of the pixels, so that a fit compiles f
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from functools import partial
 from typing import NamedTuple
@@ -17,7 +18,7 @@ import numpy as np
 from pathjax.compile import devices_of_a_call
 from pathjax.derivatives import backward
 from pathjax.derivatives.kept import kept as kept_of
-from pathjax.derivatives.kept import of_parameter
+from pathjax.derivatives.row_slopes import Place, by_column
 from pathjax.integrators import pixel
 from pathjax.integrators.options import Options
 from pathjax.inverse.compiled_cache import compiled
@@ -111,7 +112,8 @@ class Products:
     def rows(self, values: np.ndarray, spp: int, draws: tuple) -> Iterator[RowsPart]:
         """Yield parts of the pixels, enough of them that many devices do as much, and small enough for memory.
 
-        All parameters are colours, Q in all, and light keeps its channel: J[c] is that of channel c in channel c.
+        All parameters are colours, or all are numbers, Q in all. Light keeps its channel: J[c] is that of channel c, in
+        channel c of colours.
         """
         for group, pixels, places in self.parts:
             most = max(self.most_rows // len(pixels), 1)
@@ -195,13 +197,11 @@ def _rows(values, views, pixels, spp, seeds, vector):
         def of_pixel(row):
             columns = []
             for name, parameter in vector.parameters:
-                slope = jnp.zeros(parameter.shape, row.dtype)
+                column = jnp.zeros((math.prod(parameter.shape) // vector.systems, 3), row.dtype)
                 if name in views.names:
-                    parameter = views.wanted[name]
-                    here = kept.of(scene, parameter)
-                    array = named.get(scene, parameter.path).shape
-                    slope = of_parameter(parameter, array, row[here.start : here.stop])
-                columns.append(slope.reshape(-1, 3))
+                    here = kept.of(scene, views.wanted[name])
+                    column = by_column(Place.of(scene, here, views.wanted[name]), row[here.start : here.stop])
+                columns.append(column)
             return jnp.concatenate(columns) * views.exposure
 
         return jax.vmap(of_pixel, in_axes=1)(found.all()[..., :3])

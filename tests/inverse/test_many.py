@@ -59,7 +59,7 @@ def target(wall):
 def fit(request, wall, truth, target):
     with pytest.MonkeyPatch.context() as patch:
         if request.param == "without it":
-            patch.setattr(dense, "MOST_NUMBERS", 0)
+            patch.setattr(dense, "MOST_COLUMNS", 0)
         return pj.fit(wall, target, [NAME], start={NAME: np.full(truth.shape, 0.5)}, spp=16)
 
 
