@@ -21,6 +21,7 @@ from scipy import linalg
 from pathjax import distributed
 from pathjax.derivatives.jacobian import has_rows
 from pathjax.inverse.many import BATCHES, PRETENDED, PRODUCT_SPP, Search, whole
+from pathjax.inverse.prior import waves_of
 from pathjax.inverse.problem import Problem
 from pathjax.inverse.uncertainty import MAX_RELATIVE_ERROR
 
@@ -219,6 +220,16 @@ class Dense(Search):
 
     def determined(self) -> np.ndarray:
         return np.einsum("sqr,srq->qs", self.inverse, self.equations.matrix).ravel()
+
+    def told_waves(self) -> dict[str, np.ndarray]:
+        places, found = self.vector.unpack(np.arange(len(self.values))), {}
+        known, systems = self.inverse @ self.equations.matrix, self.vector.systems
+        for name in self.prior.waves:
+            h, w, _ = self.prior.shapes[name]
+            here = places[name].ravel()[::systems] // systems
+            mine = known[:, here][:, :, here].reshape(systems, h, w, h, w)
+            found[name] = np.einsum("shwhw->hw", waves_of(waves_of(mine, (1, 2)), (3, 4)))
+        return found
 
     def draw(self) -> np.ndarray:
         e = self.by_system(self.random.normal(size=len(self.values)))

@@ -17,7 +17,7 @@ import contextlib
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import optimistix as optx
@@ -67,6 +67,8 @@ class Fit:
     compile_seconds: float
     run_seconds: float
     scenes: list[Scene]  # the views, at the fitted values
+    # Of each texture with `smoothness`: how much neighbours were supposed to differ, and the power (`inverse.prior`).
+    smoothness: dict[str, tuple[float, float]] = field(default_factory=dict)
 
     @property
     def scene(self) -> Scene:
@@ -122,7 +124,8 @@ def fit(
         solver: an optimistix least-squares solver or minimiser for the approach; default: LevenbergMarquardt.
         scan: try indices of refraction over their whole range first, since a local method finds the nearest minimum.
         smoothness: of textures, how much neighbouring texels are expected to differ, in the root mean square and in
-            units of the parameter; "auto" finds it out; None: nothing is supposed of neighbours.
+            units of the parameter; "auto" finds it out, and the power of the Laplacian; None: nothing is supposed of
+            neighbours.
         prior: "laplacian", of differences that are alike everywhere; or "total variation", of few large ones, as at
             edges, whose mean is then `smoothness`: see `inverse.prior.Prior`.
         progress: True for a line on stderr at each step, or a function that is called with each entry of the history;
@@ -194,6 +197,7 @@ def _fit_many(problem: Problem, spp: int, seed: int, prior: Prior, tell) -> Fit:
             compile_seconds=search.products.compile_seconds,
             run_seconds=time.perf_counter() - search.started - search.products.compile_seconds,
             scenes=[problem.with_values(scene, values) for scene in problem.scenes],
+            smoothness={name: (difference, prior.power[name]) for name, difference in prior.difference.items()},
         )
 
 

@@ -48,7 +48,7 @@ OTHER_NOISE = 1.5
 # Neighbouring residuals may be correlated by so much: what is supposed of texels shows in many pixels, faintly.
 MOST_AGREEMENT = 0.05
 # Draws of the posterior: variances of texels are means over windows of so many texels, those of other numbers are not.
-TEXEL_DRAWS, OTHER_DRAWS, WINDOW = 3, 16, 5
+TEXEL_DRAWS, OTHER_DRAWS, WINDOW = 4, 16, 5
 # Renders from which the variance of a pixel is found, smoothed over so many pixels; and floors: parts of what it is
 # around, over so many pixels, and of its mean over all.
 BATCHES, SMOOTHED, FLOOR, LEAST = 4, (0.8, 2.0), 0.1, 1e-3
@@ -106,7 +106,7 @@ class Search:
             self.record(samples)
             self.deviation = self.draw()
             self.told = self.determined()
-            self.prior.estimate(self.values, self.deviation, self.told)
+            self.prior.estimate(self.values, self.deviation, self.told, self.told_waves())
             if excess < SETTLED and (not last or self.renders > 1):
                 break
 
@@ -209,10 +209,16 @@ class Search:
         products, spp, v = self.products, self.product_spp, self.deviation
         other = products.next_draw()
         a, b = products.push(self.values, v, spp, products.next_draw()), products.push(self.values, v, spp, other)
-        told = v * products.pull(self.values, self.weights * a, spp, other)
+        self.response = products.pull(self.values, self.weights * a, spp, other)
+        told = v * self.response
         pretended = (self.weights * (a - b) ** 2).sum() / 2
         self.sharp = int(np.ceil(spp * pretended / max(PRETENDED * told.sum(), 1)))
         return told
+
+    def told_waves(self) -> dict[str, np.ndarray]:
+        """(h, w) how much of each cosine wave of a texture the pixels determine, in all channels, up to chance."""
+        one, other = self.prior.waves_of(self.deviation), self.prior.waves_of(self.response)
+        return {name: (amplitudes * other[name]).sum(-1) for name, amplitudes in one.items()}
 
     # ---- parameters -------------------------------------------------------------------------------------------------
 

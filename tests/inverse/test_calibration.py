@@ -113,6 +113,57 @@ def test_errors_of_texels_smaller_than_pixels_are_as_stated(smoothness):
     assert_calibrated(ratios, 0.8, 1.2)
 
 
+def picture(kind, side=64):
+    """Texels (side, side, 3), that are no draw of the prior."""
+    random = np.random.default_rng(1)
+    y, x = (np.mgrid[:side, :side] + 0.5) / side
+    smooth = ndimage.gaussian_filter(random.normal(size=(side, side, 3)), (side / 10, side / 10, 0), mode="wrap")
+    texels = 0.45 + 0.1 * smooth / smooth.std() * (kind in ("smooth", "spots"))
+    if kind == "noise":
+        texels = random.uniform(0.2, 0.8, texels.shape)
+    for _ in range(12):
+        middle, size, color = random.uniform(size=2), random.uniform(0.05, 0.2, 2), random.uniform(0.1, 0.9, 3)
+        if kind == "edges":
+            texels[(abs(x - middle[0]) < size[0]) & (abs(y - middle[1]) < size[1])] = color
+        if kind == "spots":
+            texels[(x - middle[0]) ** 2 + (y - middle[1]) ** 2 < (size[0] / 3) ** 2] = color
+    return np.clip(texels, 0.05, 0.95).astype(np.float32)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "kind, least", [("noise", 0.7), ("edges", 0.7), ("spots", 0.7), ("smooth", 0.0), ("constant", 0.0)]
+)
+def test_errors_of_pictures_are_as_stated(kind, least):
+    """Seen at a slant, by conjugate gradients. What is smoother than edges may be better known than is stated."""
+    texels = picture(kind)
+    film = {"type": "hdrfilm", "width": 48, "height": 48, "rfilter": {"type": "box"}}
+    camera = pj.Transform().look_at(origin=[0, 2, 3], target=[0, 0, 0], up=[0, 1, 0])
+    lamp = pj.Transform().translate([0, 3, 0]).rotate([1, 0, 0], 90)
+    bitmap = {"type": "bitmap", "data": texels, "raw": True, "wrap_mode": "clamp"}
+    scene = pj.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "path", "max_depth": 4},
+            "sensor": {"type": "perspective", "fov": 35, "to_world": camera, "film": film},
+            "lamp": {
+                "type": "rectangle",
+                "to_world": lamp,
+                "emitter": {"type": "area", "radiance": {"type": "rgb", "value": [5, 5, 5]}},
+            },
+            "floor": {
+                "type": "rectangle",
+                "to_world": pj.Transform().rotate([1, 0, 0], -90),
+                "bsdf": {"type": "diffuse", "id": "carpet", "reflectance": bitmap},
+            },
+        }
+    )
+    fit, truth, ratios = fitted(scene, "carpet.reflectance", 0.5, 64, smoothness="auto")
+    assert fit.converged, fit.message
+    assert len(ratios) > 0.8 * truth.size
+    assert least < np.sqrt(np.mean(ratios**2)) < 1.4
+
+
 @pytest.mark.parametrize("spread", [1, 1e-4])
 def test_a_step_ends_where_the_quadratic_is_least_within_bounds(spread):
     """Texels that are strongly correlated, of which many end at a bound: others make up for what it keeps one from.
