@@ -18,7 +18,6 @@ import warnings
 import jax
 import jaxlib
 
-from pathjax.system import memory
 from pathjax.system.cores import cores
 
 _OPTION = "xla_cpu_small_while_loop_byte_threshold"
@@ -64,16 +63,13 @@ def setup() -> None:
 
     Side effects on other code in the process: a user's own JAX loop over large element-wise arrays is compiled for one
     thread too, and all is optimised to LLVM's second level, of three, without unrolling, emitted without MLIR, and
-    moved out of loops by LLVM alone; and freed memory is kept (`memory.keep_freed`). `PATHJAX_NATIVE_LOOPS=0` in the
-    environment opts out; pathjax still works, slowly.
+    moved out of loops by LLVM alone. `PATHJAX_NATIVE_LOOPS=0` in the environment opts out; pathjax still works, slowly.
 
     Warns:
         UserWarning: the backend was started before, with the remedy.
     """
     flags = os.environ.get("XLA_FLAGS", "")
     native = os.environ.get("PATHJAX_NATIVE_LOOPS", "1") != "0"
-    if native:
-        memory.keep_freed()
     wanted = native and _OPTION not in flags
     if wanted:
         width = "" if _WIDTH_OPTION in flags else _WIDTH_FLAG
