@@ -101,7 +101,7 @@ def pulled(
 
     def add(number, total):
         work, there, u = of_block(number)
-        of_values = gather_samples(through, first_pixel, u, jnp.where(there, scale, 0), of_sums, devices)
+        of_values = gather_samples(through, first_pixel, u, jnp.where(there, scale, 0), of_sums)
         new = of_samples(of_values.reshape(-1, channels), work, _sampled(scene), *shared)
         return total + new
 
@@ -304,30 +304,20 @@ def gather_samples(
     u: Float[Array, "B R n 2"],
     scale: Float[Array, "B R n"],
     of_sums: Float[Array, "R m C"],
-    devices: int | None = None,
 ) -> Float[Array, "B R n C"]:
     """The transpose of `spread_samples` but for the weights: of the adjoint of sums, that of the values of samples."""
     edge, count = halo(through), u.shape[2]
-    spare = [(0, 0), (0, 0), (0, len(jax.devices()))]  # what the last device has too many
-    adjoint = jnp.pad(jnp.moveaxis(of_sums, -1, 1), spare)
-    u, scale = jnp.pad(jnp.moveaxis(u, -1, 2), [(0, 0), *spare]), jnp.pad(scale, spare)
+    pixels, adjoint = first_pixel + jnp.arange(count), jnp.moveaxis(of_sums, -1, 1)
 
-    def of_run(first, size, u, scale, adjoint):
-        def window(x, more=0):
-            return lax.dynamic_slice_in_dim(x, first, size + more, axis=-1)
+    def gather(u, scale, around):
+        by_x, by_y, around = lax.optimization_barrier((*_weights(through, pixels, u), around))
+        total = 0
+        for b, a, step in _steps(through):
+            total = total + by_x[a] * by_y[b] * around[:, edge + step : edge + step + count]
+        return scale * total
 
-        pixels, around = first_pixel + first + jnp.arange(size), window(adjoint, 2 * edge)
-
-        def gather(u, scale, around):
-            by_x, by_y, around = lax.optimization_barrier((*_weights(through, pixels, u), around))
-            total = 0
-            for b, a, step in _steps(through):
-                total = total + by_x[a] * by_y[b] * around[:, edge + step : edge + step + size]
-            return scale * total
-
-        return lax.map(lambda sample: jax.vmap(gather)(*sample, around), (window(u), window(scale)))
-
-    found = split_map(of_run, count, u, scale, adjoint, devices=devices)
+    # On one device: XLA of jax 0.7 aborts where the columns are dealt to some.
+    found = lax.map(lambda sample: jax.vmap(gather)(*sample, adjoint), (jnp.moveaxis(u, -1, 2), scale))
     return jnp.moveaxis(found, 2, -1)
 
 
