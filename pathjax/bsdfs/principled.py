@@ -133,13 +133,13 @@ class Look(NamedTuple):
         return self.dielectric if self.spec_trans is None else self.dielectric * (1 - self.spec_trans)
 
     def mixed(self) -> Look:
-        """The look by which lobes are chosen: each has a share, since without one it has a derivative in it."""
+        """The look by which lobes are chosen. Each has a chance: of share 0 it is black, but its derivative is not."""
         shares = {name: getattr(self, name) for name in ("metallic", "spec_trans", "clearcoat")}
         return self._replace(**{name: within_shares(share) for name, share in shares.items() if share is not None})
 
 
 def within_shares(share: Float[Array, ""]) -> Float[Array, ""]:
-    """A share as one by which lobes are chosen: neither of two has none."""
+    """A share () in [0, 1] moved so far from both ends that each of two lobes has a chance."""
     return jnp.clip(share, LEAST_REFLECTANCE, 1 - LEAST_REFLECTANCE)
 
 

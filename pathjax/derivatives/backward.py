@@ -286,6 +286,7 @@ def _kernel(scene: Scene, kept: Kept, options: Options, of_slot: Callable = lamb
 
 
 def moved(place_of: Callable, slot: Slot) -> Slot:
+    """The Slot whose places are those of the total. place_of: from the list of entries to the total."""
     return replace(slot, places=tuple(map(place_of, slot.places)))
 
 

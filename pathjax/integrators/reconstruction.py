@@ -173,7 +173,7 @@ def sums(
     def add(number, state):
         work, there, u = of_block(number)
         values = jax.tree.leaves(of_samples(work, _sampled(scene), *shared))
-        none = jnp.zeros((*there.shape, 0), scale.dtype)
+        none = jnp.zeros((*there.shape, 0), scale.dtype)  # where the weights alone are asked for
         values = jnp.concatenate([none, *(x.reshape(*there.shape, -1) for x in values)], -1)
         values = jnp.where(there[..., None], values, 0)
         spread = spread_samples(through, first_pixel, u, jnp.where(there, scale, 0), values, devices)
@@ -192,9 +192,13 @@ def _sampled(scene: Scene) -> Scene:
 
 
 def _blocks(run: Run, scene: Scene, channels: int, options: Options) -> tuple[Int[Array, ""], Callable]:
-    """In how many calls of a kernel, of so many numbers of each sample, all samples are; and number -> those of one:
+    """The number of calls of a kernel that all samples take, and what the call of a number is of.
 
-    Works of all B samples of each pixel, of which some are not (B, R, n) there, and `film_numbers` (B, R, n, 2).
+    Args:
+        channels: numbers that a sample consists of.
+    Returns:
+        count, and number -> `Works` of B samples of each pixel; (B, R, n) which of them are there; and their
+        `film_numbers` (B, R, n, 2).
     """
     first_pixel, first_sample, spp, seed, _ = run
     pixels = first_pixel + jnp.arange(spp.shape[1], dtype=jnp.int32)
@@ -313,7 +317,8 @@ def gather_samples(
         by_x, by_y, around = lax.optimization_barrier((*_weights(through, pixels, u), around))
         total = 0
         for b, a, step in _steps(through):
-            total = total + by_x[a] * by_y[b] * around[:, edge + step : edge + step + count]
+            weight = by_x[a] * by_y[b]
+            total = total + jnp.where(weight != 0, weight * around[:, edge + step : edge + step + count], 0)
         return scale * total
 
     # On one device: XLA of jax 0.7 aborts where the columns are dealt to some.
