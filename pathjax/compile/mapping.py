@@ -23,8 +23,9 @@ from pathjax.compile.vectorised import most_lanes, vectorised, vectorised_sum
 from pathjax.compile.xla import native
 
 # Items that a native loop takes at once: enough that loops over them vectorise and their overheads vanish, few enough
-# that what they keep stays in the nearest caches. Few items would leave most of the lanes idle.
-_LANES, _FEW_LANES = 256, 64
+# that what they keep stays in the nearest caches. Of 64 to 512, 128 took least time in most scenes of the bench, and
+# 256 up to a tenth more. Few items would leave most of the lanes idle.
+_LANES, _FEW_LANES = 128, 64
 MANY_ITEMS = 2 * _LANES
 # Of a sum over items: so many for a part, so that few lanes wait for its last one; and bytes of the sums of all parts.
 ITEMS_OF_A_PART, MOST_PARTS, MOST_BYTES = 8192, 16, 1 << 26
