@@ -21,7 +21,16 @@ from pathjax.compile.jax_compat import is_symbolic_zero, is_traced, register_dat
 from pathjax.compile.lanes.interpreter import SELECTED_ROWS
 from pathjax.compile.linear import linear
 from pathjax.compile.mapping import MANY_ITEMS, cuts, native_fold, native_map, native_rows, split_map, sum_of_parts
-from pathjax.compile.primitives import Search, basis, compute_once, interleaved, one_by_one, persistent_loop, together
+from pathjax.compile.primitives import (
+    Search,
+    basis,
+    compute_once,
+    interleaved,
+    one_by_one,
+    persistent_loop,
+    together,
+    unset,
+)
 from pathjax.compile.promotion import usual_promotion
 from pathjax.compile.replicas import on_all_devices
 from pathjax.compile.rows import Rows
@@ -57,6 +66,7 @@ __all__ = [
     "split_map",
     "sum_of_parts",
     "together",
+    "unset",
     "usual_promotion",
 ]
 

@@ -1,6 +1,6 @@
-"""What code of one item may say to `lanes`: five primitives, with all rules that JAX's transformations need.
+"""What code of one item may say to `lanes`: six primitives, with all rules that JAX's transformations need.
 
-Four change no result, and outside of lanes they do next to nothing. `together` changes what all items share.
+Five change no result, and outside of lanes they do next to nothing. `together` changes what all items share.
 """
 
 from __future__ import annotations
@@ -33,6 +33,7 @@ column_p = Primitive("computed_column")
 one_by_one_p = Primitive("one_by_one")
 one_by_one_p.multiple_results = True
 persistent_test_p = Primitive("persistent_test")
+unset_p = Primitive("unset")
 basis_p = Primitive("basis")
 together_p = Primitive("together")
 together_p.multiple_results = True
@@ -168,6 +169,14 @@ def persistent_loop(test: Callable, body: Callable, state):
     return lax.while_loop(lambda state: persistent_test_p.bind(jnp.asarray(test(state))), body, state)
 
 
+def unset(values):
+    """A pytree of arrays that a persistent_loop begins with, and its body sets before it reads them.
+
+    A lane that takes its next item need not write them: there it finds what the last one left.
+    """
+    return jax.tree.map(unset_p.bind, values)
+
+
 def together(f: Callable) -> Callable:
     """f(memory, here, values) -> memory, called by one item as (memory, values), and by lanes once for all of them.
 
@@ -297,6 +306,12 @@ persistent_test_p.def_abstract_eval(lambda goes_on: goes_on)
 mlir.register_lowering(persistent_test_p, lambda context, goes_on: [goes_on])
 batching.primitive_batchers[persistent_test_p] = lambda values, axes: (persistent_test_p.bind(*values), *axes)
 
+
+unset_p.def_impl(jnp.asarray)
+unset_p.def_abstract_eval(lambda value: value)
+mlir.register_lowering(unset_p, lambda context, value: [value])
+batching.defvectorized(unset_p)
+ad.deflinear2(unset_p, lambda cotangent, _: [cotangent])
 
 # ---- together -------------------------------------------------------------------------------------------------------
 

@@ -10,7 +10,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int, Integer, UInt
 
-from pathjax.compile import compute_once, persistent_loop
+from pathjax.compile import compute_once, persistent_loop, unset
 from pathjax.core import sampler
 from pathjax.core.types import Ray
 from pathjax.emitters import Choice
@@ -59,9 +59,10 @@ def camera_path(
 
 
 def no_path(scene: Scene, options: Options) -> tuple[path.Path, Float[Array, ""]]:
-    """What stands where a `camera_path` is to be put."""
+    """What stands where a `camera_path` is to be put: anything that is not alive, so that lanes need not write it."""
     nothing = jax.eval_shape(lambda x: camera_path(scene, jnp.int32(0), x, x, options), jnp.uint32(0))
-    return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), nothing)
+    now, weight = unset(jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), nothing))
+    return now._replace(alive=jnp.bool_(False)), weight
 
 
 def mean(work: Work, scene: Scene, choice: Choice | None, control=None, *, options: Options) -> Float[Array, "3"]:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from jax import lax
 
-from pathjax.compile import basis, compute_once, one_by_one, persistent_loop
+from pathjax.compile import basis, compute_once, one_by_one, persistent_loop, unset
 from pathjax.compile.lanes import lanes, runs
 
 WIDTH = 5
@@ -420,6 +420,29 @@ def test_a_lane_that_leaves_the_own_loop_of_an_item_takes_the_next(count):
     rng = np.random.default_rng(count)
     trips = rng.integers(0, 40, count).astype(np.int32) * rng.integers(0, 2, count).astype(np.int32)
     agrees(f, trips, rng.normal(size=(count, 3)).astype(np.float32))
+
+
+def test_what_a_persistent_loop_begins_with_unset_is_not_written():
+    """An item's own loop keeps what the last one left in its lane, and reads nothing of it: it begins with a store."""
+
+    def f(n, start, table):
+        def step(state):
+            k, kept = state
+            return k + 1, jnp.where(k == 0, start, kept) * 1.5
+
+        return persistent_loop(lambda s: s[0] < n, step, (jnp.int32(0), unset(jnp.zeros(3))))
+
+    rng = np.random.default_rng(3)
+    trips = rng.integers(1, 9, 4 * WIDTH + 3).astype(np.int32)
+    agrees(f, trips, rng.normal(size=(len(trips), 3)).astype(np.float32))
+
+    def written(initial):
+        def count(n):
+            return persistent_loop(lambda s: s[0] < n, lambda s: (s[0] + 1, s[1] * 0 + n), (jnp.int32(0), initial()))[0]
+
+        return str(jax.make_jaxpr(lanes(count, WIDTH))(trips)).count("name=dynamic_update_index_in_dim")
+
+    assert written(lambda: unset(jnp.zeros(3, jnp.int32))) == written(lambda: jnp.zeros(3, jnp.int32)) - 3
 
 
 def test_a_loop_before_the_persistent_one_runs_when_an_item_begins():

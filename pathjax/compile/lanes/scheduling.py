@@ -12,6 +12,7 @@ from pathjax.compile.lanes import flags
 from pathjax.compile.lanes.columns import entry, join, split, with_entry
 from pathjax.compile.lanes.dataflow import variables, variables_read_by
 from pathjax.compile.lanes.interpreter import Interpreter
+from pathjax.compile.primitives import unset_p
 
 
 def in_groups(interpreter: Interpreter, program, xs, shared):
@@ -56,6 +57,9 @@ def from_queue(interpreter: Interpreter, program, xs, shared, place, differ, mem
     kept = [*own, *loop.outvars]
     differing = [True] * len(own) + differ(loop.outvars)
     shapes = [v.aval.shape for v in kept]
+    unset = variables(v for eqn in before if eqn.primitive is unset_p for v in eqn.outvars)
+    unset = {v for v, atom in zip(loop.outvars, init, strict=True) if variables([atom]) & unset}
+    written = [differs and v not in unset for v, differs in zip(kept, differing, strict=True)]
 
     def read_all(values, atoms):
         return [interpreter.read(values, v) for v in atoms]
@@ -100,9 +104,9 @@ def from_queue(interpreter: Interpreter, program, xs, shared, place, differ, mem
             begun = begin(jnp.minimum(number, count - 1), common)
             packed = [
                 [with_entry(column, x, lane) for column, x in zip(columns, jnp.ravel(begun[v]), strict=True)]
-                if differs
+                if is_written
                 else columns
-                for v, columns, differs in zip(kept, packed, differing, strict=True)
+                for v, columns, is_written in zip(kept, packed, written, strict=True)
             ]
             return number, with_entry(item, number, lane), packed
 
