@@ -128,11 +128,17 @@ class Materials:
     nudged: tuple[Int[Array, ""], Float[Array, "held columns"]] | None = None
 
 
-def build(bsdfs: list[Instance], dtype, path: tuple, parameters: Parameters) -> Materials:
+def build(
+    bsdfs: list[Instance], dtype, path: tuple, parameters: Parameters, free_passes: bool = False
+) -> Materials:
     """Materials of the shapes whose bsdfs are given.
 
     path: where the materials will be in the scene; parameters: to enter those of bsdfs and textures.
+    free_passes: whether going straight on through a surface is no bounce.
     """
+    if free_passes:
+        made = {each: each.kind.with_free_passes(each) for each in bsdfs}
+        bsdfs = [made[each] for each in bsdfs]
     levels = tree.reached(bsdfs)
     present = list(dict.fromkeys(each for level in levels for each in level))
     used = dict.fromkeys(v for each in present for v in each.values.values() if isinstance(v, Instance))
@@ -235,14 +241,14 @@ def passing(
     materials: Materials,
     shape: Index,
     surface: Surface,
-    front: Bool[Array, ""],
+    cos: Float[Array, ""],
     nudges: Float[Array, "held columns"] | None = None,
 ) -> Float[Array, ""]:
-    """Share of light that a side of a shape lets straight on. nudges: of `tree.passing`."""
+    """Share of light that a side of a shape lets straight on. cos, nudges: of `tree.passing`."""
     passes = partial(has, materials, capability="passes")
-    code = select(materials, shape, front)
+    code = select(materials, shape, cos > 0)
     if materials.wrappers:
-        return tree.passing(materials, code, front, surface, passes, nudges)
+        return tree.passing(materials, code, cos, surface, passes, nudges)
     return passes(code[0]).astype(surface.p.dtype)
 
 

@@ -13,5 +13,5 @@ class BlendBSDF(Choosing):
     weight = Number(bounds=(0, 1), textured=True, required=True)
 
     @staticmethod
-    def share(p: Row):
+    def share(p: Row, cos):
         return p.weight

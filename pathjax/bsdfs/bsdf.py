@@ -66,6 +66,11 @@ class BSDF(Kind):
         return instance, instance if cls.sided else None
 
     @classmethod
+    def with_free_passes(cls, instance: Instance) -> Instance:
+        """What stands for it where going straight on through a surface is no bounce."""
+        return instance
+
+    @classmethod
     def leaves(cls, instance: Instance) -> tuple[Instance, ...]:
         """The bsdfs that scatter, of all that it may be."""
         return (instance,)

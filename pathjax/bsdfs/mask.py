@@ -19,5 +19,5 @@ class Mask(Choosing):
         return super().holding(name, NOTHING, *held, **values)
 
     @staticmethod
-    def share(p: Row):
+    def share(p: Row, cos):
         return p.opacity

@@ -51,5 +51,5 @@ class Sheet(Choosing):
         return super().holding(name, Opaque.instance("opaque"), Null.instance("straight"), **values)
 
     @classmethod
-    def share(cls, p: Row):
+    def share(cls, p: Row, cos):
         return cls.passes_of * p.transmittance

@@ -10,30 +10,80 @@ from pathjax.bsdfs import fresnel
 from pathjax.bsdfs.dielectric import IndexOfRefraction
 from pathjax.bsdfs.interface import Interface
 from pathjax.bsdfs.ior import IOR
+from pathjax.bsdfs.null import Null
+from pathjax.bsdfs.wrapper import Choosing
 from pathjax.core.math import safe_divide, smaller
 from pathjax.core.types import BSDFSample
 from pathjax.kinds import Row
+
+# One row for all panes.
+STRAIGHT_ON = Null.instance("straight")
+
+
+def reflectance(p: Row, cos: Float[Array, ""]) -> Float[Array, ""]:
+    """Share of light that a pane reflects, between its faces any number of times."""
+    r, _ = fresnel.dielectric(smaller(cos, 1), p.int_ior / p.ext_ior)
+    # r + (1 - r)^2 r (1 + r^2 + r^4 + ...)
+    return 2 * r / (1 + r)
 
 
 class ThinDielectric(Interface):
     """A pane with two smooth faces so near each other that light leaves where it came in, going on straight.
 
-    No path moves with its IOR: the weights carry the derivative.
+    No path moves with its IOR: the weights carry the derivative. Where going straight on is no bounce, shadow rays pass
+    it too: it is a `Pane`. One with a `specular_transmittance` stays as it is.
     """
 
     int_ior = IndexOfRefraction(IOR["bk7"])
     ext_ior = IndexOfRefraction(IOR["air"])
     delta = True
 
+    @classmethod
+    def read(cls, loader, fields, name):
+        made = super().read(loader, fields, name)
+        if loader.integrator.free_passes and made.values["specular_transmittance"] is not None:
+            where = fields.where("specular_transmittance")
+            loader.note(where, "makes the pane a bounce that casts shadows; in Mitsuba light samples pass it")
+        return made
+
+    @classmethod
+    def with_free_passes(cls, instance):
+        values = dict(instance.values)
+        if values["specular_transmittance"] is not None:
+            return instance
+        reflection = {"specular_reflectance": values.pop("specular_reflectance"), "int_ior": None, "ext_ior": None}
+        return Pane.holding(instance.name, Reflection.instance(instance.name, **reflection), STRAIGHT_ON, **values)
+
     @staticmethod
     def sample(p: Row, wi: Float[Array, "3"], u: Float[Array, " numbers"]) -> BSDFSample:
         """Reflect with the probability of doing so between the faces any number of times, else pass."""
-        r, _ = fresnel.dielectric(smaller(jnp.abs(wi[2]), 1), p.int_ior / p.ext_ior)
-        # r + (1 - r)^2 r (1 + r^2 + r^4 + ...)
-        r = 2 * r / (1 + r)
+        r = reflectance(p, jnp.abs(wi[2]))
         reflects = u[0] < lax.stop_gradient(r)
         share = jnp.where(reflects, r, 1 - r)
         pdf = lax.stop_gradient(share)
         wo = jnp.where(reflects, jnp.stack([-wi[0], -wi[1], wi[2]]), -wi)
         weight = Interface.tinted(p, safe_divide(share, pdf), reflects)
         return BSDFSample(wo, weight, pdf, jnp.bool_(True), jnp.ones_like(pdf))
+
+
+class Reflection(ThinDielectric):
+    """The mirror that stands for a pane where chance takes what it reflects."""
+
+    transmissive = False
+
+    @staticmethod
+    def sample(p: Row, wi: Float[Array, "3"], u: Float[Array, " numbers"]) -> BSDFSample:
+        """Mirror direction."""
+        one = jnp.ones_like(wi[2])
+        weight = Interface.tinted(p, one, jnp.bool_(True))
+        return BSDFSample(jnp.stack([-wi[0], -wi[1], wi[2]]), weight, one, jnp.bool_(True), one)
+
+
+class Pane(Choosing, ThinDielectric):
+    """A mirror, or nothing where light goes straight on, by the share of either."""
+
+    transmissive = delta = False
+
+    @staticmethod
+    def share(p: Row, cos):
+        return 1 - reflectance(p, cos)

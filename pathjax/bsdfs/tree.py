@@ -134,7 +134,7 @@ def leaf(
                     none = jnp.zeros((len(columns),), weight.dtype)
                     trace.append(Chosen(jnp.int32(0), jnp.ones_like(weight), none))
                 same = node, u, weight, *trace[-1:]
-                choice = partial(_choice, table.kind, p, node, wi[2] > 0, u, weight, differentiated, columns)
+                choice = partial(_choice, table.kind, p, node, wi[2], u, weight, differentiated, columns)
                 node, u, weight, *trace[-1:] = compute_once(lax.cond(here, choice, lambda same=same: same))
             node, frame, wi, turns = _entered(node, frame, wi, turns)
     return Leaf(node[0], node[1], frame, wi, weight, turns, tuple(trace))
@@ -152,9 +152,10 @@ def _held(p, front):
     return at(p.nodes, jnp.where(front, 0, 1))
 
 
-def _choice(kind, p, node, front, u, weight, differentiated, columns):
+def _choice(kind, p, node, cos, u, weight, differentiated, columns):
     """One of two, the number for the next choice, the weight, and where columns are given what was Chosen."""
-    share = kind.share(p)
+    front, cos = cos > 0, jnp.abs(cos)
+    share = kind.share(p, cos)
     chance = lax.stop_gradient(share)
     if differentiated:
         chance = jnp.clip(chance, MIN_CHANCE, 1 - MIN_CHANCE)
@@ -167,7 +168,7 @@ def _choice(kind, p, node, front, u, weight, differentiated, columns):
     if columns is None:
         return following
     by_share = jnp.where(takes_second, safe_divide(1.0, chance), -safe_divide(1.0, 1 - chance))
-    return *following, Chosen(node[1], factor, by_share * share_by(kind, p, columns))
+    return *following, Chosen(node[1], factor, by_share * share_by(kind, p, cos, columns))
 
 
 def steps(materials) -> list[int]:
@@ -176,13 +177,16 @@ def steps(materials) -> list[int]:
     return [place for place in places if materials.wrappers[place].kind.chooses]
 
 
-def share_by(kind: type[Choosing], p: Row, columns: tuple[int | None, ...]) -> Float[Array, " columns"]:
+def share_by(
+    kind: type[Choosing], p: Row, cos: Float[Array, ""], columns: tuple[int | None, ...]
+) -> Float[Array, " columns"]:
     """Derivative of the share of the second of two in some columns of the table."""
 
     def share(nudges):
-        return kind.share(p.nudged({column: nudges[s] for s, column in enumerate(columns) if column is not None}))
+        nudges = {column: nudges[s] for s, column in enumerate(columns) if column is not None}
+        return kind.share(p.nudged(nudges), cos)
 
-    return jax.jacfwd(share)(jnp.zeros((len(columns),), kind.share(p).dtype))
+    return jax.jacfwd(share)(jnp.zeros((len(columns),), cos.dtype))
 
 
 def _turned(kind, p, surface, upright, frame, wi):
@@ -227,7 +231,7 @@ def seen_by_turned(turns: tuple[Turn, ...], n: Float[Array, "3"], d: Float[Array
 def passing(
     materials,
     node: Node,
-    front: Bool[Array, ""],
+    cos: Float[Array, ""],
     surface: Surface,
     passes: Callable,
     nudges: Float[Array, "held columns"] | None = None,
@@ -237,12 +241,12 @@ def passing(
     """Share of light that goes straight on: the probability with which `leaf` comes to a leaf that passes.
 
     Args:
-        front: which side is seen.
+        cos: between the ray that looks and the shading normal: which side is seen.
         passes: whether leaves of a kind do.
         nudges: added to what each of `on_the_way` looks up in the columns that are `Materials.recorded`.
     """
     kind, row, turned = node
-    front = front | (turned == 1)
+    cos = jnp.where(turned == 1, jnp.abs(cos), cos)
     share = ((kind < len(materials.tables)) & passes(kind)).astype(surface.p.dtype)
     for place in materials.passing[level] if level < len(materials.passing) else ():
         table = materials.wrappers[place]
@@ -251,14 +255,14 @@ def passing(
         def through(table=table, here=here, place=place):
             p = Row(table, jnp.where(here, row, 0), surface, materials.textures)
             following = place_in_tree + 1, place_in_tree + 1 + most_on_the_way(materials, level + 1)
-            held = zip(_held(p, front), following, strict=False)
-            shares = [passing(materials, each, front, surface, passes, nudges, level + 1, n) for each, n in held]
+            held = zip(_held(p, cos > 0), following, strict=False)
+            shares = [passing(materials, each, cos, surface, passes, nudges, level + 1, n) for each, n in held]
             if len(shares) == 1:
                 return shares[0]
             if nudges is not None:
                 of_columns = zip(materials.recorded[place], nudges[place_in_tree], strict=True)
                 p = p.nudged({column: nudge for column, nudge in of_columns if column is not None})
-            second = table.kind.share(p)
+            second = table.kind.share(p, jnp.abs(cos))
             return (1 - second) * shares[0] + second * shares[1]
 
         share = lax.cond(here, through, lambda share=share: share)

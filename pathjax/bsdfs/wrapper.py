@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from abc import abstractmethod
 from collections.abc import Callable
 from typing import ClassVar
@@ -58,10 +59,16 @@ class Choosing(Wrapper):
 
     chooses = True
 
+    @classmethod
+    def with_free_passes(cls, instance):
+        held = tuple(each.kind.with_free_passes(each) for each in instance.values["held"])
+        same = all(map(operator.is_, held, instance.values["held"]))
+        return instance if same else Instance(instance.kind, instance.name, {**instance.values, "held": held})
+
     @staticmethod
     @abstractmethod
-    def share(p: Row) -> Float[Array, ""]:
-        """The probability of the second one."""
+    def share(p: Row, cos: Float[Array, ""]) -> Float[Array, ""]:
+        """The probability of the second one. cos: in [0, 1], of the angle between the ray and the normal."""
 
 
 class Turning(Wrapper):

@@ -107,20 +107,20 @@ def _beyond(scene, target, most, differentiated, along, way: _Way) -> _Way:
     hit = geometry.closest_hit(scene.geometry, way.ray)
     arrives = (hit.primitive < 0) | (hit.primitive == target)
     surface = geometry.surface(scene.geometry, way.ray, hit)
-    front = dot(shading_frame(surface).n, way.ray.d) < 0
+    cos = -dot(shading_frame(surface).n, way.ray.d)
     nudges = None
     if way.nudged is not None:
         number, nudges = scene.materials.nudged
         mine = way.passed == number
         nudges = jnp.where(mine, nudges, 0)
-        code = bsdfs.select(scene.materials, hit.shape, front)
-        held = jnp.stack([jnp.stack(each) for each in tree.on_the_way(scene.materials, code, front)])
+        code = bsdfs.select(scene.materials, hit.shape, cos > 0)
+        held = jnp.stack([jnp.stack(each) for each in tree.on_the_way(scene.materials, code, cos > 0)])
         way = way._replace(
             nudged=jax.tree.map(lambda new, old: jnp.where(mine & ~arrives, new, old), (surface, held), way.nudged)
         )
-    free = bsdfs.passing(scene.materials, hit.shape, surface, front, nudges)
+    free = bsdfs.passing(scene.materials, hit.shape, surface, cos, nudges)
     through = jnp.where(way.passed < most, free, 0)
-    maybe = bsdfs.is_tree(scene.materials, hit.shape, front) if differentiated else False
+    maybe = bsdfs.is_tree(scene.materials, hit.shape, cos > 0) if differentiated else False
     on = ~arrives & (way.passed < most) & ((through > 0) | maybe)
     way = way._replace(share=jnp.where(arrives, way.share, way.share * through))
     way = _flown(scene, way, smaller(hit.t, way.ray.t_max), along)

@@ -32,7 +32,9 @@ def build(description: desc.Description, dtype=jnp.float32, split_rule: str = "s
     if jax.dtypes.canonicalize_dtype(dtype) != np.dtype(dtype):
         raise InputError('dtype = float64, which is off in JAX; call jax.config.update("jax_enable_x64", True) first')
     parameters = Parameters()
-    materials = bsdfs.build([shape.bsdf for shape in description.shapes], dtype, ("materials",), parameters)
+    free_passes = description.integrator.free_passes
+    given = [shape.bsdf for shape in description.shapes]
+    materials = bsdfs.build(given, dtype, ("materials",), parameters, free_passes)
     asked = {"tangents": bsdfs.occurs(materials, "anisotropic"), "along": bsdfs.occurs(materials, "along_uv")}
     geometry, lamps, trees = shapes.build(description.shapes, dtype, split_rule, ("geometry",), parameters, **asked)
     given = [*(shape.emitter for shape in description.shapes), *description.emitters]
@@ -44,7 +46,7 @@ def build(description: desc.Description, dtype=jnp.float32, split_rule: str = "s
     about = About(description, parameters.known, parameters.refused, trees)
     view = seen(description, dtype)
     # NumPy up to here: `jnp.asarray` compiles a program for every shape that it meets.
-    free_passes = description.integrator.free_passes and bsdfs.occurs(materials, "passes")
+    free_passes = free_passes and bsdfs.occurs(materials, "passes")
     parts = {"geometry": geometry, "materials": materials, "emitters": lights, "about": about, "media": within}
     return jax.device_put(Scene(**parts, **view, free_passes=free_passes))
 

@@ -201,6 +201,40 @@ def test_light_that_no_ray_meets_comes_through_masks(load_text, integrator, lit)
         assert image[depth - 1].any() == (depth == lit)
 
 
+# What stands in front of the floor, and the shares of light that a pane inside lets through, and what is around it.
+PANES = {
+    "{}": (1, 0),
+    '<bsdf type="mask"><float name="opacity" value="0.25"/>{}</bsdf>': (0.25, 0.75),
+    '<bsdf type="blendbsdf"><float name="weight" value="0.4"/>{}<bsdf type="null"/></bsdf>': (0.6, 0.4),
+    '<bsdf type="bumpmap"><texture type="checkerboard"/>{}</bsdf>': (0, 0),
+}
+
+
+@pytest.mark.parametrize("integrator", [pytest.param("path", marks=pytest.mark.slow), "volpath"])
+@pytest.mark.parametrize("around", PANES)
+def test_light_that_no_ray_meets_comes_through_panes_where_they_are_no_bounce(load_text, around, integrator):
+    """Along their normal a share 2 n / (n^2 + 1), as in Mitsuba; onto a floor, out of sight of the camera."""
+    glass = '<float name="int_ior" value="1.5"/><float name="ext_ior" value="1"/>'
+    pane = around.format(f'<bsdf type="thindielectric" id="pane">{glass}</bsdf>')
+    place = '<transform name="to_world"><rotate y="1" angle="45"/><translate x="5" z="5"/></transform>'
+    sun = '<emitter type="directional"><vector name="direction" value="-1, 0, -1"/></emitter>'
+    scene = load_text(PLATE.format(GREY) + PLATE.format(place + pane) + sun, integrator, fov=1)
+    image, J = pj.jacobian(scene, ["pane.int_ior"], spp=4)
+    n, direct = 1.5, np.array([0.6, 0.3, 0]) * np.sqrt(0.5) / np.pi
+    of_pane, of_rest = PANES[around]
+    of_pane = of_pane if integrator == "volpath" else 0
+    share, slope = 2 * n / (n**2 + 1), 2 * (1 - n**2) / (n**2 + 1) ** 2
+    for pixels, expected in ((image, of_pane * share + of_rest), (J["pane.int_ior"], of_pane * slope)):
+        np.testing.assert_allclose(pixels, np.broadcast_to(expected * direct, pixels.shape), rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("integrator, told", [("path", False), ("volpath", True)])
+def test_info_tells_of_a_pane_that_shadows_what_it_would_let_pass(load_text, integrator, told):
+    pane = '<bsdf type="thindielectric"><rgb name="specular_transmittance" value="0.9"/></bsdf>'
+    notes = load_text(PLATE.format(pane) + SKY, integrator).about.description.notes
+    assert any("specular_transmittance" in note and "light samples pass it" in note for note in notes) == told
+
+
 @pytest.mark.parametrize("kind, share", [("polarizer", 0.5), ("circular", 0.5), ("retarder", 1)])
 def test_sheets_that_polarise_let_a_share_through_and_absorb_the_rest(make_scene, kind, share):
     """Seen before the sky, within 5 standard errors; the derivative is that of the mean in each sample."""

@@ -72,6 +72,7 @@ class _Loader:
     def __init__(self, document: Document):
         self.document = document
         self.notes = list(document.notes)
+        self.integrator = d.Integrator()
         self.names = set(document.ids)
         self.counts: defaultdict[str, Iterator[int]] = defaultdict(count)
         self.named: set[tuple[str, str]] = set()  # types and names of bsdfs and textures
@@ -102,9 +103,8 @@ class _Loader:
             first = scene["integrator"][0].place
             raise element.error(f"{element}: one <integrator> is supported here; the first is at {first}")
         if scene["integrator"]:
-            integrator = self.make(scene["integrator"][0], integrators.KINDS)
+            self.integrator = self.make(scene["integrator"][0], integrators.KINDS)
         else:
-            integrator = d.Integrator()
             self.notes.append('no <integrator> is given; <integrator type="path"> is used')
         single = [element for element in scene["emitter"] if _kind_of_light(element).single]
         for element in single[1:]:
@@ -136,11 +136,11 @@ class _Loader:
                 self.make(element, dict_reader.rooms()[element.tag])
             else:
                 self.shared(element, element.id or element.tag)
-        self.check_media(scene["integrator"], integrator, shapes, lights, views[name].medium)
+        self.check_media(scene["integrator"], shapes, lights, views[name].medium)
         return d.Description(
             file,
             views[name],
-            integrator,
+            self.integrator,
             shapes,
             lights,
             tuple(self.notes),
@@ -202,7 +202,6 @@ class _Loader:
     def check_media(
         self,
         elements: list[Element],
-        integrator: d.Integrator,
         shapes: tuple[d.Shape, ...],
         lights: tuple[Instance, ...],
         medium: Instance | None,
@@ -210,10 +209,11 @@ class _Loader:
         """Tell whether media are rendered; elements: the integrator, if there is one."""
         root = elements[0] if elements else self.document.root
         present = medium is not None or any(shape.interior or shape.exterior for shape in shapes)
-        if integrator.media and not present:
+        media = self.integrator.media
+        if media and not present:
             same = "without media is the same as path, which is used"
             self.note(root, f"{same}; what goes straight on through a surface takes no depth")
-        elif present and not integrator.media:
+        elif present and not media:
             self.note(root, 'takes no notice of media, as in Mitsuba; <integrator type="volpath"> renders them')
         elif present and not shapes:
             raise root.error(f"{root}: a medium without a shape around it never ends; add a <shape>")
