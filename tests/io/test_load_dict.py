@@ -218,7 +218,7 @@ def itself():
         (scene(ball={"type": "sphere", "center": None}), "scene.ball.center: a value of type NoneType has no place"),
         (scene(ball={"type": "sphere", "to_world": np.eye(2)}), "scene.ball.to_world: a transform is a pj.Transform"),
         (scene(ball={"type": "sphere", "to_world": np.zeros((4, 4))}), "scene.ball.to_world: .*last row"),
-        (scene(ball={"type": "hair"}), "scene.ball: .*is not supported"),
+        (scene(ball={"type": "sdfgrid"}), "scene.ball: .*is not supported"),
         (scene(ball={"radius": 1}), 'scene.ball: a dictionary needs a "type"'),
         (scene(ball={"type": 3}), 'scene.ball: a dictionary needs a "type"'),
         (scene(**{"a.b": {"type": "sphere"}}), "scene: a key must be a string without dots and spaces, is 'a.b'"),

@@ -138,6 +138,41 @@ def test_included_files_are_found_beside_the_scene_beside_the_includer_and_in_pa
     assert [shape.name for shape in scene.shapes] == ["b", "shape0"]
 
 
+@pytest.mark.parametrize(
+    "body",
+    [
+        shape('<include filename="part.xml"/>'),
+        shape('<bsdf type="twosided"><include filename="part.xml" name="it"/></bsdf>'),
+        shape('<include filename="outer.xml"/>'),
+        shape('<include filename="part.xml"/>') + shape('<ref id="red"/>', "cube"),
+    ],
+)
+def test_objects_of_files_that_are_included_anywhere_stand_there(read, tmp_path, body):
+    """As in Mitsuba, which leaves out numbers of a file that are in none of its objects."""
+    red = '<bsdf type="diffuse" id="red"><rgb name="reflectance" value="$red, 0, 0"/></bsdf>'
+    (tmp_path / "part.xml").write_text(
+        f'<scene version="3.0.0"><default name="red" value="0.9"/>{red}<float name="radius" value="9"/></scene>'
+    )
+    (tmp_path / "outer.xml").write_text('<scene version="3.0.0"><include filename="part.xml"/></scene>')
+    scene = read('<default name="red" value="0.5"/>' + body)
+    front = scene.shapes[0].bsdf.kind.sides(scene.shapes[0].bsdf)[0]
+    np.testing.assert_array_equal(front.values["reflectance"], [0.5, 0, 0])
+    assert scene.shapes[0].geometry.radius == 1
+    assert any("part.xml:1" in note and "radius" in note and "has no effect" in note for note in scene.notes)
+
+
+def test_defaults_and_aliases_stand_anywhere(read):
+    inside = '<alias id="red" as="rot"/><default name="r" value="2"/><float name="radius" value="$r"/><ref id="rot"/>'
+    scene = read('<bsdf type="diffuse" id="red"/>' + shape(inside))
+    assert scene.shapes[0].geometry.radius == 2 and scene.shapes[0].bsdf.name == "red"
+
+
+@pytest.mark.parametrize("tag", ['include filename="part.xml"', 'default name="a" value="1"', 'path value="."'])
+def test_what_is_for_reading_takes_nothing_inside(refused, tmp_path, tag):
+    (tmp_path / "part.xml").write_text('<scene version="3.0.0"/>')
+    assert "takes nothing inside" in refused(f'<{tag}><float name="a" value="1"/></{tag.split()[0]}>')
+
+
 def test_error_in_an_included_file_names_that_file(read, tmp_path):
     (tmp_path / "part.xml").write_text('<scene version="3.0.0">\n\n<shape type="spere"/></scene>')
     with pytest.raises(InputError, match=r'part\.xml:3: <shape type="spere"> is not supported.* mean "sphere"'):
@@ -839,9 +874,12 @@ def test_merged_shapes_stand_for_themselves(read):
     assert [each.name for each in scene.shapes] == ["box", "lamp"] and scene.shapes[1].emitter is not None
 
 
-def test_objects_that_nothing_uses_are_checked_and_noted(read, refused):
-    assert any("is used by nothing" in note for note in read('<bsdf type="diffuse" id="spare"/>').notes)
-    assert "hair" in refused('<bsdf type="hair" id="spare"/>')
+def test_objects_that_nothing_uses_are_checked_and_noted_but_may_be_of_any_kind_of_mitsuba(read, refused):
+    spare = '<bsdf type="{}" id="spare"/>'
+    for each in (spare.format("diffuse"), spare.format("hair"), f'<bsdf type="twosided">{spare.format("hair")}</bsdf>'):
+        assert any("is used by nothing" in note for note in read(each + shape()).notes)
+    assert "hairy" in refused(spare.format("hairy"))
+    assert "roughness" in refused('<bsdf type="diffuse" id="spare"><float name="roughness" value="1"/></bsdf>')
 
 
 # --- what Mitsuba's plugins take, and no image depends on
@@ -1123,7 +1161,7 @@ def test_an_older_file_may_be_included_by_a_newer_one(read, tmp_path):
         (b"<scene/>", 'lacks the attribute "version"'),
         (b'<scene version="4.0"/>', 'version "4.0" is not of the form'),
         (b'<scene version="0.6"/>', 'version "0.6" is not of the form'),
-        (b'<scene version="3.0.0" name="x"/>', 'no attribute "name"'),
+        (b'<scene version="3.0.0" type="x"/>', 'no attribute "type"'),
         (b'<shape type="sphere"/>', "the outermost element is"),
         (b"<a>" * 100_000, "nested more than"),
         (b'<?xml version="1.0" encoding="klingon"?><scene/>', ":1: "),

@@ -66,6 +66,10 @@ def read_again(document: Document, element: Element, name: str) -> Instance:
     return _Loader(document).make(element, dict_reader.rooms()[element.tag], name)
 
 
+class _NotModelled(InputError):
+    """A kind of Mitsuba that pathjax has not."""
+
+
 class _Loader:
     """What `objects` and the readers of kinds share: names given so far, objects made so far, notes."""
 
@@ -132,10 +136,13 @@ class _Loader:
         unread = (each for tag in SHARED for each in scene[tag] if each not in self.made)
         for element in (each for each in unread if not is_one_color(each)):
             self.note(element, "is used by nothing")
-            if element.tag in ("film", "sampler", "rfilter"):
-                self.make(element, dict_reader.rooms()[element.tag])
-            else:
-                self.shared(element, element.id or element.tag)
+            try:
+                if element.tag in ("film", "sampler", "rfilter"):
+                    self.make(element, dict_reader.rooms()[element.tag])
+                else:
+                    self.shared(element, element.id or element.tag)
+            except _NotModelled:
+                self.making.clear()
         self.check_media(scene["integrator"], shapes, lights, views[name].medium)
         return d.Description(
             file,
@@ -237,7 +244,7 @@ class _Loader:
             use = f"use one of {', '.join(kinds)}"
             if fields.type in PLUGINS.get(element.tag, ()):
                 reason = f": {REASONS[fields.type]}" if fields.type in REASONS else " yet"
-                raise element.error(f"{element} is not supported{reason}; {use}")
+                raise _NotModelled(f"{element.place}: {element} is not supported{reason}; {use}")
             raise element.error(f"{element} is not supported; {use}{nearest(fields.type, kinds)}")
         if element in self.making:
             raise element.error(f"{element} cannot stand inside itself")

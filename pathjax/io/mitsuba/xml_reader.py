@@ -15,6 +15,7 @@ import numpy as np
 
 from pathjax.description.elements import Document, Element, find_file, nearest, require_attributes
 from pathjax.errors import InputError
+from pathjax.io.mitsuba.plugins import PLUGINS
 from pathjax.io.mitsuba.upgrade import upgrade
 
 # Far above any real scene (meshes live in files of their own), and low enough that a hostile file fails at once.
@@ -81,35 +82,41 @@ class _Reader:
     def expand(self, root: Element, chain: tuple[Path, ...]) -> Element:
         if root.tag != "scene":
             raise root.error(f'the outermost element is {root}; a scene file starts with <scene version="3.0.0">')
-        require_attributes(root, required=("version",), optional=("id",))
+        require_attributes(root, required=("version",), optional=("id", "name"))
         version = root.attributes["version"]
         if not re.fullmatch(r"\d{1,9}\.\d{1,9}\.\d{1,9}", version):
             raise root.error(f'scene version "{version}" is not of the form "3.0.0"; use that, Mitsuba 3\'s')
         if int(version.partition(".")[0]) < 2:
             upgrade(root)
+        self._settle(root, chain)
+        return root
+
+    def _settle(self, parent: Element, chain: tuple[Path, ...]) -> None:
+        """Take out of an element what is for reading alone, and put in what it includes, in the order of the file."""
         children: list[Element] = []
-        for element in root.children:
+        for element in parent.children:
             self._substitute(element)
             match element.tag:
                 case "default":
-                    require_attributes(element, required=("name", "value"))
+                    _check(element, required=("name", "value"))
                     self.used.add(element.attributes["name"])
                     self.values.setdefault(element.attributes["name"], element.attributes["value"])
-                case "path":
-                    require_attributes(element, required=("value",))
+                case "path" if parent.tag == "scene":
+                    _check(element, required=("value",))
                     self.folders.append(find_file(element.attributes["value"], self.folders, element, folder=True))
                 case "alias":
-                    require_attributes(element, required=("id", "as"))
+                    _check(element, required=("id", "as"))
                     self.aliases.append(element)
                 case "include":
-                    children += self._include(element, chain)
+                    children += self._include(element, parent, chain)
                 case _:
+                    self._settle(element, chain)
                     children.append(element)
-        root.children = children
-        return root
+        parent.children = children
 
-    def _include(self, element: Element, chain: tuple[Path, ...]) -> list[Element]:
-        require_attributes(element, required=("filename",))
+    def _include(self, element: Element, parent: Element, chain: tuple[Path, ...]) -> list[Element]:
+        """The objects of another file; in a scene its settings, too."""
+        _check(element, required=("filename",), optional=("name",))
         path = find_file(element.attributes["filename"], [*self.folders, chain[-1].parent], element)
         self.found[element] = path
         if path.resolve() in chain:
@@ -117,18 +124,21 @@ class _Reader:
         self.files += 1
         if self.files > MAX_FILES or len(chain) > MAX_DEPTH:
             raise element.error(f"more than {MAX_FILES} included files, or {MAX_DEPTH} within one another")
-        return self.expand(_parse(path, str(path), self.notes), (*chain, path.resolve())).children
+        found = self.expand(_parse(path, str(path), self.notes), (*chain, path.resolve())).children
+        objects = [each for each in found if parent.tag == "scene" or each.tag in (*PLUGINS, "ref")]
+        for each in (each for each in found if each not in objects):
+            self.notes.append(f"{each.place}: {each} is in no object of its file, and has no effect in {parent}")
+        return objects
 
-    def _substitute(self, top: Element) -> None:
-        for element in _walk(top):
-            self.elements += 1
-            if self.elements > MAX_ELEMENTS:
-                raise element.error(f"the scene has more than {MAX_ELEMENTS} elements")
-            for key, text in element.attributes.items():
-                if "$" in text:
-                    element.attributes[key] = REFERENCE.sub(lambda match, at=element: self._value(match[1], at), text)
-                    if len(element.attributes[key]) > MAX_VALUE:
-                        raise element.error(f'the attribute "{key}" grows beyond {MAX_VALUE} characters')
+    def _substitute(self, element: Element) -> None:
+        self.elements += 1
+        if self.elements > MAX_ELEMENTS:
+            raise element.error(f"the scene has more than {MAX_ELEMENTS} elements")
+        for key, text in element.attributes.items():
+            if "$" in text:
+                element.attributes[key] = REFERENCE.sub(lambda match: self._value(match[1], element), text)
+                if len(element.attributes[key]) > MAX_VALUE:
+                    raise element.error(f'the attribute "{key}" grows beyond {MAX_VALUE} characters')
 
     def _value(self, name: str, element: Element) -> str:
         self.used.add(name)
@@ -146,6 +156,12 @@ class _Reader:
                 raise InputError(
                     f'{file}: the scene has no parameter "{name}"; it has: {known}{nearest(name, sorted(self.used))}'
                 )
+
+
+def _check(element: Element, required: tuple[str, ...], optional: tuple[str, ...] = ()) -> None:
+    require_attributes(element, required, optional)
+    if element.children:
+        raise element.error(f"{element} takes nothing inside")
 
 
 def _parse(path: Path, shown: str, notes: list[str]) -> Element:
