@@ -58,7 +58,7 @@ class Document:
         if element.children:
             raise element.error(f"{element} takes nothing inside")
         if element.id not in self.ids:
-            raise element.error(f"{element}: there is no such id{nearest(element.id, self.ids)}")
+            raise element.error(f'{element}: there is no id "{element.id[:60]}"{nearest(element.id, self.ids)}')
         return self.ids[element.id]
 
     def find(self, filename: str, element: Element) -> Path:

@@ -24,6 +24,19 @@ OBJECTS = ("integrator", "sensor", "sampler", "film", "rfilter", "shape", "bsdf"
 TYPED = ("uniform", "d65", "srgb", "rawconstant")
 ONE_COLOR = TYPED[1:]
 REQUIRED = object()
+# How dictionaries give what stands in files as an element.
+IN_DICTIONARIES = {
+    "float": "a float",
+    "integer": "an integer",
+    "boolean": "a bool",
+    "string": "a string",
+    "rgb": '{"type": "rgb", "value": [r, g, b]}',
+    "spectrum": '{"type": "spectrum", "value": ...}',
+    "point": "three numbers",
+    "vector": "three numbers",
+    "transform": "a pj.Transform or a (4, 4) matrix",
+    "array": "an array",
+}
 
 
 class Fields:
@@ -288,6 +301,15 @@ class Fields:
         for child in self._objects:
             raise child.error(f"{child} has no place inside {self.element}")
 
+    def lacks(self, tag: str, name: str, remedy: str = "") -> InputError:
+        """That a parameter is not given, which has to be."""
+        what = f'<{tag} name="{name}" ...>' if self.element.line else f'"{name}", {self._shown(tag)}'
+        return self.element.error(f"{self.element} needs {what}{remedy}")
+
+    def _shown(self, tag: str) -> str:
+        """An element of that tag, as whoever wrote the scene has it."""
+        return f"<{tag}>" if self.element.line else IN_DICTIONARIES.get(tag, f"a {tag}")
+
     def _nameless(self, child: Element) -> InputError:
         return child.error(f'{child} inside {self.element} lacks name="...", the parameter that it sets')
 
@@ -299,12 +321,13 @@ class Fields:
                 given = [self._values[other] for other in self._values if other not in self._taken]
                 misspelt = [each for each in given if nearest(each.attributes.get("name", ""), [name])]
                 instead = f"; is it {misspelt[0]} at {misspelt[0].place}?" if misspelt else ""
-                raise self.element.error(f'{self.element} needs <{tags[0]} name="{name}" ...>{instead}')
+                raise self.lacks(tags[0], name, instead)
             return None
         element = self._values[name]
         if element.tag not in tags:
-            kind = self.document.resolve(element).tag
-            raise self.error(name, f"cannot be a <{kind}>; give it as {' or '.join(f'<{tag}>' for tag in tags)}")
+            kind, a = self.document.resolve(element).tag, "a " if self.element.line else ""
+            wanted = " or ".join(dict.fromkeys(map(self._shown, tags)))
+            raise self.error(name, f"cannot be {a}{self._shown(kind)}; give it as {wanted}")
         if element.children and element.tag not in ("transform", *NAMED) and "type" not in element.attributes:
             raise element.children[0].error(f"{element.children[0]} has no place inside {element}")
         return element

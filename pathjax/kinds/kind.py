@@ -67,7 +67,7 @@ class Kind:
         for key, d in asked.items():
             if d.required and values[key] is None:
                 or_texture = ", or a texture of that name" if d.textured else ""
-                raise fields.element.error(f'{fields.element} needs <{d.tag} name="{key}" ...>{or_texture}')
+                raise fields.lacks(d.tag, key, or_texture)
         return cls.instance(name, **known, **values)
 
     @classmethod

@@ -211,12 +211,13 @@ def itself():
         (scene(ball={"type": "spere"}), 'scene.ball: no kind is named "spere"; did you mean "sphere"?'),
         (scene(ball={"type": "sphere", "radious": 1.0}), r"scene.ball.radious: .*did you mean \"radius\"?"),
         (scene(ball={"type": "sphere", "radius": -1}), r'scene.ball.radius: "radius" of .* must be above 0'),
-        (scene(ball={"type": "sphere", "radius": "1"}), "scene.ball.radius: .*cannot be a <string>"),
+        (scene(ball={"type": "sphere", "radius": "1"}), "scene.ball.radius: .*cannot be a string; give it as a float"),
         (scene(ball={"type": "sphere", "radius": np.nan}), "scene.ball.radius: .*not a finite number"),
         (scene(ball={"type": "sphere", "bsdf": {"type": "ref", "id": "skyy"}}), 'scene.ball.bsdf.*did you mean "sky"'),
         (scene(ball={"type": "sphere", "center": [1, 2]}), "scene.ball.center: must be one number or three, has 2"),
         (scene(ball={"type": "sphere", "center": None}), "scene.ball.center: a value of type NoneType has no place"),
         (scene(ball={"type": "sphere", "to_world": np.eye(2)}), "scene.ball.to_world: a transform is a pj.Transform"),
+        (scene(ball={"type": "sphere", "to_world": {"scale": 2}}), "ball.to_world: a transform is a pj.Transform"),
         (scene(ball={"type": "sphere", "to_world": np.zeros((4, 4))}), "scene.ball.to_world: .*last row"),
         (scene(ball={"type": "sdfgrid"}), "scene.ball: .*is not supported"),
         (scene(ball={"radius": 1}), 'scene.ball: a dictionary needs a "type"'),
@@ -231,7 +232,8 @@ def itself():
         (itself(), "scene.again.*inside itself"),
         (scene(fog={"type": "sphere", "inside": {"type": "homogeneous"}}), "scene.fog.inside: .*takes one <medium"),
         (scene(folder={"type": "resources", "path": "/none"}), 'scene.folder.*no folder "/none"'),
-        (with_reflectance([0.1, 0.2, 0.3]), "scene.ball.bsdf.reflectance: .*cannot be a <point>"),
+        (with_reflectance([0.1, 0.2, 0.3]), "reflectance: .*cannot be three numbers; give it as {\"type\": \"rgb\""),
+        (with_reflectance({"type": "rgb", "value": "1, 0, 0"}), "must be a number, or a list .*, is '1, 0, 0'"),
         (with_reflectance({"type": "rgb"}), 'scene.ball.bsdf.reflectance: .*lacks "value"'),
         (with_reflectance({"type": "rgb", "value": [1, 2, 3]}), "scene.ball.bsdf.reflectance: .*between 0 and 1"),
         (with_reflectance({"type": "rgb", "value": 1, "x": 2}), "takes value, and no 'x'"),
@@ -243,7 +245,7 @@ def itself():
         (with_reflectance(np.full((2, 2, 3), np.nan)), "scene.ball.bsdf.reflectance: .*or NaN"),
         (with_reflectance(np.zeros((2, 2, 4))), r"reflectance: .*must have the shape \(H, W\)"),
         (with_reflectance({"type": "bitmap", "data": np.zeros((2, 2)), "filename": "x"}), "excludes filename"),
-        (scene(kite={"type": "mesh"}), 'scene.kite: .*needs <array name="vertices"'),
+        (scene(kite={"type": "mesh"}), 'scene.kite: .*needs "vertices", an array'),
         (scene(kite={"type": "mesh", "mesh": 3}), 'kite: "mesh" must be a .*Trimesh or a mitsuba.Mesh, is of type int'),
         (scene(kite={"type": "mesh", **TRIANGLE, "faces": [[0, 1, 7]]}), "scene.kite: face 0 .*has the vertex 7"),
         (scene(kite={"type": "mesh", **TRIANGLE, "faces": np.ones((1, 3))}), "scene.kite: faces must be integers"),
@@ -402,6 +404,14 @@ def test_what_a_mesh_of_mitsuba_does_not_tell_is_refused(mitsubas_mesh):
             load_dict(scene(it=mitsubas_mesh(bsdf=bsdf)))
     with pytest.raises(pj.InputError, match="scene.it: the medium of a mesh of Mitsuba, Homogeneous.*, cannot be read"):
         load_dict(scene(it=mitsubas_mesh(interior={"type": "homogeneous"})))
+
+
+@pytest.mark.parametrize("kind", ["diffuse", "path", "constant", "sphere", "perspective"])
+def test_objects_of_mitsuba_that_are_no_meshes_are_refused_as_such(kind):
+    mi = pytest.importorskip("mitsuba")
+    mi.set_variant("scalar_rgb")
+    with pytest.raises(pj.InputError, match="scene.it: a .* of Mitsuba cannot be read back; give the dictionary"):
+        load_dict(scene(it=mi.load_dict({"type": kind})))
 
 
 @pytest.mark.parametrize("kind", ["ScalarTransform3f", "ScalarTransform4f", "array"])

@@ -203,7 +203,7 @@ def test_a_reference_may_come_before_its_object_and_shares_it(read):
 @pytest.mark.parametrize(
     ("body", "line", "words"),
     [
-        ('<bsdf type="diffuse" id="grey"/>\n' + shape('<ref id="gray"/>'), 3, 'no such id; did you mean "grey"?'),
+        ('<bsdf type="diffuse" id="grey"/>\n' + shape('<ref id="gray"/>'), 3, 'no id "gray"; did you mean "grey"?'),
         (shape(attributes='id="a"') + "\n" + shape(attributes='id="a"'), 3, 'id "a" is taken already'),
         ('<bsdf type="twosided" id="a"><ref id="a"/></bsdf>', 2, "cannot stand inside itself"),
         ('<integrator type="moment" id="a"><ref id="a"/></integrator>', 2, "cannot stand inside itself"),
@@ -211,7 +211,7 @@ def test_a_reference_may_come_before_its_object_and_shares_it(read):
         (shape('<ref name="radius" id="r"/><float id="r" name="q" value="1"/>'), 2, "which is not an object"),
         ('<include filename="nowhere.xml"/>', 2, 'no file "nowhere.xml"'),
         ('<path value="nowhere"/>', 2, 'no folder "nowhere"'),
-        ('<alias id="gray" as="b"/><bsdf type="diffuse" id="grey"/>', 2, 'no such id; did you mean "grey"?'),
+        ('<alias id="gray" as="b"/><bsdf type="diffuse" id="grey"/>', 2, 'no id "gray"; did you mean "grey"?'),
         ('<bsdf type="diffuse" id="a"/>\n<alias id="a" as="a"/>', 3, 'id "a" is taken already'),
     ],
 )

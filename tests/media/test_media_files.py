@@ -99,7 +99,7 @@ BLEND = f'<phase type="blendphase">{WEIGHT}{2 * HG}</phase>'
             ball(medium='<rgb name="sigma_t" value="1, 2, 3"/><boolean name="has_spectral_extinction" value="false"/>'),
             "has_spectral_extinction.* is false, but sigma_t has a colour",
         ),
-        ('<shape type="sphere"><ref name="interior" id="smoke"/></shape>' + FOG, "there is no such id"),
+        ('<shape type="sphere"><ref name="interior" id="smoke"/></shape>' + FOG, 'there is no id "smoke"'),
         ('<shape type="sphere"><ref id="fog"/></shape>' + FOG, 'takes one <medium name="interior"> and one'),
         (ball().replace("homogeneous", "hetero"), "hetero.*not supported; use one of homogeneous"),
         (ball(inside='<bsdf type="diffuse"><volume name="reflectance" type="constvolume"/></bsdf>'), "be a <volume>"),

@@ -106,6 +106,8 @@ class _Reader:
             if any(each is value for each in self.around):
                 raise InputError(f"{place}: this dictionary stands inside itself; refer to objects by their id")
             kind = value.get("type")
+            if key.startswith("to_"):
+                raise InputError(f"{place}: a transform is a pj.Transform or a (4, 4) matrix, and no dictionary")
             if not isinstance(kind, str):
                 raise InputError(f'{place}: a dictionary needs a "type", the name of a kind; it has {_shown(kind)}')
             if kind in VALUE_TYPES:
@@ -260,6 +262,11 @@ def _array(value: object, place: str) -> np.ndarray:
     except Exception:  # whatever a foreign object, or a list of lists of different lengths, raises
         array = np.asarray(None)
     if array.dtype.kind not in "iuf":
+        if isinstance(value, str):
+            raise InputError(f"{place}: must be a number, or a list or an array of numbers, is {_shown(value)}")
+        if type(value).__module__.partition(".")[0] == "mitsuba":
+            kind = f"{type(value).__name__} of Mitsuba"
+            raise InputError(f"{place}: a {kind} cannot be read back; give the dictionary that it is made of")
         kinds = "a number, a string, a list of numbers, an array, a transform or a dictionary"
         raise InputError(f"{place}: a value of type {type(value).__name__} has no place in a scene; use {kinds}")
     # Dr.Jit has one more axis, for the lanes that it computes at once.

@@ -47,7 +47,7 @@ def read(path: str | Path, parameters: Mapping[str, object]) -> Document:
     for alias in reader.aliases:
         name = alias.attributes["as"]
         if alias.id not in ids:
-            raise alias.error(f"{alias}: there is no such id{nearest(alias.id, ids)}")
+            raise alias.error(f'{alias}: there is no id "{alias.id[:60]}"{nearest(alias.id, ids)}')
         if name in ids:
             raise alias.error(f'the id "{name}" is taken already, at {ids[name].file}:{ids[name].line}')
         ids[name] = ids[alias.id]
