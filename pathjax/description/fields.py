@@ -302,7 +302,10 @@ class Fields:
             raise child.error(f"{child} has no place inside {self.element}")
 
     def lacks(self, tag: str, name: str, remedy: str = "") -> InputError:
-        """That a parameter is not given, which has to be."""
+        """That a parameter is not given, which has to be, and what may be meant to be it."""
+        given = [self._values[other] for other in self._values if other not in self._taken]
+        misspelt = [each for each in given if nearest(each.attributes.get("name", ""), [name])]
+        remedy += f"; is it {misspelt[0]} at {misspelt[0].place}?" if misspelt else ""
         what = f'<{tag} name="{name}" ...>' if self.element.line else f'"{name}", {self._shown(tag)}'
         return self.element.error(f"{self.element} needs {what}{remedy}")
 
@@ -318,10 +321,7 @@ class Fields:
         self._taken.add(name)
         if name not in self._values:
             if default is REQUIRED:
-                given = [self._values[other] for other in self._values if other not in self._taken]
-                misspelt = [each for each in given if nearest(each.attributes.get("name", ""), [name])]
-                instead = f"; is it {misspelt[0]} at {misspelt[0].place}?" if misspelt else ""
-                raise self.lacks(tags[0], name, instead)
+                raise self.lacks(tags[0], name)
             return None
         element = self._values[name]
         if element.tag not in tags:

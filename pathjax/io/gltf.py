@@ -116,7 +116,7 @@ class _Scene:
             return {"type": "directional", "irradiance": color, "direction": to_world.matrix[:3, 2]}
         if light["type"] == "point":
             return {"type": "point", "intensity": color, "position": to_world.matrix[:3, 3]}
-        cone = {"innerConeAngle": 0.0, "outerConeAngle": math.pi / 4} | light["spot"]
+        cone = {"innerConeAngle": 0.0, "outerConeAngle": math.pi / 4} | light.get("spot", {})
         angles = {
             "beam_width": math.degrees(cone["innerConeAngle"]),
             "cutoff_angle": math.degrees(cone["outerConeAngle"]),

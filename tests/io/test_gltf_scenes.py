@@ -304,6 +304,13 @@ def test_lights_shine_along_minus_z(objects, number):
         assert (light["beam_width"], light["cutoff_angle"]) == (math.degrees(0.25), math.degrees(0.5))
 
 
+def test_a_spot_without_settings_has_those_of_the_format(objects):
+    file = Gltf(extensions={"KHR_lights_punctual": {"lights": [{"type": "spot"}]}})
+    file.node(name="it", extensions={"KHR_lights_punctual": {"light": 0}})
+    light = objects(file)[0]["it"]
+    assert (light["beam_width"], light["cutoff_angle"]) == (0, 45)
+
+
 def test_the_film_has_the_cameras_shape_and_what_is_lacking_is_added(write):
     made, notes, _ = bare.scene(write(with_node(camera=0)), {"res": 100})
     assert (made["it"]["film"]["width"], made["it"]["film"]["height"]) == (100, 50)

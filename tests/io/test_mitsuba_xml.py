@@ -579,6 +579,12 @@ def test_textures_that_are_not_modelled_are_refused(refused, picture, kind, insi
     assert words in refused(with_bsdf("diffuse", texture))
 
 
+@pytest.mark.parametrize(("kind", "misspelt", "held"), [("blendbsdf", "weght", 2), ("normalmap", "normal_map", 1)])
+def test_a_misspelt_parameter_that_a_bsdf_needs_is_told(refused, kind, misspelt, held):
+    message = refused(with_bsdf(kind, f'<rgb name="{misspelt}" value="0.5"/>' + '<bsdf type="diffuse"/>' * held))
+    assert f'is it <rgb name="{misspelt}"> at' in message
+
+
 @pytest.mark.parametrize("inside", ["{}", '<texture type="checkerboard" name="reflectance">{}</texture>'])
 def test_images_below_0_are_no_reflectance(refused, tmp_path, inside):
     dark = np.full((2, 2), -0.5, np.float32)

@@ -40,7 +40,7 @@ class File:
     beside: list[Path] = field(default_factory=list)  # other files that were read
 
     def refuse(self, what: str) -> InputError:
-        return InputError(f"{self.path}: glTF with {what} is not supported; export plain triangles")
+        return InputError(f"{self.path}: glTF with {what} is not supported; export it without")
 
     def entry(self, kind: str, number: int) -> dict:
         """`number` of one of the header's lists; negative numbers do not count from its end."""
