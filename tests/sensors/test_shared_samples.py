@@ -83,6 +83,20 @@ def test_samples_count_by_the_filter_and_by_nothing_else(ball):
     np.testing.assert_allclose(pj.render(ball, spp, 7), expected, rtol=2e-5)
 
 
+def test_what_is_not_finite_spoils_only_what_it_counts_in(ball):
+    """A sample the pixels under the filter around it, and the adjoint of a pixel the samples there."""
+    here, edge, first = 27, reconstruction.halo(ball.film), jnp.int32(0)
+    u = jnp.asarray(np.random.default_rng(3).uniform(size=(1, 1, 64, 2)), jnp.float32)
+    pixels = np.stack([np.arange(64) % 8, np.arange(64) // 8], -1)
+    counts = (np.abs(pixels[:, None] + np.asarray(u)[0, 0, :, None] - pixels - 0.5) < 2).all(-1)  # (sample, pixel)
+    scale, values = jnp.ones((1, 1, 64)), jnp.ones((1, 1, 64, 3)).at[:, :, here].set(jnp.nan)
+    spread = jax.jit(partial(reconstruction.spread_samples, ball.film))(first, u, scale, values)[0, :3, edge:-edge]
+    np.testing.assert_array_equal(np.isnan(spread), np.broadcast_to(counts[here], (3, 64)))
+    adjoint = jnp.ones((1, 64 + 2 * edge, 3)).at[:, edge + here].set(jnp.nan)
+    gathered = jax.jit(partial(reconstruction.gather_samples, ball.film))(first, u, scale, adjoint)[0, 0]
+    np.testing.assert_array_equal(np.isnan(gathered), np.broadcast_to(counts[:, here, None], (64, 3)))
+
+
 def test_the_box_shares_nothing_and_is_rendered_as_ever(ball):
     box = through(ball, Box())
     assert not box.film.shared and film.pixel_count(film.of_samples(box.film)) == 64
