@@ -20,6 +20,9 @@ if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
     atexit.register(shutil.rmtree, _shared, ignore_errors=True)
     os.environ |= {"JAX_COMPILATION_CACHE_DIR": _shared, "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
 
+# The workers share the processors: threads of theirs for products of matrices would wait for those of the others.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 import pathjax  # before anything starts JAX's backend  # isort: skip
 import jax
 import jax.numpy as jnp
