@@ -59,13 +59,6 @@ def test_furnace_without_limit_under_roulette(shipped, estimate, agree, rr_depth
     agree(estimate(scene, spp=64), 1 / (1 - RHO))
 
 
-@pytest.mark.parametrize("kind, inside", [("sphere", ""), ("obj", OCTAHEDRON)])
-def test_convex_diffuse_object_under_uniform_light_reflects_its_albedo(make_scene, kind, inside):
-    """Every sampled direction escapes, so the estimate has no noise."""
-    scene = make_scene(shape(kind, inside + GREY) + UNIFORM, origin="1.2, 1.5, 4", fov=5)
-    np.testing.assert_allclose(pj.render(scene, 16), np.broadcast_to(RHO, (16, 16, 3)), rtol=2e-6)
-
-
 SPLIT = {"fresnel": "schlick", "split_depth": 4}
 
 
@@ -91,26 +84,6 @@ def test_mirror_ball_in_uniform_light_shows_its_reflectance(make_scene):
 # ---- direct and indirect light --------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("strategy", ["mis", "light", "bsdf"])
-def test_spherical_cavity_with_uneven_emission_is_lit_evenly(make_scene, estimate, agree, strategy):
-    """A disk spans a cap of the unit sphere and emits like it; all other wall points see the cap alike.
-
-    With f the cap's share of the sphere: E = pi Le f / (1 - rho (1 - f)), cut off after max_depth.
-    """
-    alpha, depth = 0.7, 5
-    f = (1 - np.cos(alpha)) / 2
-    wall = shape("sphere", f'<boolean name="flip_normals" value="true"/>{GREY}')
-    lamp = shape(
-        "disk",
-        f'<transform name="to_world"><scale value="{np.sin(alpha)}"/><translate z="{-np.cos(alpha)}"/></transform>'
-        '<bsdf type="diffuse"><rgb name="reflectance" value="0"/></bsdf>'
-        '<emitter type="area"><rgb name="radiance" value="3"/></emitter>',
-    )
-    scene = make_scene(wall + lamp, depth=depth, rr_depth=3, origin="0.1, 0.2, -0.3", target="0.3, 0.1, 1", fov=90)
-    series = sum((RHO * (1 - f)) ** k for k in range(depth - 1))
-    agree(estimate(scene, spp=64, strategy=strategy), 3 * RHO * f * series)
-
-
 # A plate at the origin that looks up, and a light of each kind around it.
 LIGHTS = {
     "disk": '<transform name="to_world"><scale value="0.5"/><lookat origin="0, 2, 0" target="0, 0, 0" up="1, 0, 0"/>'
@@ -123,17 +96,40 @@ LIGHTS = {
 }
 
 
+# Out of sight; no two in one place, for surfaces that coincide have another structure.
+AWAY = {
+    kind: f'<transform name="to_world"><scale value="1e-3"/><translate x="{place}" y="1e4"/></transform>'
+    for place, kind in enumerate(["plate", *LIGHTS])
+}
+AWAY["obj"] += OCTAHEDRON
+
+
 @pytest.fixture(scope="module")
-def lit_plate(make_scene):
+def plate_and_lamps(make_scene):
+    """A plate, a lamp of each kind, what stands in them, and a sky: one structure, so one kernel for many tests.
+
+    Those that are not told of are dark and out of sight.
+    """
+
+    def make(plate=AWAY["plate"], sky=0, **camera_and_lamps):
+        lamps = {kind: camera_and_lamps.pop(kind, (AWAY[kind], GREY, 0)) for kind in LIGHTS}
+        lamps = "".join(
+            f'<shape type="{kind}" id="lamp-{kind}">{inside}{bsdf}'
+            f'<emitter type="area" id="{kind}"><rgb name="radiance" value="{radiance}"/></emitter></shape>'
+            for kind, (inside, bsdf, radiance) in lamps.items()
+        )
+        sky = f'<emitter type="constant" id="sky"><rgb name="radiance" value="{sky}"/></emitter>'
+        return make_scene(shape("rectangle", plate + GREY) + lamps + sky, **camera_and_lamps)
+
+    return make
+
+
+@pytest.fixture(scope="module")
+def lit_plate(plate_and_lamps):
     """All lights at once, the sky too; `parameters` turn them off."""
     upwards = '<transform name="to_world"><scale value="3"/><rotate x="1" angle="-90"/></transform>'
-    floor = shape("rectangle", upwards + GREY)
-    lamps = "".join(
-        f'<shape type="{kind}" id="lamp-{kind}">{inside}{GREY}'
-        f'<emitter type="area" id="{kind}"><rgb name="radiance" value="2, 3, 4"/></emitter></shape>'
-        for kind, inside in LIGHTS.items()
-    )
-    return make_scene(floor + lamps + UNIFORM, origin="0.5, 1.2, -2", fov=25)
+    lamps = {kind: (inside, GREY, "2, 3, 4") for kind, inside in LIGHTS.items()}
+    return plate_and_lamps(upwards, 1, **lamps, origin="0.5, 1.2, -2", fov=25)
 
 
 def at_the_origin(scene):
@@ -178,9 +174,51 @@ def test_direct_light_is_the_form_factor(lit_plate, estimate, agree, kind, strat
     agree(estimate(scene, spp=64, strategy=strategy), expected, pixelwise=False)
 
 
+@pytest.mark.parametrize("strategy", ["mis", "light", "bsdf"])
+def test_spherical_cavity_with_uneven_emission_is_lit_evenly(plate_and_lamps, estimate, agree, strategy):
+    """A disk spans a cap of the unit sphere and emits like it; all other wall points see the cap alike.
+
+    With f the cap's share of the sphere: E = pi Le f / (1 - rho (1 - f)), cut off after max_depth.
+    """
+    alpha, depth = 0.7, 5
+    f = (1 - np.cos(alpha)) / 2
+    place = f'<scale value="{np.sin(alpha)}"/><translate z="{-np.cos(alpha)}"/>'
+    black = '<bsdf type="diffuse"><rgb name="reflectance" value="0"/></bsdf>'
+    scene = plate_and_lamps(
+        sphere=('<boolean name="flip_normals" value="true"/>', GREY, 0),
+        disk=(f'<transform name="to_world">{place}</transform>', black, 3),
+        **{"depth": depth, "rr_depth": 3, "origin": "0.1, 0.2, -0.3", "target": "0.3, 0.1, 1", "fov": 90},
+    )
+    series = sum((RHO * (1 - f)) ** k for k in range(depth - 1))
+    agree(estimate(scene, spp=64, strategy=strategy), 3 * RHO * f * series)
+
+
 @pytest.mark.parametrize("strategy", ["light", "bsdf"])
 def test_strategies_agree_under_lights_of_every_kind(lit_plate, estimate, agree, strategy):
     agree(estimate(lit_plate, spp=64), estimate(lit_plate, spp=128, strategy=strategy, first_seed=101))
+
+
+@pytest.mark.parametrize("kind, inside", [("sphere", ""), ("obj", OCTAHEDRON)])
+def test_convex_diffuse_object_under_uniform_light_reflects_its_albedo(plate_and_lamps, kind, inside):
+    """Every sampled direction escapes, so the estimate has no noise."""
+    scene = plate_and_lamps(sky=1, **{kind: (inside, GREY, 0)}, origin="1.2, 1.5, 4", fov=5)
+    np.testing.assert_allclose(pj.render(scene, 16), np.broadcast_to(RHO, (16, 16, 3)), rtol=2e-6)
+
+
+def test_one_triangle_covers_half_of_a_square(plate_and_lamps, write_scene, agree, estimate):
+    """The triangle (-1,-1) (1,-1) (-1,1) fills the view up to its hypotenuse, a diagonal of the image.
+
+    The others of its mesh, which has as many as an octahedron, are far away.
+    """
+    file = write_scene("").with_name("one.obj")
+    corners = "v -1 -1 0\nv 1 -1 0\nv -1 1 0\nv 0 0 1e4\nv 1 0 1e4\nv 0 1 1e4\n"
+    file.write_text(corners + "f 1 2 3\n" + "f 4 5 6\n" * 7)
+    triangle = f'<string name="filename" value="{file}"/><boolean name="face_normals" value="true"/>'
+    scene = plate_and_lamps(obj=(triangle, GREY, 1), origin="0, 0, 1", fov=90, depth=1)
+    y, x = np.mgrid[:16, :16]
+    covered = np.where(x < y, 1.0, np.where(x == y, 0.5, 0.0))
+    # The diagonal passes pixel corners to some ulps.
+    agree(estimate(scene, spp=64), covered[..., None], rounding=1e-4)
 
 
 def test_roulette_changes_noise_only(lit_plate, estimate, agree):
@@ -287,17 +325,6 @@ def test_empty_scene_shows_its_background(make_scene):
 
 def test_scene_of_nothing_at_all_is_black(make_scene):
     assert not np.asarray(pj.render(make_scene(""), 2)).any()
-
-
-def test_one_triangle_covers_half_of_a_square(write_scene, agree, estimate):
-    """The triangle (-1,-1) (1,-1) (-1,1) fills the view up to its hypotenuse, a diagonal of the image."""
-    triangle = shape("obj", '<string name="filename" value="one.obj"/><emitter type="area"/>')
-    path = write_scene(triangle, origin="0, 0, 1", fov=90, depth=1)
-    (path.parent / "one.obj").write_text("v -1 -1 0\nv 1 -1 0\nv -1 1 0\nf 1 2 3\n")
-    image = estimate(pj.load_scene(path), spp=64)
-    y, x = np.mgrid[:16, :16]
-    covered = np.where(x < y, 1.0, np.where(x == y, 0.5, 0.0))
-    agree(image, covered[..., None], rounding=1e-4)  # the diagonal passes pixel corners to some ulps
 
 
 def test_hidden_emitters_light_the_scene_and_let_the_camera_through(make_scene, estimate, agree):
