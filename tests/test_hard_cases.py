@@ -142,31 +142,72 @@ def test_walls_of_radius_1e5_show_no_speckles(shipped, x64):
 # ---- glass ----------------------------------------------------------------------------------------------------------
 
 TILTED = '<rotate x="0.8" y="0.6" angle="37"/>'
+# Out of sight; no two in one place, for surfaces that coincide have another structure.
+AWAY = [f'<scale value="1e-3"/><translate x="{place}" y="1e4"/>' for place in range(5)]
+
+
+@pytest.fixture(scope="module")
+def glassware(make_scene):
+    """A ball, one in it, a slab and a plane, all of glass, a square lamp and a sky: one structure, so one kernel.
+
+    Each where its transform puts it, or out of sight; what is not told of gives no light.
+    """
+
+    def make(ball=AWAY[0], core=AWAY[1], slab=AWAY[2], plane=AWAY[3], square=AWAY[4], sky=0, radiance=0, **camera):
+        ref = '<ref id="glass"/>'
+        return make_scene(
+            glass()
+            + shape("sphere", ball, ref)
+            + shape("sphere", core, glass(2.0, 1.5, "core"))
+            + shape("cube", slab, ref)
+            + shape("rectangle", plane, ref)
+            + shape("rectangle", square, lamp(radiance))
+            + f'<emitter type="constant"><rgb name="radiance" value="{sky}"/></emitter>',
+            **camera,
+        )
+
+    return make
+
+
+SPLIT = {"fresnel": "schlick", "split_depth": 4}
+
+
+@pytest.mark.parametrize(
+    "body, how", [("ball", {}), ("slab", {}), pytest.param("ball", SPLIT, marks=pytest.mark.slow)]
+)
+def test_glass_in_uniform_light_is_invisible(glassware, body, how):
+    scene = without_roulette(glassware(**{body: ""}, sky=1, origin="1.2, 1.5, 4"))
+    # Some 10 refractions by reciprocal factors, an ulp or two each.
+    np.testing.assert_allclose(pj.render(scene, 16, **how), 1, rtol=1e-5)
+
+
+def test_glass_under_roulette_stays_as_bright(glassware, estimate, agree):
+    scene = glassware(ball="", sky=1, origin="1.2, 1.5, 4")
+    agree(estimate(replace(scene, max_depth=jnp.int32(NO_LIMIT), rr_depth=jnp.int32(1))), 1)
 
 
 @pytest.mark.parametrize("tilt", ["", TILTED])
 @pytest.mark.parametrize("thickness", [0.1, 1e-4, 1e-7])
-def test_slab_of_glass_has_both_its_faces(make_scene, estimate, agree, thickness, tilt):
+def test_slab_of_glass_has_both_its_faces(glassware, estimate, agree, thickness, tilt):
     """Between its faces light bounces to and fro: T = (1 - R) / (1 + R), which is 2 eta / (eta^2 + 1) head-on."""
-    slab = shape("cube", f'<scale x="1" y="1" z="{thickness / 2}"/>{tilt}', glass(1.5))
-    far_lamp = shape("rectangle", '<scale value="5"/><translate z="-6"/>', lamp())
-    scene = without_roulette(make_scene(slab + far_lamp, fov=0.2))
-    normal = scene.about.description.shapes[0].geometry.to_world[:3, 2]
+    slab, far = f'<scale x="1" y="1" z="{thickness / 2}"/>{tilt}', '<scale value="5"/><translate z="-6"/>'
+    scene = without_roulette(glassware(slab=slab, square=far, radiance=1, fov=0.2))
+    normal = scene.about.description.shapes[2].geometry.to_world[:3, 2]
     r = reflectance_of_glass(abs(normal[2]) / np.linalg.norm(normal), 1.5)
     agree(estimate(scene, spp=64), (1 - r) / (1 + r), pixelwise=False, rounding=1e-3)
 
 
-def test_thin_slab_reflects_what_it_does_not_transmit(make_scene, estimate, agree):
-    slab = shape("cube", '<scale x="1" y="1" z="5e-8"/>', glass(1.5))
-    lamp_behind_camera = shape("rectangle", '<scale value="5"/><rotate y="1" angle="180"/><translate z="6"/>', lamp())
-    scene = without_roulette(make_scene(slab + lamp_behind_camera, fov=0.2))
+def test_thin_slab_reflects_what_it_does_not_transmit(glassware, estimate, agree):
+    behind_camera = '<scale value="5"/><rotate y="1" angle="180"/><translate z="6"/>'
+    slab = '<scale x="1" y="1" z="5e-8"/>'
+    scene = without_roulette(glassware(slab=slab, square=behind_camera, radiance=1, fov=0.2))
     agree(estimate(scene, spp=64), (1.5 - 1) ** 2 / (1.5**2 + 1), pixelwise=False, rounding=1e-3)
 
 
 @pytest.fixture(scope="module")
-def water_level(make_scene):
+def water_level(glassware):
     """A plane of glass, its normal up, in uniform light above and below."""
-    return partial(make_scene, shape("rectangle", '<scale value="1e4"/><rotate x="1" angle="-90"/>', glass()) + UNIFORM)
+    return partial(glassware, plane='<scale value="1e4"/><rotate x="1" angle="-90"/>', sky=1)
 
 
 def cosines_in_pixels(scene, samples=64):
@@ -213,34 +254,32 @@ def test_rays_that_graze_glass_stay_finite(water_level, d_y):
     assert abs(image - 1).max() <= 1 - 1.5**-2 + 1e-6
 
 
-def test_ior_of_1_is_invisible(make_scene):
+def test_ior_of_1_is_invisible(glassware):
     """A ball of air before a bright square: the same image but for squares' edges, which rounding may move."""
-    square = shape("rectangle", '<rotate z="1" angle="20"/><translate z="-2"/>', lamp())
-    scene = make_scene(shape("sphere", "", glass(1.5)) + square)
+    square = '<rotate z="1" angle="20"/><translate z="-2"/>'
+    scene, out_of_view = (glassware(ball=ball, square=square, radiance=1) for ball in ("", '<translate x="100"/>'))
     air = without_roulette(pj.with_parameters(scene, {"glass.int_ior": 1.0}))
-    out_of_view = make_scene(shape("sphere", '<translate x="100"/>', glass(1.5)) + square)
     image, plain = pj.render(air, 16), pj.render(out_of_view, 16)
     assert np.isclose(image, plain, atol=1e-5).mean() > 0.99
     assert not np.isclose(pj.render(scene, 16), plain, atol=1e-5).all()  # glass of 1.5 shows
 
 
-def test_camera_inside_glass_sees_eta_squared(make_scene):
-    scene = without_roulette(make_scene(shape("sphere", "", glass(1.5)) + UNIFORM, origin="0, 0, 0", target="1, 2, 3"))
+def test_camera_inside_glass_sees_eta_squared(glassware):
+    scene = without_roulette(glassware(ball="", sky=1, origin="0, 0, 0", target="1, 2, 3"))
     np.testing.assert_allclose(pj.render(scene, 16), 1.5**2, rtol=1e-5)
 
 
-def test_light_caught_in_glass_is_dark_and_its_paths_end(make_scene):
+def test_light_caught_in_glass_is_dark_and_its_paths_end(glassware):
     """Near the wall of a glass ball, rays along it are reflected totally for ever."""
-    scene = make_scene(shape("sphere", "", glass(1.5)) + UNIFORM, origin="0, 0, 0.95", target="1, 0, 0.95", fov=10)
+    scene = glassware(ball="", sky=1, origin="0, 0, 0.95", target="1, 0, 0.95", fov=10)
     assert not np.asarray(pj.render(without_roulette(scene, 1000), 4)).any()
     assert not np.asarray(pj.render(replace(scene, max_depth=jnp.int32(NO_LIMIT)), 4)).any()
 
 
 @pytest.mark.parametrize("origin, expected", [("0, 0, 0.01", 4.0), ("0, 0, 0.75", 1.5**2), ("0, 0, 4", 1.0)])
-def test_glass_in_glass_scales_radiance_both_ways(make_scene, origin, expected):
+def test_glass_in_glass_scales_radiance_both_ways(glassware, origin, expected):
     """eta = 2 in 1.5 in 1. Rays that total reflection holds for ever would be dark: the views avoid them."""
-    inner = shape("sphere", '<scale value="0.5"/>', glass(2.0, 1.5, "inner"))
-    scene = make_scene(inner + shape("sphere", "", glass(1.5, 1.0, "outer")) + UNIFORM, origin=origin, fov=10)
+    scene = glassware(ball="", core='<scale value="0.5"/>', sky=1, origin=origin, fov=10)
     image = np.asarray(pj.render(without_roulette(scene, 10_000), 16))
     np.testing.assert_allclose(image, expected, rtol=3e-5)  # some 20 interfaces
 

@@ -15,7 +15,6 @@ NO_LIMIT = 1 << 30
 GREY = '<bsdf type="diffuse"><rgb name="reflectance" value="0.2, 0.5, 0.8"/></bsdf>'
 RHO = np.array([0.2, 0.5, 0.8])
 UNIFORM = '<emitter type="constant" id="sky"><rgb name="radiance" value="1"/></emitter>'
-GLASS = '<bsdf type="dielectric" id="glass"><float name="int_ior" value="1.5"/><float name="ext_ior" value="1"/></bsdf>'
 MIRROR = '<bsdf type="conductor"><rgb name="specular_reflectance" value="0.9, 0.5, 0.25"/></bsdf>'
 OCTAHEDRON = '<string name="filename" value="meshes/octahedron.obj"/><boolean name="face_normals" value="true"/>'
 
@@ -57,23 +56,6 @@ def test_furnace_by_bsdf_sampling_has_no_noise(shipped):
 def test_furnace_without_limit_under_roulette(shipped, estimate, agree, rr_depth):
     scene = with_depth(shipped("furnace", res=16), NO_LIMIT, rr_depth)
     agree(estimate(scene, spp=64), 1 / (1 - RHO))
-
-
-SPLIT = {"fresnel": "schlick", "split_depth": 4}
-
-
-@pytest.mark.parametrize(
-    "kind, how", [("sphere", {}), ("cube", {}), pytest.param("sphere", SPLIT, marks=pytest.mark.slow)]
-)
-def test_glass_in_uniform_light_is_invisible(make_scene, kind, how):
-    scene = with_depth(make_scene(shape(kind, GLASS) + UNIFORM, origin="1.2, 1.5, 4"), NO_LIMIT, NO_LIMIT)
-    # Some 10 refractions by reciprocal factors, an ulp or two each.
-    np.testing.assert_allclose(pj.render(scene, 16, **how), 1, rtol=1e-5)
-
-
-def test_glass_under_roulette_stays_as_bright(make_scene, estimate, agree):
-    scene = with_depth(make_scene(shape("sphere", GLASS) + UNIFORM, origin="1.2, 1.5, 4"), NO_LIMIT, 1)
-    agree(estimate(scene), 1)
 
 
 def test_mirror_ball_in_uniform_light_shows_its_reflectance(make_scene):
