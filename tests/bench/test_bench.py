@@ -17,7 +17,18 @@ from pathjax.cli import main
 from pathjax.images import rel_mse
 
 ROOT = Path(__file__).resolve().parents[2]
-CORNELL, FURNACE = (str(ROOT / "scenes" / f"{name}.xml") for name in ("cornell_box", "furnace"))
+FURNACE = str(ROOT / "scenes" / "furnace.xml")
+# A floor under a small lamp, which bsdf sampling seldom finds.
+FLOOR = """<scene version="3.0.0"><default name="res" value="16"/><integrator type="path"/><sensor type="perspective">
+  <transform name="to_world"><lookat origin="0,3,4" target="0,0,0" up="0,1,0"/></transform>
+  <float name="fov" value="40"/>
+  <film type="hdrfilm"><integer name="width" value="$res"/><integer name="height" value="$res"/><rfilter type="box"/>
+  </film></sensor>
+<shape type="rectangle"><transform name="to_world"><scale value="3"/><rotate x="1" angle="-90"/></transform>
+  <bsdf type="diffuse" id="floor"/></shape>
+<shape type="rectangle"><transform name="to_world"><scale value="0.3"/><rotate x="1" angle="90"/><translate y="1"/>
+  </transform><bsdf type="diffuse" id="base"/><emitter type="area" id="lamp"/></shape></scene>
+"""
 SMALL = ["-D", "res=16", "--spp", "2,32", "--reference-spp", "512", "--repeat", "2"]
 
 needs_mitsuba = pytest.mark.skipif(not importlib.util.find_spec("mitsuba"), reason="Mitsuba is not installed")
@@ -33,10 +44,17 @@ def run(*arguments, status=0):
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory):
+def floor(tmp_path_factory):
+    file = tmp_path_factory.mktemp("scenes") / "floor.xml"
+    file.write_text(FLOOR)
+    return str(file)
+
+
+@pytest.fixture(scope="module")
+def folder(floor, tmp_path_factory):
     """A report of everything but Mitsuba."""
     folder = tmp_path_factory.mktemp("bench") / "report"
-    run(CORNELL, *SMALL, "-o", str(folder))
+    run(floor, *SMALL, "-o", str(folder))
     return folder
 
 
@@ -69,13 +87,13 @@ def test_strategies(scene):
     assert 3 * mis["rel_mse"] < bsdf["rel_mse"]
 
 
-def test_sampler_beside_independent_numbers(scene):
+def test_sampler_beside_independent_numbers(scene, floor):
     sampler = scene["sampler"]
     for row in sampler["rows"]:
         assert row["independent_rel_mse"] == pytest.approx(sampler["single_rel_mse"] / row["spp"])
         assert row["ratio"] == pytest.approx(row["independent_rel_mse"] / row["rel_mse"])
     # The mean of images of one sample has the error that the table says.
-    small = pathjax.load_scene(CORNELL, res=16)
+    small = pathjax.load_scene(floor, res=16)
     truth = pathjax.render(small, 4096, 1 << 10)
     singles = np.stack([pathjax.render(small, 1, 2000 + k) for k in range(512)])
     means = singles.reshape(16, 32, *singles.shape[1:]).mean(1)
@@ -93,9 +111,9 @@ def test_precision_and_memory(scene):
 
 
 def test_derivatives(scene, folder):
-    """In three reflectances and a radiance, whatever else is a parameter."""
+    """In two reflectances and a radiance, whatever else is a parameter."""
     derivatives = scene["derivatives"]
-    assert derivatives["numbers"] == 12 and derivatives["spp"] == 32
+    assert derivatives["numbers"] == 9 and derivatives["spp"] == 32
     assert all(len(each) == 2 and min(each) > 0 for each in derivatives["cpu_seconds"].values())
     assert "| J^T v |" in (folder / "bench.md").read_text()
 
@@ -108,9 +126,9 @@ def test_closest_hits(scene):
 
 @needs_matplotlib
 def test_plot(folder, scene):
-    assert scene["plot"] == "cornell_box.png"
-    assert "](cornell_box.png)" in (folder / "bench.md").read_text()
-    with Image.open(folder / "cornell_box.png") as picture:
+    assert scene["plot"] == "floor.png"
+    assert "](floor.png)" in (folder / "bench.md").read_text()
+    with Image.open(folder / "floor.png") as picture:
         assert picture.format == "PNG"
         assert picture.width >= 800 and picture.height >= 500
         assert len(np.unique(np.asarray(picture.convert("L")))) > 10
@@ -155,14 +173,14 @@ def test_a_scene_without_noise(tmp_path, capsys, write_scene):
 
 
 @needs_matplotlib
-def test_an_interrupt_keeps_the_scenes_that_are_done(scene, tmp_path, capsys, monkeypatch):
+def test_an_interrupt_keeps_the_scenes_that_are_done(scene, floor, tmp_path, capsys, monkeypatch):
     def measure(file, *_):
-        if file == CORNELL:
+        if file == floor:
             raise KeyboardInterrupt
         return {name: value for name, value in scene.items() if name != "plot"} | {"file": file}
 
     monkeypatch.setattr(bench, "measure", measure)
-    run(FURNACE, FURNACE, CORNELL, *SMALL, "--quick", "-o", str(tmp_path), status=1)
+    run(FURNACE, FURNACE, floor, *SMALL, "--quick", "-o", str(tmp_path), status=1)
     assert "interrupted; 2 of 3 scenes are done" in capsys.readouterr().err
     scenes = json.loads((tmp_path / "bench.json").read_text())["scenes"]
     assert [scene["plot"] for scene in scenes] == ["furnace-1.png", "furnace-2.png"]
@@ -227,7 +245,7 @@ def test_names_that_are_not_utf8(measured, tmp_path):
 
 
 def test_a_folder_without_parent_is_refused(tmp_path, capsys):
-    run(CORNELL, *SMALL, "-o", str(tmp_path / "none" / "report"), status=2)
+    run(FURNACE, *SMALL, "-o", str(tmp_path / "none" / "report"), status=2)
     assert "there is no folder" in capsys.readouterr().err
 
 
@@ -277,8 +295,9 @@ def test_the_best_sampler_is_named_and_one_that_fails_is_told(tmp_path, capsys, 
 @pytest.mark.slow
 @needs_mitsuba
 def test_mitsubas_independent_sampler_has_the_error_of_independent_numbers(capsys):
+    cornell = str(ROOT / "scenes" / "cornell_box.xml")
     small = ["-D", "res=16", "--spp", "16", "--reference-spp", "4096", "--repeat", "8", "--json"]
-    run(CORNELL, *small, "--against", "mitsuba")
+    run(cornell, *small, "--against", "mitsuba")
     (scene,) = json.loads(capsys.readouterr().out)["scenes"]
     assert {row["sampler"] for row in scene["mitsuba"]} == set(mitsuba3.SAMPLERS)
     row = next(row for row in scene["mitsuba"] if row["sampler"] == "independent")
