@@ -368,14 +368,18 @@ def test_transformations_of_a_linear_image(screen):
 
 def test_jacobians_in_textures(make_scene, picture):
     """The texels alone that are asked for are kept, beside a colour, of two textures that lie in one array."""
-    before = '<transform name="to_world"><translate x="{}" z="-0.1"/></transform>'
+    turned = '<scale value="{}"/><rotate y="1" angle="{}"/><translate x="{}" z="{}"/>'
     inside = "".join(
-        f'<shape type="rectangle">{before.format(x)}{diffuse(name, texture(picture(*size)))}</shape>'
-        for x, name, size in ((-1, "left", (2, 3)), (1, "right", (5, 4)))
+        f'<shape type="rectangle"><transform name="to_world">{turned.format(*place)}</transform>'
+        f"{diffuse(name, reflectance)}</shape>"
+        for place, name, reflectance in (
+            ((1, 20, -1, 0), "left", texture(picture(2, 3))),
+            ((1, -20, 1, 0), "right", texture(picture(5, 4))),
+            ((0.5, 0, 0, 1), "plate", rgb("reflectance", 0.5)),
+        )
     )
-    ball = f'<shape type="sphere"><float name="radius" value="0.5"/>{diffuse("ball", rgb("reflectance", 0.5))}</shape>'
-    inside += ball + f'<emitter type="constant" id="sky">{rgb("radiance", 1)}</emitter>'
-    scene, names = make_scene(inside, res=RES, depth=3), ["right.reflectance", "ball.reflectance"]
+    inside += f'<emitter type="constant" id="sky">{rgb("radiance", 1)}</emitter>'
+    scene, names = make_scene(inside, res=RES, depth=3), ["right.reflectance", "plate.reflectance"]
     image, J = pj.jacobian(scene, names, SPP, 3)
     wanted = {name: scene.about.parameters[name] for name in names}
     bare, pixels = named.nameless(scene), jnp.arange(RES * RES, dtype=jnp.int32)
