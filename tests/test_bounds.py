@@ -190,7 +190,7 @@ LAMPS = (
 def test_lights_are_chosen_inside_of_arrays(outside_of, make_scene):
     """A light, and a triangle of a mesh, by numbers at the ends of their ranges."""
     scene = replace(make_scene(LAMPS + SKY), about=None)
-    chosen = emitters.choice(scene.emitters, "light")
+    chosen = jax.jit(lambda lights: emitters.choice(lights, "light"))(scene.emitters)
     numbers = jnp.asarray(np.stack(np.meshgrid(ENDS, ENDS, ENDS), -1).reshape(-1, 3))
 
     def draw(u, scene, chosen):

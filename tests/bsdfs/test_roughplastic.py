@@ -19,8 +19,14 @@ slow = pytest.mark.slow
 def transmitted(distribution, alpha, eta):
     """T at COSINES, and the share that is reflected inside."""
     made = coat.coats(distribution, np.array([alpha]), np.array([eta]))[0]
-    terms, share = coat.at(jnp.asarray(made), alpha, eta)
-    return np.asarray(jax.vmap(lambda mu: coat.passes(terms, mu))(COSINES)), float(share)
+
+    @jax.jit
+    def of(made):
+        terms, share = coat.at(made, alpha, eta)
+        return jax.vmap(lambda mu: coat.passes(terms, mu))(COSINES), share
+
+    T, share = of(jnp.asarray(made))
+    return np.asarray(T), float(share)
 
 
 # ---- coats ----------------------------------------------------------------------------------------------------------

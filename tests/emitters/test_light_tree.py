@@ -58,7 +58,7 @@ def test_each_light_has_a_leaf_of_its_own_near_its_neighbours(count):
 @pytest.mark.parametrize("sky", [False, True])
 def test_lights_are_found_as_often_as_their_probabilities_say(sky):
     scene = room(sky=sky)
-    chosen = emitters.choice(scene.emitters, "mis")
+    chosen = jax.jit(lambda lights: emitters.choice(lights, "mis"))(scene.emitters)
     count, draws = chosen.pdf.shape[0], 1 << 12
     u = jnp.stack([(jnp.arange(draws) + 0.5) / draws, jnp.full((draws,), 0.25)], 1).astype(jnp.float32)
     choose = jax.jit(jax.vmap(lambda ref, u: emitters.choose(chosen, ref, u), (None, 0)))
@@ -79,7 +79,10 @@ def tree_of(points, normals, power):
     """Of small lights."""
     places = np.stack([points, points, normals], 1).astype(np.float32)
     leaf = light_tree.arranged(places)
-    return light_tree.built(jnp.asarray(places), jnp.asarray(leaf), jnp.asarray(power, jnp.float32))
+    return jax.jit(light_tree.built)(jnp.asarray(places), jnp.asarray(leaf), jnp.asarray(power, jnp.float32))
+
+
+probability = jax.jit(light_tree.probability)
 
 
 def test_lights_that_face_a_point_are_chosen_more_often():
@@ -87,16 +90,16 @@ def test_lights_that_face_a_point_are_chosen_more_often():
     tilted = [(0, 0, 1), (0, np.sin(0.9), np.cos(0.9))]
     tree = tree_of([(0, 0, 0), (0, 0, 0)], tilted, [1, 1])
     least = light_tree._LEAST_AROUND / 4
-    first, second = (float(light_tree.probability(tree, jnp.array([0, 0, 7.0]), n)) for n in (0, 1))
+    first, second = (float(probability(tree, jnp.array([0, 0, 7.0]), n)) for n in (0, 1))
     np.testing.assert_allclose(second / first, (np.cos(0.9) + least) / (1 + least), rtol=1e-5)
     tree = tree_of([(0, 0, 0), (0, 0, 0)], [(0, 0, -1), (0, 0, 0)], [1, 1])
-    away, round = (float(light_tree.probability(tree, jnp.array([0, 0, 7.0]), n)) for n in (0, 1))
+    away, round = (float(probability(tree, jnp.array([0, 0, 7.0]), n)) for n in (0, 1))
     np.testing.assert_allclose(away / round, least / 0.25, rtol=1e-5)
 
 
 def test_near_and_bright_lights_are_chosen_more_often():
     tree = tree_of([(0, 0, 0), (10, 0, 0), (10, 5, 0), (10, 9, 0)], np.zeros((4, 3)), [1, 1, 8, 0])
-    beside = [float(light_tree.probability(tree, jnp.array([0.5, 0, 0]), n)) for n in range(4)]
+    beside = [float(probability(tree, jnp.array([0.5, 0, 0]), n)) for n in range(4)]
     assert beside[0] > 5 * 0.1  # its share of the power
     assert beside[2] > beside[1] and beside[3] == 0
 

@@ -56,9 +56,10 @@ def test_tables_of_any_length_stand_beside_each_other():
     for row, values in enumerate(TABLES):
         lines = np.interp(cos, np.linspace(-1, 1, len(values)), values)
         lines /= np.trapezoid(lines, cos)
-        found = jax.vmap(lambda wo, row=row: media.TabPhase.evaluate(Row(table, row), wo))(wo)
+        found = jax.jit(jax.vmap(lambda wo, row=row: media.TabPhase.evaluate(Row(table, row), wo)))(wo)
         np.testing.assert_allclose(2 * np.pi * found, lines, rtol=1e-4, atol=1e-4 * lines.max())
-        drawn = -np.asarray(jax.vmap(lambda u, row=row: media.TabPhase.sample(Row(table, row), u))(u), float)[:, 2]
+        sample = jax.jit(jax.vmap(lambda u, row=row: media.TabPhase.sample(Row(table, row), u)))
+        drawn = -np.asarray(sample(u), float)[:, 2]
         # 4.5 standard errors for each of five: a false alarm in 30,000; and the steps of the table of shares.
         assert abs(drawn.mean() - np.trapezoid(lines * cos, cos)) < 4.5 * drawn.std() / math.sqrt(SAMPLES) + 1e-5
 

@@ -92,7 +92,7 @@ def test_along_the_tangent_u_grows_and_v_stays(kind):
 def test_where_u_grows_nowhere_any_tangent_will_do():
     shapes = geometry_of(Mesh(TRIANGLE, np.array([[0, 1, 2]]), None, np.zeros((3, 2))))
     ray = Ray(jnp.array([0.0, 0, 5]), jnp.array([0.0, 0, -1]), jnp.float32(np.inf), jnp.int32(-1))
-    surface = geometry.surface(shapes, ray, geometry.closest_hit(shapes, ray))
+    surface = jax.jit(lambda ray: geometry.surface(shapes, ray, geometry.closest_hit(shapes, ray)))(ray)
     np.testing.assert_allclose(np.linalg.norm(surface.tangent), 1, rtol=1e-6)
     np.testing.assert_allclose(np.dot(surface.tangent, surface.n), 0, atol=1e-6)
 
