@@ -186,7 +186,7 @@ def test_two_infinite_plates(plates, derivatives, agree):
         agree(slopes[name], partial, pixelwise=False)
 
 
-@pytest.mark.parametrize("strategy", ["mis", "bsdf"])
+@pytest.mark.parametrize("strategy", ["mis", pytest.param("bsdf", marks=pytest.mark.slow)])
 def test_two_finite_plates_with_their_form_factor(plates, derivatives, agree, strategy):
     """One bounce: the point's form factor to the other plate, a rectangle seen from below its middle."""
     # Four quarters, each 1 / (2 pi) (a / A atan(b / A) + b / B atan(a / B)), A^2 = 1 + a^2 (Howell's catalogue, B-3).

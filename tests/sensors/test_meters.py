@@ -116,7 +116,10 @@ def test_sensors_of_one_number_agree_with_mitsuba(case):
     assert (abs(one.mean(0) - other.mean(0)) < 5 * error + 1e-6 * one.mean(0)).all()
 
 
-@pytest.mark.parametrize(("case", "lights"), [("radiancemeter", ("sky", "lamp")), ("distant", ("sky",))])
+@pytest.mark.parametrize(
+    ("case", "lights"),
+    [("radiancemeter", ("sky", "lamp")), pytest.param("distant", ("sky",), marks=pytest.mark.slow)],
+)
 def test_derivatives_through_glass_are_finite(case, lights):
     """Where paths move with a parameter, though no ray moves with its place on the film."""
     glass = {"type": "sphere", "bsdf": {"type": "dielectric", "id": "clear"}}
