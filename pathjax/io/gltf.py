@@ -25,7 +25,8 @@ WRAPS = {10497: "repeat", 33648: "mirror", 33071: "clamp"}
 NEAREST = 9728
 # Extensions that are modelled: what a file may require.
 KNOWN = re.compile(
-    "KHR_(lights_punctual|mesh_quantization|texture_transform|materials_(ior|emissive_strength|unlit))|EXT_texture_webp"
+    "KHR_(lights_punctual|mesh_quantization|texture_transform|materials_(ior|emissive_strength|transmission|unlit))"
+    "|EXT_texture_webp"
 )
 MOST_PIXELS = 10**9
 NO_LIMIT = 1e10  # of what a camera sees: farther than anything
@@ -159,7 +160,7 @@ class _Scene:
         return np.clip(colors[:, :3], 0, 1)
 
     def bsdf(self, material: dict, colored: bool) -> dict:
-        """Both sides alike, as path tracers have them; the format would show one of them alone."""
+        """Both sides alike, as path tracers have them; the format would show one of them alone. But for solid glass."""
         pbr = material.get("pbrMetallicRoughness", {})
         factor = np.array(pbr.get("baseColorFactor", [1.0, 1.0, 1.0, 1.0]))
         base = self.texture(pbr.get("baseColorTexture"))
@@ -169,6 +170,7 @@ class _Scene:
         elif colored:
             color = {"type": "mesh_attribute", "name": "vertex_color"}
         extensions = material.get("extensions", {})
+        two_sided = True
         if "KHR_materials_unlit" in extensions:
             self.note("its unlit materials are lit, as diffuse ones of their colour")
             bsdf = {"type": "diffuse", "reflectance": color}
@@ -180,12 +182,14 @@ class _Scene:
             for key, channel, usual in (("roughness", 1, "roughnessFactor"), ("metallic", 2, "metallicFactor")):
                 share = float(pbr.get(usual, 1.0))
                 bsdf[key] = share if both is None else both.times(slice(channel, channel + 1), share, raw=True)
+            if (through := self.transmission(extensions)) is not None:
+                bsdf, two_sided = self.glass(bsdf | {"spec_trans": through}, extensions), False
             if (normals := self.texture(material.get("normalTexture"))) is not None:
                 normal = normals.normals(float(material["normalTexture"].get("scale", 1.0)))
                 bsdf = {"type": "normalmap", "normalmap": normal, "bsdf": bsdf}
         if "occlusionTexture" in material:
             self.note("the occlusion in its materials is left out, as light is traced")
-        bsdf = {"type": "twosided", "bsdf": bsdf}
+        bsdf = {"type": "twosided", "bsdf": bsdf} if two_sided else bsdf
         if (mode := material.get("alphaMode", "OPAQUE")) == "OPAQUE":
             return bsdf
         cutoff = float(material.get("alphaCutoff", 0.5)) if mode == "MASK" else None
@@ -194,6 +198,21 @@ class _Scene:
         else:
             opacity = float(factor[3]) if cutoff is None else float(factor[3] >= cutoff)
         return {"type": "mask", "opacity": opacity, "bsdf": bsdf}
+
+    def transmission(self, extensions: dict) -> float | dict | None:
+        """The share of light that is let through; None where there is none."""
+        extension = extensions.get("KHR_materials_transmission", {})
+        factor = float(extension.get("transmissionFactor", 0.0))
+        picture = self.texture(extension.get("transmissionTexture")) if factor else None
+        return picture.times(slice(0, 1), factor, raw=True) if picture is not None else factor or None
+
+    def glass(self, bsdf: dict, extensions: dict) -> dict:
+        """A `principled` that lets light through: solid where it has a thickness, else a sheet of no metal."""
+        if extensions.get("KHR_materials_volume", {}).get("thicknessFactor", 0.0):
+            return bsdf
+        if bsdf.pop("metallic") != 0:
+            self.note("the metal in its sheets that let light through is left out")
+        return bsdf | {"type": "principledthin"}
 
     def emission(self, material: dict) -> dict | None:
         """Radiance; None where there is none."""
@@ -216,6 +235,7 @@ class _Scene:
         pbr = material.get("pbrMetallicRoughness", {})
         infos = [pbr.get("baseColorTexture"), pbr.get("metallicRoughnessTexture")]
         infos += [material.get("normalTexture"), material.get("emissiveTexture")]
+        infos += [material.get("extensions", {}).get("KHR_materials_transmission", {}).get("transmissionTexture")]
         used = {_transform_of(info).get("texCoord", info.get("texCoord", 0)) for info in infos if info}
         if len(used) > 1:
             raise self.file.refuse("textures of one material that use different texture coordinates")
