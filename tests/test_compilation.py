@@ -79,7 +79,7 @@ def test_programs_are_small(shipped, name, lines, loops):
 def test_columns_of_lanes_are_seldom_copied(kernel_of, name):
     """XLA copies what it believes to be overwritten while it is read: once two columns for each that was computed."""
     text = kernel_of(name).compiled.as_text()
-    copied, computed = (len(re.findall(rf"= \w+\[64\]\S* {what}\(", text)) for what in ("copy", "fusion"))
+    copied, computed = (len(re.findall(rf"= \w+\[128\]\S* {what}\(", text)) for what in ("copy", "fusion"))
     assert computed > 50
     assert copied < computed / 2
 
