@@ -2,8 +2,8 @@
 
 - `native_map` runs a function of one item over all items, on all devices; `lanes/` is how, on CPUs. `native_fold` is
   the same for items that leave something in memory that they share, `native_rows` where each has rows of its own there.
-- `compute_once`, `one_by_one`, `interleaved`, `persistent_loop` and `basis` stand in code of one item. They change
-  nothing of its results, only what is computed, and when. `together` changes the memory of a `native_fold`.
+- `compute_once`, `one_by_one`, `interleaved`, `persistent_loop`, `unset` and `basis` stand in code of one item. They
+  change nothing of its results, only what is computed, and when. `together` changes the memory of a `native_fold`.
 - `linear` is a linear function with a transpose of its own.
 - `register_dataclass` makes a dataclass a pytree, where JAX's own may give it the kernel of another.
 - `on_all_devices` keeps large arrays from being copied at each call.

@@ -307,11 +307,14 @@ mlir.register_lowering(persistent_test_p, lambda context, goes_on: [goes_on])
 batching.primitive_batchers[persistent_test_p] = lambda values, axes: (persistent_test_p.bind(*values), *axes)
 
 
+# ---- unset ----------------------------------------------------------------------------------------------------------
+
 unset_p.def_impl(jnp.asarray)
 unset_p.def_abstract_eval(lambda value: value)
 mlir.register_lowering(unset_p, lambda context, value: [value])
 batching.defvectorized(unset_p)
 ad.deflinear2(unset_p, lambda cotangent, _: [cotangent])
+
 
 # ---- together -------------------------------------------------------------------------------------------------------
 
