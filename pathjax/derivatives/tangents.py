@@ -37,7 +37,7 @@ def places(parameters: Iterable[Parameter]) -> Places:
     return tuple((parameter.path, parameter.index) for parameter in parameters)
 
 
-def in_parameter(slope: Float[Array, "*shape 3"], of_color: bool) -> Float[Array, "*shape 3 ..."]:
+def in_parameter(slope: Float[Array, "*shape 3"], of_color: bool) -> Float[Array, "..."]:
     """In a colour (*shape, 3, 3), from the derivative of each channel in its own; in a number, that of each channel."""
     return slope[..., None] * jnp.eye(3, dtype=slope.dtype) if of_color else slope
 
