@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from pathjax.bsdfs.null import Null
+from pathjax.bsdfs.null import NOTHING
 from pathjax.bsdfs.wrapper import Choosing
 from pathjax.kinds import Number, Row
-
-NOTHING = Null.instance("nothing")
 
 
 class Mask(Choosing):

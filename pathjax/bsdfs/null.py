@@ -24,3 +24,7 @@ class Null(BSDF):
         """Straight on."""
         one = jnp.ones_like(wi[2])
         return BSDFSample(-wi, jnp.ones_like(wi), one, jnp.bool_(True), one)
+
+
+# What masks and panes hold beside something else: one row for all of them.
+NOTHING = Null.instance("nothing")

@@ -8,7 +8,7 @@ from typing import ClassVar
 import numpy as np
 
 from pathjax.bsdfs.bsdf import BSDF
-from pathjax.bsdfs.null import Null
+from pathjax.bsdfs.null import NOTHING
 from pathjax.bsdfs.wrapper import Choosing
 from pathjax.kinds import Number, Row
 
@@ -48,7 +48,7 @@ class Sheet(Choosing):
 
     @classmethod
     def holding(cls, name, *held, **values):
-        return super().holding(name, Opaque.instance("opaque"), Null.instance("straight"), **values)
+        return super().holding(name, Opaque.instance("opaque"), NOTHING, **values)
 
     @classmethod
     def share(cls, p: Row, cos):

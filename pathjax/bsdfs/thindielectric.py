@@ -10,14 +10,11 @@ from pathjax.bsdfs import fresnel
 from pathjax.bsdfs.dielectric import IndexOfRefraction
 from pathjax.bsdfs.interface import Interface
 from pathjax.bsdfs.ior import IOR
-from pathjax.bsdfs.null import Null
+from pathjax.bsdfs.null import NOTHING
 from pathjax.bsdfs.wrapper import Choosing
 from pathjax.core.math import safe_divide, smaller
 from pathjax.core.types import BSDFSample
 from pathjax.kinds import Row
-
-# One row for all panes.
-STRAIGHT_ON = Null.instance("straight")
 
 
 def reflectance(p: Row, cos: Float[Array, ""]) -> Float[Array, ""]:
@@ -51,8 +48,8 @@ class ThinDielectric(Interface):
         values = dict(instance.values)
         if values["specular_transmittance"] is not None:
             return instance
-        reflection = {"specular_reflectance": values.pop("specular_reflectance"), "int_ior": None, "ext_ior": None}
-        return Pane.holding(instance.name, Reflection.instance(instance.name, **reflection), STRAIGHT_ON, **values)
+        mirror = Reflection.instance(instance.name, specular_reflectance=values.pop("specular_reflectance"))
+        return Pane.holding(instance.name, mirror, NOTHING, **values)
 
     @staticmethod
     def sample(p: Row, wi: Float[Array, "3"], u: Float[Array, " numbers"]) -> BSDFSample:
@@ -66,10 +63,10 @@ class ThinDielectric(Interface):
         return BSDFSample(wo, weight, pdf, jnp.bool_(True), jnp.ones_like(pdf))
 
 
-class Reflection(ThinDielectric):
+class Reflection(Interface):
     """The mirror that stands for a pane where chance takes what it reflects."""
 
-    transmissive = False
+    transmissive, delta = False, True
 
     @staticmethod
     def sample(p: Row, wi: Float[Array, "3"], u: Float[Array, " numbers"]) -> BSDFSample:

@@ -57,8 +57,8 @@ def from_queue(interpreter: Interpreter, program, xs, shared, place, differ, mem
     kept = [*own, *loop.outvars]
     differing = [True] * len(own) + differ(loop.outvars)
     shapes = [v.aval.shape for v in kept]
-    unset = variables(v for eqn in before if eqn.primitive is unset_p for v in eqn.outvars)
-    unset = {v for v, atom in zip(loop.outvars, init, strict=True) if variables([atom]) & unset}
+    said = variables(v for eqn in before if eqn.primitive is unset_p for v in eqn.outvars)
+    unset = {v for v, atom in zip(loop.outvars, init, strict=True) if variables([atom]) & said}
     written = [differs and v not in unset for v, differs in zip(kept, differing, strict=True)]
 
     def read_all(values, atoms):
