@@ -1,17 +1,17 @@
-"""How a function of one ray becomes a native kernel over millions, and what its code may say of that.
+"""Compiles a function of one ray to a native kernel over millions of rays.
 
-- `native_map` runs a function of one item over all items, on all devices; `lanes/` is how, on CPUs. `native_fold` is
-  the same for items that leave something in memory that they share, `native_rows` where each has rows of its own there.
-- `compute_once`, `one_by_one`, `interleaved`, `persistent_loop`, `unset` and `basis` stand in code of one item. They
-  change nothing of its results, only what is computed, and when. `together` changes the memory of a `native_fold`.
+- `native_map` runs a function of one item over all items, on all devices; on CPUs `lanes/` implements it. `native_fold`
+  is for items that accumulate into shared memory, `native_rows` for items that each write rows of their own.
+- `compute_once`, `one_by_one`, `interleaved`, `persistent_loop`, `unset` and `basis` are used in code of one item. They
+  change no result, only what is computed and when. `together` updates the memory of a `native_fold`.
 - `linear` is a linear function with a transpose of its own.
-- `register_dataclass` makes a dataclass a pytree, where JAX's own may give it the kernel of another.
+- `register_dataclass` makes a dataclass a pytree; with JAX's own function it may get the kernel of another dataclass.
 - `on_all_devices` keeps large arrays from being copied at each call.
 - `concurrently` calls one kernel several times at once.
-- `setup` prepares XLA. It runs here, so that importing pathjax is enough; `keep_kernels` is for programs,
-  and `compiled` then finds on disk what they would trace.
+- `setup` prepares XLA. It runs here, so that importing pathjax is enough. `keep_kernels` is for programs; `compiled`
+  then loads kernels from disk without tracing them.
 
-Whatever of JAX is not public is imported by `jax_compat` alone.
+Only `jax_compat` imports JAX internals.
 """
 
 from __future__ import annotations

@@ -21,26 +21,26 @@ from pathjax.compile.jax_compat import bytes_of_program, program_of_bytes
 from pathjax.compile.lanes import without_collections
 from pathjax.system.files import write_whole
 
-# Most bytes of compiled kernels on disk, some 100 kB each; those used longest ago go first.
+# Limit on the bytes of compiled kernels on disk, some 100 kB each; the least recently used are removed first.
 _CACHE_BYTES = 1 << 28
-# Lines of /proc/cpuinfo that tell which machine code a processor runs, on x86 and Arm.
+# Fields of /proc/cpuinfo that determine which machine code a processor runs, on x86 and Arm.
 _CPU_LINES = ("vendor_id", "cpu family", "model", "flags", "CPU implementer", "CPU part", "Features")
-# JAX's events of kernels that were on disk.
+# JAX's events for kernels that it found on disk.
 _hits: list[str] = []
-# The folder where programs are kept by what they are traced from; None: nowhere.
+# Folder of the kept programs, whose file names are their keys; None: no program is kept.
 _programs: Path | None = None
-# Programs of this process, by their keys there.
+# Programs that this process has compiled or loaded, by key.
 _known: dict[str, Callable] = {}
 
 
 def keep_kernels() -> None:
-    """Let this process find the kernels that earlier ones compiled, and leave its own to later ones.
+    """Let this process load the kernels that earlier processes compiled, and keep its own for later ones.
 
     For programs, not libraries: it sets JAX's persistent compilation cache to `pathjax` in the user's cache folder,
-    and silences XLA's log, which takes a compiler's preferences for instructions that the processor lacks. What the
-    user chose, in JAX's configuration or by `PATHJAX_CACHE=0`, stands; without a folder to write in, or on a full disk,
-    nothing is kept, and JAX's warnings of that are silenced.
-    Linux only: other systems do not tell their processors apart here, and XLA loads what a processor cannot run.
+    and silences XLA's log, which mistakes a compiler's preferences for instructions that the processor lacks. The
+    user's choices, in JAX's configuration or by `PATHJAX_CACHE=0`, take precedence. Without a writable folder, or on a
+    full disk, nothing is kept, and JAX's warnings about that are silenced.
+    Linux only: processors are not told apart on other systems, where XLA would load code that the processor cannot run.
     """
     warnings.filterwarnings("ignore", "Error (reading|writing) persistent compilation cache", UserWarning)
     chosen = "JAX_COMPILATION_CACHE_DIR" in os.environ or jax.config.jax_compilation_cache_dir is not None
@@ -50,8 +50,8 @@ def keep_kernels() -> None:
     try:
         folder = (base if base.is_absolute() else Path.home() / ".cache") / "pathjax" / _processor()
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        str(folder).encode()  # XLA takes names in UTF-8 alone
-    except (OSError, RuntimeError, UnicodeError):  # RuntimeError: nobody knows the home folder
+        str(folder).encode()  # XLA accepts only names in UTF-8
+    except (OSError, RuntimeError, UnicodeError):  # RuntimeError: the home folder is unknown
         return
     if not os.access(folder, os.W_OK):
         return
@@ -81,9 +81,9 @@ def _hear_hit(event: str, **_: str | int) -> None:
 
 
 def compiled(function, *arguments, **static) -> Callable:
-    """`function.lower(*arguments, **static).compile()`, of a jitted function of one device that gives one array.
+    """Return `function.lower(*arguments, **static).compile()` for a jitted one-device function that returns one array.
 
-    With `keep_kernels`, a program is found by what it is traced from, without tracing it.
+    After `keep_kernels`, a program that is known is looked up by a key, without tracing the function.
     """
     try:
         if _programs is None or jax.default_backend() != "cpu" or jax.process_count() > 1:
@@ -98,12 +98,12 @@ def compiled(function, *arguments, **static) -> Callable:
 
 
 def _read(file: Path, arguments) -> Callable | None:
-    """The program in a file; None: there is none that can be used."""
+    """Return the program in a file; None: the file is missing or unusable."""
     try:
         content = file.read_bytes()
-        os.utime(file)  # when it was last used
+        os.utime(file)  # records the time of last use
         return program_of_bytes(content, arguments, 0)
-    except Exception:  # whatever XLA says of what it cannot read: the program is made anew
+    except Exception:  # any error of XLA's in reading it: the program is compiled again
         return None
 
 
@@ -114,7 +114,7 @@ def _lowered(function, arguments, static):
 
 def _made(file: Path, function, arguments, static) -> Callable:
     lowered, hits = _lowered(function, arguments, static), len(_hits)
-    # JAX is not to keep the program too: XLA writes one that it has read without some of its functions.
+    # Keep JAX from caching the program, too: XLA omits some functions when it writes a program that it has loaded.
     least = jax.config.jax_persistent_cache_min_compile_time_secs
     jax.config.update("jax_persistent_cache_min_compile_time_secs", float("inf"))
     try:
@@ -122,7 +122,7 @@ def _made(file: Path, function, arguments, static) -> Callable:
     finally:
         jax.config.update("jax_persistent_cache_min_compile_time_secs", least)
     if len(_hits) == hits:
-        # Errors of a disk are an InputError, and XLA has its own where a program cannot be kept.
+        # `write_whole` raises InputError on disk errors; XLA raises its own where a program cannot be serialised.
         with contextlib.suppress(Exception):
             content = bytes_of_program(program)
             write_whole(file, lambda out: out.write(content))
@@ -131,7 +131,7 @@ def _made(file: Path, function, arguments, static) -> Callable:
 
 
 def _remove_oldest(folder: Path) -> None:
-    """Remove the programs that were used longest ago, beyond as many bytes as kernels have."""
+    """Remove the least recently used programs beyond `_CACHE_BYTES`."""
     used = sorted(folder.glob("*.program"), key=lambda path: path.stat().st_mtime, reverse=True)
     total = 0
     for path in used:
@@ -141,14 +141,14 @@ def _remove_oldest(folder: Path) -> None:
 
 
 class _Unknown(Exception):
-    """Something of which another process cannot tell whether it has the same."""
+    """An object that cannot be identified across processes."""
 
 
 def _key(function, arguments, static) -> str:
-    """Hash of all that a program depends on.
+    """Return a hash of everything that a program depends on.
 
     Raises:
-        _Unknown: it depends on what is not pathjax's own, such as a kind of the user's.
+        _Unknown: it depends on something outside pathjax, such as a kind defined by the user.
     """
     leaves, tree = jax.tree.flatten(arguments)
     given = [(leaf.shape, str(leaf.dtype), getattr(leaf, "weak_type", False)) for leaf in leaves]
@@ -162,13 +162,13 @@ def _key(function, arguments, static) -> str:
 
 @functools.cache
 def _sources() -> list[tuple]:
-    """What tells whether the package is the same, as Python tells whether a module is the one that it has compiled."""
+    """Return path, time and size of each source file, as Python checks whether a compiled module is up to date."""
     files = sorted(Path(__file__).parents[1].rglob("*.py"))
     return [(str(file), file.stat().st_mtime_ns, file.stat().st_size) for file in files]
 
 
 def _told_tree(tree) -> object:
-    """A pytree's structure, in words that are the same in each process."""
+    """Return a pytree's structure as values whose `repr` is the same in each process."""
     data = tree.node_data()
     return "*" if data is None else (_told(data), [_told_tree(child) for child in tree.children()])
 
@@ -190,7 +190,7 @@ def _told(x: object) -> object:
 
 
 def _remove_halves(folder: Path) -> None:
-    """Remove kernels whose writing a full disk cut short: one without its time of use stops JAX from keeping others."""
+    """Remove kernels that a full disk left incomplete: one without an `-atime` file keeps JAX from caching others."""
     with contextlib.suppress(OSError):
         for kernel in folder.glob("*-cache"):
             if not kernel.with_name(kernel.name.removesuffix("-cache") + "-atime").exists():
@@ -198,7 +198,7 @@ def _remove_halves(folder: Path) -> None:
 
 
 def _processor() -> str:
-    """A name that processors share if they run the same machine code."""
+    """Return a name that is the same for processors that run the same machine code."""
     with open("/proc/cpuinfo", encoding="utf-8", errors="replace") as file:
         first = [line for line in itertools.takewhile(str.strip, file) if line.partition("\t")[0] in _CPU_LINES]
     return f"{platform.machine()}-{hashlib.sha256(''.join(first).encode()).hexdigest()[:16]}"

@@ -1,6 +1,6 @@
-"""All that pathjax uses of JAX beyond its public interface, and what differs between JAX's versions.
+"""Everything that pathjax uses of JAX beyond its public interface, and the differences between JAX's versions.
 
-Tested with jax 0.7.2 to 0.12: a new version is met here.
+Tested with jax 0.7.2 to 0.12. Adaptations to a new version belong here.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ __all__ = [
     "while_parts",
 ]
 
-# Primitives that only call a program of other primitives, and the parameter that holds it.
+# Primitives that only call another program -> the parameter that holds that program.
 _CALLS = {
     "jit": "jaxpr",
     "pjit": "jaxpr",  # until jax 0.8
@@ -54,14 +54,15 @@ _CALLS = {
     "custom_vmap_call": "call",
 }
 Class = TypeVar("Class", bound=type)
-func: Any = func_dialect  # its annotations leave out what its classes inherit
+func: Any = func_dialect  # its annotations omit inherited members
 
 
 def register_dataclass(cls: Class) -> Class:
-    """What `jax.tree_util.register_dataclass` does: a pytree whose fields are children, but the static ones.
+    """Register a dataclass as a pytree whose non-static fields are children, like `jax.tree_util.register_dataclass`.
 
-    There, structures of two dataclasses with equal fields are equal since JAX 0.8. Their hashes differ, but tables of
-    hashes compare seven bits of them: one pair in 128 shares a kernel, and disks are searched as rectangles.
+    With JAX's function, since JAX 0.8, tree structures of two dataclasses with equal fields compare equal. Their hashes
+    differ, but hash tables compare seven bits of them: one pair in 128 shares a kernel, and disks are intersected as
+    rectangles.
     """
     static = [f.name for f in fields(cls) if f.metadata.get("static")]
     data = [f.name for f in fields(cls) if f.name not in static]
@@ -75,7 +76,7 @@ def register_dataclass(cls: Class) -> Class:
         return list(zip(keys, children, strict=True)), about
 
     def unflatten(about, children):
-        x = object.__new__(cls)  # unchecked, as JAX puts other things in the place of arrays
+        x = object.__new__(cls)  # without checks, as JAX puts other objects in place of arrays
         for name, value in zip(data + static, (*children, *about), strict=True):
             object.__setattr__(x, name, value)
         return x
@@ -85,22 +86,26 @@ def register_dataclass(cls: Class) -> Class:
 
 
 def aval_of(shape: tuple[int, ...], dtype):
-    """What a primitive says of an array that it gives."""
+    """Return the abstract value of a primitive's result."""
     return jax.core.ShapedArray(shape, dtype)
 
 
 def is_traced(x) -> bool:
-    """Whether x stands for a value that is not known yet, within `jax.jit` or a transformation."""
+    """Return whether x is a tracer, of `jax.jit` or another transformation."""
     return isinstance(x, jax.core.Tracer)
 
 
 def is_symbolic_zero(x) -> bool:
-    """Whether x is what `custom_jvp(symbolic_zeros=True)` gives for a tangent that is zero."""
+    """Return whether x is the zero tangent that `custom_jvp(symbolic_zeros=True)` passes."""
     return isinstance(x, SymbolicZero)
 
 
 def program_of(f, *args) -> tuple[ClosedJaxpr, list]:
-    """A function of flat arguments as a program without constants, and what it closes over, its first inputs."""
+    """Trace a function of flat arguments.
+
+    Returns:
+        The program, without constants, and the arrays that the function closes over, which are its first inputs.
+    """
     traced = jax.make_jaxpr(f)(*args)
     consts = traced.consts
 
@@ -111,9 +116,9 @@ def program_of(f, *args) -> tuple[ClosedJaxpr, list]:
 
 
 def called_program(eqn) -> ClosedJaxpr | None:
-    """What an equation calls, if calling a program is all that it does."""
+    """Return the program that an equation calls; None: the equation is not a plain call."""
     name = eqn.primitive.name
-    if name == "call_hi_primitive":  # jax 0.12: what it writes in other primitives
+    if name == "call_hi_primitive":  # jax 0.12: defined by other primitives
         return jax.make_jaxpr(partial(eqn.primitive.to_lojax, **eqn.params))(*(v.aval for v in eqn.invars))
     if name not in _CALLS:
         return None
@@ -122,7 +127,7 @@ def called_program(eqn) -> ClosedJaxpr | None:
 
 
 def call_of_identity(context: mlir.LoweringRuleContext, value: ir.Value) -> list[ir.Value]:
-    """Lower a value to what a function gives back, which XLA keeps as a call: no fusion reaches across it."""
+    """Lower a value to a call of the identity that XLA does not inline, so that nothing is fused across it."""
     module, types = context.module_context, [value.type]
     start = ir.InsertionPoint.at_block_begin(module.module.body)
     function = func.FuncOp("identity", (types, types), visibility="private", ip=start)
@@ -135,14 +140,20 @@ def call_of_identity(context: mlir.LoweringRuleContext, value: ir.Value) -> list
 
 
 def bytes_of_program(compiled) -> bytes:
-    """A compiled function of one device as bytes."""
+    """Serialise a compiled function of one device."""
     from jax.experimental.serialize_executable import serialize
 
     return serialize(compiled)[0]
 
 
 def program_of_bytes(content: bytes, arguments, result):
-    """The compiled function of such bytes, as it was called: a tuple of arguments, and something like its result."""
+    """Load a function from the bytes of `bytes_of_program`.
+
+    Args:
+        content: the bytes.
+        arguments: tuple of arguments of the same tree structure as when it was compiled.
+        result: a pytree of its result's structure.
+    """
     from jax.experimental.serialize_executable import deserialize_and_load
 
     trees = jax.tree.structure((arguments, {})), jax.tree.structure(result)
@@ -150,13 +161,13 @@ def program_of_bytes(content: bytes, arguments, result):
 
 
 def while_parts(eqn, values) -> tuple[list, list, list]:
-    """Values of a while loop: constants of the test, of the body, what is carried."""
+    """Split the values of a while loop into constants of the test, constants of the body, and carry."""
     n, m = eqn.params["cond_nconsts"], eqn.params["body_nconsts"]
     return values[:n], values[n : n + m], values[n + m :]
 
 
 def scan_parts(eqn, values) -> tuple[list, list, list]:
-    """Values of a scan: constants, what is carried, what is taken row by row."""
+    """Split the values of a scan into constants, carry, and arrays that are scanned over."""
     if "num_consts" in eqn.params:
         n, m = eqn.params["num_consts"], eqn.params["num_carry"]
     else:  # jax 0.12
@@ -165,16 +176,17 @@ def scan_parts(eqn, values) -> tuple[list, list, list]:
 
 
 def gathered(tree):
-    """What all processes give: a tree of arrays (processes, ...)."""
-    from jax.experimental import multihost_utils  # takes a moment, and one process never needs it
+    """Gather a pytree of arrays from all processes, each as (processes, ...)."""
+    from jax.experimental import multihost_utils  # slow to import, and a single process does not need it
 
     return multihost_utils.process_allgather(tree)
 
 
 def found_cluster(seconds: int) -> tuple[Any, Any, Any, Any]:
-    """What `jax.distributed.initialize` finds out by itself: address, processes, number of this one, its devices.
+    """Return the settings that `jax.distributed.initialize` detects; None: one that it cannot detect.
 
-    None: it does not know.
+    Returns:
+        address, number of processes, index of this process, its devices.
     """
     from jax._src.clusters import ClusterEnv
 

@@ -1,4 +1,4 @@
-"""A linear function that brings a transpose of its own: for maps that are cheap both ways, and by different means."""
+"""A linear function with a transpose of its own, for maps that are cheap both ways but by different methods."""
 
 from __future__ import annotations
 
@@ -16,13 +16,14 @@ linear_p.multiple_results = True
 
 
 def linear(f: Callable, transpose: Callable, known, x):
-    """f(known, x), linear in x, a pytree of arrays; its transpose is transpose(known, cotangent of the result).
+    """Return f(known, x), which is linear in x, a pytree of arrays.
 
-    JAX's transformations see a linear function: derivatives in x, their transposes, and those of the transpose work.
-    There are none in `known`. Under `jax.vmap` one call follows another.
+    Its transpose is transpose(known, cotangent of the result). JAX's transformations see a linear function: derivatives
+    in x, their transposes, and derivatives of the transpose work. Derivatives in `known` do not exist. `jax.vmap` runs
+    its calls one after another.
 
     Raises:
-        InputError: a derivative in `known` is asked for.
+        InputError: a derivative in `known` is requested.
     """
     known_leaves, known_tree = jax.tree.flatten(known)
     leaves, tree = jax.tree.flatten(x)
@@ -38,7 +39,7 @@ def linear(f: Callable, transpose: Callable, known, x):
 
 
 def _bind(f, transpose, known, leaves):
-    # As a program, so that JAX sees which devices it is for.
+    # Traced to a program, so that JAX sees which devices it uses.
     program, constants = program_of(lambda *inputs: f(inputs[: len(known)], inputs[len(known) :]), *known, *leaves)
     inputs = *constants, *known, *leaves
     sizes = len(constants), len(constants) + len(known)

@@ -1,7 +1,7 @@
-"""A function of one item over millions of them: on CPUs one native loop a device, elsewhere `vectorised` items.
+"""Map a function of one item over millions of items: one native loop per device on CPUs, `vectorised` chunks elsewhere.
 
-Where several processes have joined (`distributed`), the devices are those of all of them. Each holds all items, does
-its share, and gets all results, so that whatever comes before and after is the same program in each.
+Where several processes have joined (`distributed`), the devices of all of them are used. Each process holds all items,
+computes its share, and gets all results, so that the code before and after is the same program in each.
 """
 
 from __future__ import annotations
@@ -22,32 +22,34 @@ from pathjax.compile.rows import Rows
 from pathjax.compile.vectorised import most_lanes, vectorised, vectorised_sum
 from pathjax.compile.xla import native
 
-# Items that a native loop takes at once: enough that loops over them vectorise and their overheads vanish, few enough
-# that what they keep stays in the nearest caches. Of 64 to 512, 128 took least time in most scenes of the bench, and
-# 256 up to a tenth more. Few items would leave most of the lanes idle.
+# Lanes of a native loop: enough that loops over them vectorise and loop overhead vanishes, few enough that their state
+# stays in the nearest caches. Of 64 to 512, 128 was fastest in most scenes of the bench; 256 took up to a tenth longer.
+# Fewer lanes for few items, which would leave most of the lanes idle.
 _LANES, _FEW_LANES = 128, 64
 MANY_ITEMS = 2 * _LANES
-# Of a sum over items: so many for a part, so that few lanes wait for its last one; and bytes of the sums of all parts.
+# Sums over items: items per part, so that few lanes wait for its last item; and limits on the number of parts, and on
+# the bytes of the sums of all parts.
 ITEMS_OF_A_PART, MOST_PARTS, MOST_BYTES = 8192, 16, 1 << 26
-# On an accelerator items of a kernel may be cut in parts, so that there are some for each of its lanes.
+# On an accelerator the items of a kernel may be cut into parts, so that there are several for each of its lanes.
 _ITEMS_OF_A_LANE, _MOST_CUTS = 4, 16
 
 
 @usual_promotion
 def native_map(f: Callable, xs, *shared, form: str | None = None, devices: int | None = None):
-    """`f(x, *shared)` for every x of `xs`, on all devices.
+    """Return `f(x, *shared)` for every x of `xs`, computed on all devices.
+
+    Under `jax.vmap` each item loops over the batch, within the same kernel.
 
     Args:
         f: pure function of one item, with real control flow.
         xs: pytree of arrays (N, ...).
         shared: pytrees that every item sees whole.
-        form: "lanes" (one native loop a device over groups of items, see `lanes`), "loop" (the same, item by item),
-            "vmap" (as many vectorised items as fit into memory), or None: what suits the backend. All give the same
-            results up to rounding.
-        devices: how many devices of this process to use; None: all, of all processes, each of which calls it then.
+        form: "lanes" (one native loop per device over groups of items, see `lanes`), "loop" (the same, item by item),
+            "vmap" (as many vectorised items as fit into memory), or None: the one that suits the backend. All return
+            the same results up to rounding.
+        devices: number of devices of this process to use; None: all devices of all processes, which must all call it.
     Returns:
         pytree of arrays (N, ...); bitwise the same for every number of devices.
-    Under `jax.vmap` each item loops over the batch, within the same kernel.
     """
 
     @custom_vmap
@@ -83,18 +85,18 @@ def native_map(f: Callable, xs, *shared, form: str | None = None, devices: int |
 def native_fold(
     f: Callable, xs, *shared, start: Callable, finish: Callable, form: str | None = None, devices: int | None = None
 ):
-    """What all items together leave in memory that they share (`together`), on all devices.
+    """Accumulate all items into memory that they share (`together`), on all devices.
 
-    Items are dealt to parts, whose number depends on theirs alone. Each part has a memory of its own and is done by one
-    device, and parts are added up in their order: so the sums are bitwise the same for every number of devices.
+    Items are dealt to parts, whose number depends only on the number of items. Each part has its own memory and runs on
+    one device, and parts are summed in order: so the sums are bitwise the same for every number of devices.
 
     Args:
-        f: (x, *shared, memory) -> memory, of one item. An item of zeros leaves the memory as it is.
+        f: (x, *shared, memory) -> memory, of one item. An item of zeros must leave the memory unchanged.
         xs: pytree of arrays (N, ...), N > 0.
         shared: pytrees that every item sees whole.
         start: number of lanes -> memory before the first item.
-        finish: memory after the last item of a part -> pytree of arrays, which are added up.
-        form, devices: of `native_map`; "vmap" gives each item a memory of its own, as lanes do to each part.
+        finish: memory after the last item of a part -> pytree of arrays, which are summed over the parts.
+        form, devices: as in `native_map`; "vmap" gives each item its own memory, as lanes give each part its own.
     """
     form = _form(form)
     if form == "loop":
@@ -118,16 +120,18 @@ def native_fold(
 def native_rows(
     f: Callable, xs, *shared, start: Callable, finish: Callable, form: str | None = None, devices: int | None = None
 ):
-    """What every item leaves in a row of memory that is its own, as `native_fold` has it, and what it gives.
+    """Map items that each return a result and write rows of memory of their own, in parts as in `native_fold`.
+
+    `jax.vmap` runs its calls one after another.
 
     Args:
-        f: (x, number of the item, *shared, memory) -> (y, memory); items of a part are numbered from 0.
+        f: (x, index of the item in its part, *shared, memory) -> (y, memory).
         start: (number of lanes, number of items, *shared) -> memory before the first item.
         finish: memory after the last item of a part -> array (M, items, ...).
-        xs, shared, form, devices: of `native_fold`.
+        xs, shared, form, devices: as in `native_fold`.
     Returns:
-        y, a pytree of arrays (N, ...), and the M `Rows` of all items, as what takes one number of many items finds them
-        side by side. Under `jax.vmap` one call follows another.
+        y, a pytree of arrays (N, ...), and the M `Rows` of all items: a reader of one scalar per item finds the scalars
+        of neighbouring items side by side.
     """
     count = jax.tree.leaves(xs)[0].shape[0]
     form = _form(form)
@@ -170,14 +174,14 @@ def native_rows(
 
 
 def sum_of_parts(f: Callable, xs, *shared, devices: int | None = None):
-    """The sum of f(x, *shared) over the x of `xs`, each of which is much work; and what else it gives of each.
+    """Sum f(x, *shared) over the x of `xs`, each of which is much work, and stack its second results.
 
     Args:
-        f: pytrees of arrays x, *shared -> (what is added up, what is kept of each); its kernels have `devices=1`.
-        xs: pytree of arrays (parts, ...), dealt to the devices. Sums have their order, whatever the number of these.
-        devices: of `native_map`.
+        f: pytrees of arrays x, *shared -> (pytree to sum, pytree to stack); its kernels use `devices=1`.
+        xs: pytree of arrays (parts, ...), dealt to the devices. Parts are summed in order for every number of devices.
+        devices: as in `native_map`.
     Returns:
-        pytrees of arrays (...), (parts, ...).
+        The sums, a pytree of arrays (...), and the stacked results, a pytree of arrays (parts, ...).
     """
     used = _used(devices)
     xs, shared = jax.tree.map(jnp.asarray, (xs, shared))
@@ -213,10 +217,12 @@ def sum_of_parts(f: Callable, xs, *shared, devices: int | None = None):
 
 
 def _by_parts(part: Callable, xs, shared, devices: int | None, most: int = MOST_PARTS, total=None):
-    """part(items, lanes, shared) of all parts, one after another, added to the total: pytree of arrays.
+    """Run part(items, lanes, shared) for all parts, and add the results to the total in order: pytree of arrays.
 
-    total: None: nothing is added up, and the arrays are (parts, ...).
-    Item i belongs to part i % parts. Each device does some parts; how many there are depends on the items alone.
+    Item i belongs to part i % parts. Each device runs some parts; their number depends only on the number of items.
+
+    Args:
+        total: pytree of arrays; None: nothing is summed, and the results are stacked, (parts, ...).
     """
     count = jax.tree.leaves(xs)[0].shape[0]
     used = _used(devices)
@@ -242,13 +248,13 @@ def _by_parts(part: Callable, xs, shared, devices: int | None, most: int = MOST_
         return jax.tree.map(lambda x: x.swapaxes(0, 1).reshape(-1, *x.shape[2:])[:parts], results)
 
     def shares(x):
-        """Of the parts of one round, in their order, the share of the numbers that this device adds up."""
+        """Return, for each part of one round in order, the share of its scalars that this device sums."""
         share = -(-x.size // len(used))
         x = jnp.pad(x.ravel(), (0, share * len(used) - x.size)).reshape(len(used), share)
         return x if len(used) == 1 else lax.all_to_all(x, "device", 0, 0)
 
     def share_of_sum(xs, *shared):
-        """Parts that are not kept till all are done need far less memory."""
+        """Add up the parts of each round at once: keeping all parts until the end would take far more memory."""
 
         def step(totals, xs):
             found = jax.tree.map(shares, part(xs, width, shared))
@@ -262,7 +268,7 @@ def _by_parts(part: Callable, xs, shared, devices: int | None, most: int = MOST_
 
 
 def cuts(count: int, form: str | None = None) -> int:
-    """In how many parts an item is best cut, of so many: a lane of an accelerator needs items to go on with."""
+    """Return the number of parts to cut each of `count` items into: a lane of an accelerator needs several items."""
     return 1 if _form(form) != "vmap" else min(-(-_ITEMS_OF_A_LANE * most_lanes() // max(count, 1)), _MOST_CUTS)
 
 
@@ -271,7 +277,7 @@ def _form(form: str | None) -> str:
 
 
 def _bytes(made: Callable) -> int:
-    """Size of the arrays that a function makes."""
+    """Return the bytes of the arrays that a function returns."""
     return sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(jax.eval_shape(made)))
 
 
@@ -280,10 +286,11 @@ def _used(devices: int | None) -> list[jax.Device]:
 
 
 def _dealt(f: Callable, used: list[jax.Device], xs, shared):
-    """f(xs, *shared) on each of the devices, of its own row of xs: both pytrees of arrays (devices, ...)."""
+    """Run f(x, *shared) on each device, with its row x of xs. xs and results are pytrees of arrays (devices, ...)."""
     if len(used) == 1:
         return jax.tree.map(lambda y: y[None], f(jax.tree.map(lambda x: x[0], xs), *shared))
-    # A process that holds a part of an array could do nothing with it but what all others do at the same time.
+    # Across processes, results are gathered to each: a process that held only its part of an array could use the array
+    # only in operations that all processes run at the same time.
     alone = all(device.process_index == jax.process_index() for device in used)
 
     def on_one_device(xs, *shared):
@@ -308,7 +315,7 @@ def _map(f, xs, shared, form, devices):
     used = _used(devices)
     each = -(-count // len(used))
     run = {
-        # By the items of all devices, so that their number does not change the program.
+        # By the items of all devices, so that the number of devices does not change the program.
         "lanes": partial(_lanes, width=_LANES if count >= MANY_ITEMS else _FEW_LANES),
         "loop": _loop,
         "vmap": vectorised,
@@ -331,9 +338,12 @@ def _map(f, xs, shared, form, devices):
 
 
 def split_map(f: Callable, count: int, *shared, devices: int | None = None):
-    """`f(first, size, *shared)` -> (..., size), for runs of `count` columns, one run a device; joined, (..., count).
+    """Split `count` columns into one run per device, call `f(first, size, *shared)` -> (..., size) for each, and join.
 
-    For arithmetic on whole arrays that every device holds: each computes a part of the columns.
+    For arithmetic on whole arrays that every device holds: each device computes a part of the columns.
+
+    Returns:
+        array (..., count).
     """
     used = _used(devices)
     size = -(-count // len(used))

@@ -1,6 +1,6 @@
-"""What code of one item may say to `lanes`: six primitives, with all rules that JAX's transformations need.
+"""Primitives by which code of one item controls `lanes`, with all rules that JAX's transformations need.
 
-Five change no result, and outside of lanes they do next to nothing. `together` changes what all items share.
+`together` updates memory that all items share. The others change no result, and do next to nothing outside of lanes.
 """
 
 from __future__ import annotations
@@ -40,30 +40,30 @@ together_p.multiple_results = True
 
 
 def compute_once(values):
-    """A pytree of arrays, whose consumers all read one result.
+    """Return a pytree of arrays as it is, but computed once, however many consumers read it.
 
-    XLA fuses what is computed into each of its consumers, so a value that five results share is computed five times.
-    In lanes it is not; elsewhere this is `lax.optimization_barrier`. A value that is computed by few operations, or
-    that has one consumer, is better left to XLA: what is computed once is written to memory and read back.
+    XLA fuses a computation into each of its consumers, so a value that five results share is computed five times. This
+    prevents it in lanes; elsewhere it is `lax.optimization_barrier`. A value that takes few operations, or that has one
+    consumer, is better left to XLA: a value that is computed once is written to memory and read back.
     """
     leaves, structure = jax.tree.flatten(values)
     return jax.tree.unflatten(structure, compute_once_p.bind(*leaves) if leaves else [])
 
 
 def basis(count: int, dtype):
-    """Tangents (count, count) of as many numbers, one after another: the identity.
+    """Return the identity (count, count): one unit tangent per row, for that many scalars.
 
-    `jax.vmap` pushes them through a function all at once. Lanes know the zeros, and compute nothing of what is zero
-    because of them: so the tangent of a number costs only what depends on the number. In a function that has a
-    `persistent_loop` it stands in the loop's body.
+    `jax.vmap` pushes the rows through a function all at once. Lanes know the zeros, and skip whatever is zero because
+    of them: so the tangent of a scalar costs only the operations that depend on the scalar. In a function that has a
+    `persistent_loop`, call it in the loop's body.
     """
     return basis_p.bind(count=count, dtype=np.dtype(dtype))
 
 
 def one_by_one(f: Callable) -> Callable:
-    """f, which lanes run for one after another of those that are in the branch, or the loop, where it stands.
+    """Return f such that lanes run it one after another, for the lanes that are active where it is called.
 
-    For a search whose lanes would go different ways. Within it, JAX's control flow is real control flow.
+    For a search in which lanes would diverge. Inside f, JAX's control flow is real control flow.
     """
 
     def called(*args):
@@ -86,42 +86,42 @@ F = TypeVar("F", bound=Callable)
 
 @dataclass(frozen=True)
 class Search(Generic[F]):
-    """A search in parts, functions that may close over arrays. Its state is a pytree; of zeros, it is done."""
+    """A search given as functions that may close over arrays. Its state is a pytree; all zeros: the search is done."""
 
-    begin: F  # () -> state, of which `visit` does not come next
-    opens: F  # state -> whether `open` comes next
-    open: F  # state -> state: the usual step; leaves a search done that is done
-    visits: F  # state -> whether `visit` comes next; if neither does, the search is done
-    visit: F  # state -> state: a step that comes less often, or costs more
+    begin: F  # () -> state; `visit` must not be the next step
+    opens: F  # state -> whether `open` is the next step
+    open: F  # state -> state: the usual step; keeps a finished search finished
+    visits: F  # state -> whether `visit` is the next step; if neither is, the search is done
+    visit: F  # state -> state: a step that is rarer, or costs more
     result: F  # state -> results
 
 
 @dataclass(frozen=True)
 class Part:
-    """A function of a `Search` as a program, called with all inputs of the search and with its state."""
+    """A function of a `Search` as a program. It is called with all inputs of the search and its state."""
 
     program: ClosedJaxpr
-    places: tuple[int, ...]  # of the inputs that it reads
+    places: tuple[int, ...]  # indices of the inputs that it reads
 
     @cached_property
     def _once(self) -> Callable:
-        """The program as one function of XLA's, however many slots call it: traced once, and once lowered."""
+        """The program as one jitted function: traced and lowered once, however many slots call it."""
         return jax.jit(jaxpr_as_fun(self.program))
 
     def __call__(self, inputs, *state):
         return self._once(*(inputs[place] for place in self.places), *state)
 
     def reads(self) -> list[int]:
-        """Which of the arrays of the state it reads."""
+        """Return the indices of the arrays of the state that it reads."""
         jaxpr = self.program.jaxpr
         read = {id(v) for v in [*jaxpr.outvars, *(v for eqn in jaxpr.eqns for v in eqn.invars)]}
         return [k for k, v in enumerate(jaxpr.invars[len(self.places) :]) if id(v) in read]
 
 
 def interleaved(search: Search):
-    """Results of a search, of which lanes run several at once, as each alone waits for memory most of the time.
+    """Run a search and return its results; lanes run several at once, as a single one mostly waits for memory.
 
-    In all else it is what `one_by_one` makes of a function that runs the search.
+    Otherwise it is like `one_by_one` of a function that runs the search.
     """
     inputs: list[Any] = []
     state: list[jax.ShapeDtypeStruct] = []
@@ -160,30 +160,32 @@ def _search_alone(search: Search[Part], inputs):
 
 
 def persistent_loop(test: Callable, body: Callable, state):
-    """`lax.while_loop`, from which each lane goes on to its next item, instead of waiting for the longest.
+    """Run `lax.while_loop` such that a lane that leaves it begins its next item instead of waiting for other lanes.
 
-    For the loop that most of an item's work consists of. Lanes do so where it stands in the item's function itself, not
-    within other control flow, and once; otherwise it is an ordinary loop. What stands before it is done when a lane
-    begins an item, what stands after it when the lane is done with it, both for one lane alone: so both are short.
+    For the loop that holds most of an item's work. It must stand in the item's function itself, and only once; within
+    other control flow it is an ordinary loop. The code before it runs when a lane begins an item, the code after it
+    when the lane ends the item, both for a single lane at a time: so keep both short.
     """
     return lax.while_loop(lambda state: persistent_test_p.bind(jnp.asarray(test(state))), body, state)
 
 
 def unset(values):
-    """A pytree of arrays that a persistent_loop begins with, and its body sets before it reads them.
+    """Mark a pytree of arrays as initial values of a persistent_loop that its body overwrites before it reads them.
 
-    A lane that takes its next item need not write them: there it finds what the last one left.
+    A lane that begins its next item then does not write them: they keep the values of its last item.
     """
     return jax.tree.map(unset_p.bind, values)
 
 
 def together(f: Callable) -> Callable:
-    """f(memory, here, values) -> memory, called by one item as (memory, values), and by lanes once for all of them.
+    """Return a function (memory, values) -> memory of one item, for which lanes call f once for all of them.
 
-    Memory is a pytree of arrays that items share, like a table to which each of them adds: the only thing by which one
-    item may leave anything to another. f gets the flags (W,) of the lanes that hold an item, and the values, numbers of
-    an item, as (W,) arrays. It stands in the body of a `persistent_loop` that carries the memory, and in no branch; see
-    `lanes`. Outside of lanes an item is the only lane.
+    Memory is a pytree of arrays that items share, like a table to which each of them adds: the only way to pass data
+    from one item to another. The call must stand in the body of a `persistent_loop` that carries the memory, and not in
+    a branch; see `lanes`. Outside of lanes an item is the only lane.
+
+    Args:
+        f: (memory, mask (W,) of the lanes that hold an item, values of all lanes (W, ...)) -> memory.
     """
 
     def called(memory, values):
@@ -204,7 +206,7 @@ def together(f: Callable) -> Callable:
 
 
 def _once_each(values):
-    """The same of tangents or cotangents, of which some are known to be zero."""
+    """Apply `compute_once` to tangents or cotangents, except symbolic zeros."""
     there = [value for value in values if type(value) is not ad.Zero]
     results = iter(compute_once_p.bind(*there) if there else ())
     return [value if type(value) is ad.Zero else next(results) for value in values]
@@ -219,7 +221,7 @@ batching.primitive_batchers[compute_once_p] = lambda values, axes: (compute_once
 ad.primitive_jvps[compute_once_p] = lambda primals, tangents: (compute_once_p.bind(*primals), _once_each(tangents))
 ad.primitive_transposes[compute_once_p] = lambda cotangents, *primals: _once_each(cotangents)
 
-# What lanes make of it, column by column: a barrier that fusion sees, where XLA's own is gone before.
+# Lanes lower compute_once to this, column by column: a barrier that is still there at fusion, unlike XLA's own.
 column_p.def_impl(jnp.asarray)
 column_p.def_abstract_eval(lambda column: column)
 mlir.register_lowering(column_p, call_of_identity)
@@ -248,7 +250,7 @@ def _one_by_one_batch(inputs, axes, *, program, search):
 
 
 def _one_by_one_jvp(primals, tangents, *, program, search):
-    """Tangents come from a program of their own, linear in those of the inputs, so that it transposes."""
+    """Compute tangents by a separate program that is linear in the tangents of the inputs, so that it transposes."""
     moves = [type(tangent) is not ad.Zero for tangent in tangents]
     smooth = [np.issubdtype(aval.dtype, np.inexact) for aval in program.out_avals]
 
@@ -300,7 +302,7 @@ ad.primitive_transposes[one_by_one_p] = _one_by_one_transpose
 
 # ---- persistent_loop ------------------------------------------------------------------------------------------------
 
-# Stands behind the test of the loop, a bool: so JAX's own rules of loops transform it, and it has no derivative.
+# Applied to the loop's test, a bool: so JAX's own rules for loops transform the loop, and it needs no derivative.
 persistent_test_p.def_impl(jnp.asarray)
 persistent_test_p.def_abstract_eval(lambda goes_on: goes_on)
 mlir.register_lowering(persistent_test_p, lambda context, goes_on: [goes_on])
@@ -324,12 +326,12 @@ def _alone(*inputs, f, shared):
 
 
 def _together_batch(inputs, axes, **params):
-    """Under `jax.vmap` no item shares its memory with others."""
+    """Give each item of `jax.vmap` a memory of its own."""
     outputs = jax.vmap(lambda *inputs: _alone(*inputs, **params), axes)(*inputs)
     return outputs, [0] * len(outputs)
 
 
-# Derivatives are made of it, and it has none.
+# It is used to compute derivatives and has none itself.
 together_p.def_impl(_alone)
 batching.primitive_batchers[together_p] = _together_batch
 together_p.def_abstract_eval(lambda *avals, f, shared: avals[:shared])

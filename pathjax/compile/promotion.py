@@ -1,4 +1,4 @@
-"""JAX's promotion of dtypes and ranks, as pathjax's own code expects it."""
+"""JAX's default promotion of dtypes and ranks, which pathjax's own code relies on."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ R = TypeVar("R")
 
 
 def usual_promotion(f: Callable[P, R]) -> Callable[P, R]:
-    """f, within which JAX promotes dtypes and ranks as by default: what the user forbids is meant for the user's code.
+    """Return f with JAX's default promotion inside: a stricter setting of the user's is meant for the user's code.
 
-    For what is called from outside, and for what JAX calls later, such as rules of differentiation.
+    For public functions, and for functions that JAX calls later, such as differentiation rules.
     """
 
     @wraps(f)

@@ -1,4 +1,4 @@
-"""Calls of one kernel beside each other, each on a thread of its own."""
+"""Concurrent calls of one kernel, each on a thread of its own."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from pathjax.compile.promotion import usual_promotion
 
 
 def calls_at_once() -> int:
-    """How many calls of one kernel run at a time: on CPUs, where a call keeps its thread, one for each device."""
+    """Return how many calls of one kernel run at a time: one per device on CPUs, where a call occupies its thread."""
     return len(jax.local_devices()) if jax.default_backend() == "cpu" else 1
 
 
 def devices_of_a_call() -> int:
-    """`devices` of `native_map` in a kernel for `concurrently`: one of a CPU runs on the thread that calls it."""
+    """Return `devices` of `native_map` in a kernel for `concurrently`: 1 on CPUs, as it runs on the calling thread."""
     return 1 if jax.default_backend() == "cpu" else len(jax.local_devices())
 
 
 def concurrently(f: Callable, items: Iterable) -> Iterator[tuple]:
-    """Pairs (item, f(item)) in the order of the items, `calls_at_once` of them at a time, each in a thread of its own.
+    """Yield pairs (item, f(item)) in the order of the items, running `calls_at_once` calls, each in its own thread.
 
-    So no device waits for another, nor for what is done with the results. Of the items, a few more are taken than
-    results are given. Closed early, it waits for the calls that run.
+    So no device waits for another, nor for the consumer of the results. It takes up to 2 `calls_at_once` more items
+    than it has yielded results. Closed early, it cancels the calls that have not begun and waits for those that run.
     """
     workers = calls_at_once()
     waiting: deque[tuple] = deque()
@@ -33,7 +33,7 @@ def concurrently(f: Callable, items: Iterable) -> Iterator[tuple]:
         try:
             for item in items:
                 waiting.append((item, pool.submit(usual_promotion(f), item)))
-                # One that is ready for each thread, and one whose result is being used.
+                # Per thread, one that runs and one that is ready.
                 if len(waiting) > 2 * workers:
                     done, result = waiting.popleft()
                     yield done, result.result()

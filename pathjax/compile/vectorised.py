@@ -1,10 +1,10 @@
-"""The form for accelerators: `vmap` over items, which leaves whole what they share.
+"""The form for accelerators: `vmap` over items, without copies of the arrays that items share.
 
-JAX's own rule of a conditional whose lanes differ gives each lane a copy of every operand, of the tables that a branch
-looks things up in too: 3 MB a lane for a mesh of 70,000 triangles. Here both branches read the one table.
+JAX's own batching rule for a conditional whose lanes differ gives each lane a copy of every operand, including tables
+that a branch reads: 3 MB per lane for a mesh of 70,000 triangles. Here both branches read the one table.
 
-As many items are under way as fit into memory, each in a lane. A lane that leaves a `persistent_loop` takes another
-item, so that those that are done do not wait for the longest.
+As many items run at once as fit into memory, each in a lane. A lane that leaves a `persistent_loop` takes another item,
+so that lanes do not wait for the longest item.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ from pathjax.compile.lanes.dataflow import differing_in, find_persistent_loop, v
 from pathjax.compile.primitives import one_by_one_p
 from pathjax.system import memory
 
-# Lanes that occupy an accelerator, the threads that an H100 holds; and that stay in the caches of a CPU.
+# Lanes that fill an accelerator, as many as an H100 holds threads; lanes whose values stay in the caches of a CPU.
 MOST_LANES, MOST_LANES_OF_CPU = 1 << 18, 1 << 10
-# The share of memory that lanes may take at most, as what is live of a program is an estimate, and others need some;
-# and memory, where nobody says how much there is.
+# Lanes may take 1 / _SHARE of memory, as the live bytes are an estimate and others need memory, too; _MEMORY is the
+# memory that is assumed where its size is unknown.
 _SHARE, _MEMORY = 8, 1 << 33
-# One lane in so many may be idle before they begin other items, which costs all of them a little.
+# One lane in so many may be idle before idle lanes begin other items, which costs all lanes a little.
 _IDLE = 8
 
 
 def vectorised(f: Callable, xs, shared):
-    """`f(x, *shared)` for every x of `xs`, pytrees of arrays (N, ...)."""
+    """Return `f(x, *shared)` for every x of `xs`; both are pytrees of arrays (N, ...)."""
     rows, (program, consts, structure) = jax.tree.leaves(xs), _program(f, xs, shared)
     count, width = len(rows[0]), lanes_at_once(program, len(consts))
     differ = differing_in(program, [False] * len(consts) + [True] * len(rows))
@@ -50,7 +50,7 @@ def vectorised(f: Callable, xs, shared):
 
 
 def vectorised_sum(f: Callable, xs, shared):
-    """The sum of f over all items, and over items of zeros, which fill the last chunk up."""
+    """Return the sum of f over all items, and over items of zeros, which fill up the last chunk."""
     program, consts, structure = _program(f, xs, shared)
     rows = jax.tree.leaves(xs)
 
@@ -67,13 +67,13 @@ def most_lanes() -> int:
 
 
 def lanes_at_once(program: ClosedJaxpr, consts: int = 0) -> int:
-    """How many items of a program are under way, as memory allows; of its inputs, the first `consts` are shared."""
+    """Return how many items of a program run at once, as memory allows; its first `consts` inputs are shared."""
     fit = (memory.limit() or _MEMORY) // _SHARE // max(live_bytes(program, consts), 1)
     return max(min(fit, most_lanes()), 1)
 
 
 def live_bytes(program: ClosedJaxpr, consts: int = 0) -> int:
-    """Bytes of the values of one item that are live at once, at most: as if nothing were fused or updated in place."""
+    """Return the most bytes of one item's values that are live at once if nothing is fused or updated in place."""
     jaxpr = program.jaxpr
     last = {v: k for k, eqn in enumerate(jaxpr.eqns) for v in variables(eqn.invars)}
     last |= dict.fromkeys(variables(jaxpr.outvars), len(jaxpr.eqns))
@@ -101,7 +101,11 @@ def live_bytes(program: ClosedJaxpr, consts: int = 0) -> int:
 
 
 def _program(f: Callable, xs, shared):
-    """f of one item as a program, what it closes over, which are its first inputs, and the structure of its results."""
+    """Trace f of one item.
+
+    Returns:
+        The program, the arrays that f closes over, which are its first inputs, and the tree structure of its results.
+    """
     item, structure = jax.tree.flatten(jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), xs))
     result = None
 
@@ -110,7 +114,7 @@ def _program(f: Callable, xs, shared):
         outputs, result = jax.tree.flatten(f(jax.tree.unflatten(structure, leaves), *shared))
         return outputs
 
-    # Some accelerators round the factors of a product of matrices to 10 bits unless they are told not to.
+    # By default some accelerators round the factors of a matrix product to 10 bits.
     with jax.default_matmul_precision("highest"):
         return *program_of(flat, *item), result
 
@@ -120,7 +124,7 @@ def _at_once(program, consts, rows) -> list:
 
 
 def _chunks(rows: list, width: int, more: list) -> list:
-    """The rows by chunk: chunks of one size, of at most `width` items, the last one filled up with the item `more`."""
+    """Split rows into chunks of one size, of at most `width` items; the last one is filled up with the item `more`."""
     count = len(rows[0])
     chunks = -(-count // width)
     each = -(-count // chunks)
@@ -145,7 +149,7 @@ def _from_queue(program, place: int, differ: Callable, consts, rows, width: int)
 
     first = begun(*(x[0] for x in rows))
     common = {v: x for v, x in first.items() if v not in loop.outvars and not differ([v])[0]}
-    # What a lane keeps of its item: what is made of it before the loop and read later, then what the loop carries.
+    # State of a lane: values of its item that are computed before the loop and read later, then the loop's carry.
     read_later = variables_read_by(after) | variables([*test_consts, *body_consts, *jaxpr.outvars])
     own = [v for v in first if v in read_later and v not in common and v not in loop.outvars]
     kept = [*own, *loop.outvars]
@@ -167,7 +171,7 @@ def _from_queue(program, place: int, differ: Callable, consts, rows, width: int)
     def refill(state):
         """Store the results of lanes that do not go on, and begin the next items in them."""
         following, item, on, lanes, results = state
-        row = jnp.where(on, count, item)  # a lane without an item, too, writes beyond the last one
+        row = jnp.where(on, count, item)  # lanes without an item write past the end, too
         results = [x.at[row].set(y, mode="drop") for x, y in zip(results, ended(lanes), strict=True)]
         number = jnp.minimum(following + jnp.cumsum(~on, dtype=jnp.int32) - 1, count)
         item = jnp.where(on, item, number)
@@ -191,7 +195,7 @@ def _from_queue(program, place: int, differ: Callable, consts, rows, width: int)
 
 
 def _inputs(program, inputs) -> dict:
-    """Values by variable, before a program's first equation."""
+    """Return the values by variable before a program's first equation."""
     jaxpr = program.jaxpr
     return dict(zip([*jaxpr.constvars, *jaxpr.invars], [*program.consts, *inputs], strict=True))
 
@@ -201,7 +205,7 @@ def _values(known: dict, atoms) -> list:
 
 
 def _run(eqns, known: dict) -> dict:
-    """The values, and results of equations, whose conditionals are those of `_switch`."""
+    """Return the values together with the results of equations, with `_switch` for conditionals."""
     known = dict(known)
     for eqn in eqns:
         known |= zip(eqn.outvars, _apply(eqn, _values(known, eqn.invars)), strict=True)
@@ -209,7 +213,7 @@ def _run(eqns, known: dict) -> dict:
 
 
 def _evaluate(program, *inputs) -> list:
-    """Results of a program."""
+    """Return the results of a program."""
     return _values(_run(program.jaxpr.eqns, _inputs(program, inputs)), program.jaxpr.outvars)
 
 
@@ -240,7 +244,7 @@ def _apply(eqn, inputs) -> list:
 
 
 def _switch(branches, which, operands) -> list:
-    """`lax.switch`; where lanes differ all branches run, and each lane picks its results."""
+    """Run `lax.switch`; where lanes differ, all branches run, and each lane picks its results."""
 
     @custom_vmap
     def switch(which, *operands):
@@ -261,6 +265,6 @@ def _switch(branches, which, operands) -> list:
 
 
 def _pick(which, cases):
-    """The rows that lanes take, each of one of the cases (N, ...)."""
+    """Pick, for each lane, its row of one of the cases (N, ...)."""
     shape = (len(which),) + (1,) * (cases[0].ndim - 1)
     return lax.select_n(jnp.broadcast_to(which.reshape(shape), cases[0].shape), *cases)

@@ -1,12 +1,13 @@
-"""From a function of one item to the same function of many lanes, every number of an item in a register of its own.
+"""Transform a function of one item into a function of many lanes, with every component of an item in its own register.
 
 `jax.vmap` puts an axis in front of each array: the x of two points then lie three apart, and stacking them costs
 branches, so that LLVM vectorises little. This transformation keeps the components of every small array apart, each an
 array (W,) over the lanes. Structure (stack, slice, reshape) then costs nothing, arithmetic is SIMD across the lanes,
-and what all lanes share stays shared. Branches become selections; a loop goes on until its last lane is done, but a
-`persistent_loop` is left by lanes one by one, each for the next item.
+and values that all lanes share stay shared. Branches become selects; a loop runs until its last lane is done, but lanes
+leave a `persistent_loop` one by one, each for its next item.
 
-README.md beside this file shows a function, its program and what lanes make of it, and says what of XLA this relies on.
+README.md beside this file shows a function, its program and its lane program, and lists the behaviour of XLA that this
+relies on.
 """
 
 from __future__ import annotations
@@ -26,16 +27,18 @@ __all__ = ["lanes"]
 
 
 def lanes(f: Callable, width: int, memory=None) -> Callable:
-    """f(x, *shared) of any number of items x, `width` at a time.
+    """Return a function that runs f(x, *shared) for any number of items x, `width` at a time.
 
     Args:
-        memory: of `together`, a pytree of arrays. f is then (x, *shared, memory) -> (y, memory), where its persistent
-            loop, which has no end that all items know, carries the memory.
+        f: function of one item.
+        width: W, the number of lanes.
+        memory: the memory of `together`, a pytree of arrays; None: there is none. With memory, f is (x, *shared,
+            memory) -> (y, memory), and its persistent loop, whose test must depend on the item, carries the memory.
     Returns:
-        function of xs, a pytree of arrays (N, ...), and of what all items share, to pytrees of arrays (N, ...), and to
-        the memory after all items, where there is one.
+        function (xs, *shared) -> ys, or (ys, memory after all items) with memory; xs and ys are pytrees of arrays
+        (N, ...).
     Raises:
-        ValueError: f holds two persistent loops.
+        ValueError: f holds two persistent loops, or memory is given and f holds none.
     """
     memories = len(jax.tree.leaves(memory))
 
@@ -63,7 +66,7 @@ def lanes(f: Callable, width: int, memory=None) -> Callable:
 
 @contextlib.contextmanager
 def without_collections() -> Iterator[None]:
-    """Tracing makes many objects that stay, through all of which Python's collector would go time and again."""
+    """Pause Python's garbage collector: tracing creates many lasting objects, which it would scan again and again."""
     enabled = gc.isenabled()
     gc.disable()
     try:

@@ -1,4 +1,4 @@
-"""Values of lanes: a jax array that all share, or a NumPy array of objects, the components, each (W,) or ()."""
+"""Values of lanes: a jax array that all lanes share, or a NumPy object array of components, each (W,) or ()."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from jax import lax
 
 
 def differs(value) -> bool:
-    """Whether lanes hold values of their own."""
+    """Return whether lanes hold values of their own."""
     return isinstance(value, np.ndarray) and value.dtype == object
 
 
 def as_components(shape, items) -> np.ndarray:
-    """An array of this shape of objects, which NumPy would take apart."""
+    """Return an object array of this shape, without NumPy's taking the items apart."""
     flat = np.empty(math.prod(shape), object)
     for place, item in enumerate(items):
         flat[place] = item
@@ -25,7 +25,7 @@ def as_components(shape, items) -> np.ndarray:
 
 @functools.cache
 def known_zero(dtype: np.dtype) -> np.generic:
-    """The component that stands for what is known to be zero: this very object, elsewhere a number as any other."""
+    """Return the component that marks a known zero, by its identity; outside of lanes it is an ordinary number."""
     return dtype.type(0)
 
 
@@ -34,14 +34,14 @@ def is_known_zero(item) -> bool:
 
 
 def split(x) -> np.ndarray:
-    """(W, ...) -> components (...)."""
+    """Split an array (W, ...) into components (...)."""
     columns = x.reshape(len(x), -1)
     items = [lax.index_in_dim(columns, k, 1, keepdims=False) for k in range(columns.shape[1])]
     return as_components(x.shape[1:], items)
 
 
 def join(value, width):
-    """Components (...), or what is shared, -> (W, ...)."""
+    """Join components (...), or broadcast a shared value, to an array (W, ...)."""
     if not differs(value):
         return jnp.broadcast_to(value, (width, *jnp.shape(value)))
     columns = [jnp.broadcast_to(item, (width,)) for item in value.flat]
@@ -49,7 +49,7 @@ def join(value, width):
 
 
 def components(value) -> np.ndarray:
-    """Components of any value, those of a shared one being ()."""
+    """Return the components of any value; those of a shared value are ()."""
     if differs(value):
         return value
     if not np.shape(value):
@@ -59,16 +59,16 @@ def components(value) -> np.ndarray:
 
 
 def entry(x, index):
-    """x[index] for an index () inside: one contiguous load. (Unsigned ones are clamped in two instructions.)"""
+    """Return x[index] for an in-range index (): one contiguous load. (Unsigned ones are clamped in 2 instructions.)"""
     return lax.dynamic_index_in_dim(x, jnp.asarray(index, jnp.uint32), keepdims=False, allow_negative_indices=False)
 
 
 def with_entry(x, value, index):
-    """x whose entry at an index () inside is the value."""
+    """Return x with its entry at an in-range index () set to the value."""
     return lax.dynamic_update_index_in_dim(x, value, index, 0, allow_negative_indices=False)
 
 
 def gathered(column, indices):
-    """(W,) entries of a column (N,)."""
+    """Gather entries (W,) of a column (N,)."""
     dimensions = lax.GatherDimensionNumbers(offset_dims=(), collapsed_slice_dims=(0,), start_index_map=(0,))
     return lax.gather(column, indices[:, None], dimensions, (1,), mode="clip")

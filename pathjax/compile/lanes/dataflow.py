@@ -1,4 +1,4 @@
-"""Which values of a program may differ between lanes."""
+"""Analysis of which values of a program may differ between lanes."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def variables_read_by(eqns) -> set:
 
 
 def differing_in(program: ClosedJaxpr, inputs_differ: list[bool]) -> Callable:
-    """A function from atoms of a program to whether each may differ between lanes, if these inputs do."""
+    """Return a function that tells for atoms of a program whether each may differ between lanes if these inputs do."""
     differing = {v for v, d in zip(program.jaxpr.invars, inputs_differ, strict=True) if d}
 
     def differ(atoms) -> list[bool]:
@@ -67,7 +67,7 @@ def _while_outputs_differ(eqn, inputs_differ):
 
 
 def carried_memory(eqn) -> list[bool]:
-    """Whether what a while loop carries is the memory of `together`, which lanes share: of each value."""
+    """Return for each carried value of a while loop whether it is the memory of `together`, which lanes share."""
     body = eqn.params["body_jaxpr"].jaxpr
     changed = variables(v for e in body.eqns if e.primitive is together_p for v in e.outvars)
     return [not isinstance(v, Literal) and v in changed for v in body.outvars]
@@ -84,16 +84,17 @@ def _scan_outputs_differ(eqn, inputs_differ):
 
 
 def _fixpoint(step, flags: list[bool]) -> list[bool]:
-    """The least flags above these that `step` does not raise."""
+    """Raise flags by `step` until none changes."""
     while (raised := [a or b for a, b in zip(flags, step(flags), strict=True)]) != flags:
         flags = raised
     return flags
 
 
 def find_persistent_loop(program: ClosedJaxpr, differ: Callable) -> int | None:
-    """Number of the equation that is the `persistent_loop` of an item; None: there is none, or lanes leave it together.
+    """Return the index of the equation that is the `persistent_loop`; None: there is none, or lanes leave it together.
 
-    differ: of `differing_in`.
+    Args:
+        differ: result of `differing_in`.
     """
 
     def is_persistent(eqn):

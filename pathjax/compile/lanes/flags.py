@@ -13,9 +13,9 @@ _BITS = 32
 
 
 def packed(flags):
-    """Flags (W,) bool of lanes as bits of words (K,) uint32: bit b of word k is that of lane K b + k.
+    """Pack flags (W,) bool into the bits of words (K,) uint32: bit b of word k is the flag of lane K b + k.
 
-    Halves are laid upon each other, by SIMD: XLA reduces flags one by one.
+    It combines halves by SIMD, as XLA would reduce flags one by one.
     """
     count = -(-len(flags) // _BITS)
     words = jnp.pad(flags, (0, count * _BITS - len(flags))).astype(jnp.uint32)
@@ -26,16 +26,16 @@ def packed(flags):
 
 
 def any_set(words):
-    """() bool."""
+    """Return whether any flag is set, () bool."""
     return lax.reduce_or(words, (0,)) != 0
 
 
 def for_each_lane(words, act: Callable, state):
-    """act(lane, state) -> state, for one after another of the lanes whose flag is set in these words."""
+    """Apply act(lane, state) -> state to the lanes whose flag is set in these words, one after another."""
     count = len(words)
 
     def next_nonzero(k, word):
-        """Number and flags of the next word, from this one on, that is not 0, or of the last."""
+        """Return index and value of the first word from this one on that is not 0, or of the last word."""
 
         def is_empty(state):
             k, word = state

@@ -1,4 +1,4 @@
-"""Runs a program of one item on the values of many lanes."""
+"""An interpreter that runs a program of one item on the values of many lanes."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from pathjax.compile.lanes.dataflow import equation_outputs_differ, variables, v
 from pathjax.compile.lanes.primitive_rules import COMPONENTWISE, RULES, ZEROS
 from pathjax.compile.primitives import basis_p, column_p, compute_once_p, one_by_one_p, together_p
 
-# Rows of a table from which lanes select what they want; gathering is faster from more.
+# Most rows of a table from which lanes select; from more rows gathering is faster.
 SELECTED_ROWS = 8
 
 
@@ -45,10 +45,10 @@ class Interpreter:
 
     def __init__(self, width: int):
         self.width = width
-        # By id: what has been made to be computed once. JAX wants no tracer to outlive its function.
+        # id -> item that is computed once already. Weak, as no tracer may outlive its function.
         self.computed: WeakValueDictionary = WeakValueDictionary()
         self.occupied = None  # (W,) bool lanes that hold an item; None: all
-        self.active = None  # (W,) bool lanes whose results are read; None: all. In the others they may be anything.
+        self.active = None  # (W,) bool lanes whose results are read; None: all. Other lanes may hold anything.
 
     def run(self, program: ClosedJaxpr, inputs) -> list:
         jaxpr = program.jaxpr
@@ -57,7 +57,7 @@ class Interpreter:
         return [self.read(values, v) for v in jaxpr.outvars]
 
     def run_for(self, lanes, program: ClosedJaxpr, inputs) -> list:
-        """`run` where only some lanes (W,) bool, of the active ones, read the results."""
+        """Call `run` with only these lanes (W,) bool active, of those that are active."""
         outer = self.active
         self.active = lanes if outer is None else outer & lanes
         try:
@@ -67,7 +67,7 @@ class Interpreter:
 
     @staticmethod
     def initial_values(program: ClosedJaxpr, inputs) -> dict:
-        """Values by variable, before a program's first equation."""
+        """Return the values by variable before a program's first equation."""
         jaxpr = program.jaxpr
         return dict(zip([*jaxpr.constvars, *jaxpr.invars], [*program.consts, *inputs], strict=True))
 
@@ -79,7 +79,7 @@ class Interpreter:
         """Add the results of equations to the values. used: results that are read; None: all."""
         for eqn in eqns:
             wanted = [used is None or v in used for v in eqn.outvars]
-            # What an equation becomes is said to stand where it stands: profiles and errors name the code of one item.
+            # Operations get the source location of their equation, so that profiles and errors name code of one item.
             with source_info_util.user_context(eqn.source_info.traceback):
                 outputs = self.apply(eqn, [self.read(values, v) for v in eqn.invars], wanted)
             values |= zip(eqn.outvars, outputs, strict=True)
@@ -117,13 +117,13 @@ class Interpreter:
     # ---- arithmetic -------------------------------------------------------------------------------------------------
 
     def columnwise(self, op, *operands):
-        """op of numbers, each (W,) or () where shared."""
+        """Apply op to operands that are (W,), or () where shared."""
         if any(map(jnp.ndim, operands)):
             operands = [x if jnp.ndim(x) else jnp.broadcast_to(x, (self.width,)) for x in operands]
         return op(*operands)
 
     def componentwise(self, op, inputs, shape, zeros=None):
-        """op of each component; inputs have the shape or are single numbers. zeros: of `ZEROS`."""
+        """Apply op to each component; inputs have the shape or are scalars. zeros: a rule of `ZEROS`."""
 
         def component(*operands):
             known = zeros(*operands) if zeros is not None and any(map(is_known_zero, operands)) else None
@@ -138,7 +138,7 @@ class Interpreter:
         return as_components((count, count), [one if i == j else zero for i, j in np.ndindex(count, count)])
 
     def select(self, which, *cases):
-        """By the number `which`, components of one of the cases; what is the same in all stays as it is."""
+        """Select the components of case number `which`; components that are the same in all cases need no select."""
 
         def chosen(first, *others):
             same = all(other is first for other in others)
@@ -148,7 +148,7 @@ class Interpreter:
         return as_components(np.shape(cases[0]), list(map(chosen, *columns)))
 
     def rows_of_column(self, column, numbers):
-        """(W,) of a column (N,) that lanes share: selected from a few, which stay in registers, gathered from many."""
+        """Return entries (W,) of a shared column (N,): selected from few, kept in registers; gathered from many."""
         if len(column) > SELECTED_ROWS:
             return gathered(column, numbers)
         found = jnp.broadcast_to(column[0], numbers.shape)
@@ -157,9 +157,9 @@ class Interpreter:
         return found
 
     def materialize(self, values):
-        """The values, of which every consumer reads one result. What lanes share stays as it is.
+        """Return the values, each computed once for all of its consumers; shared values are returned unchanged.
 
-        Column by column, so that those which nobody reads vanish with all that they are made of.
+        It works column by column, so that unread columns are eliminated together with their computation.
         """
         items = {id(item): item for value in values if differs(value) for item in value.flat}
         new = [item for item in items.values() if id(item) not in self.computed and not is_known_zero(item)]
@@ -172,7 +172,7 @@ class Interpreter:
         ]
 
     def by_vmap(self, eqn, inputs):
-        """Any primitive: right, and slow."""
+        """Apply any primitive by `jax.vmap`: correct, but slow."""
         joined = [join(x, self.width) if differs(x) else x for x in inputs]
         axes = [0 if differs(x) else None for x in inputs]
         outputs = jax.vmap(partial(eqn.primitive.bind, **eqn.params), in_axes=axes)(*joined)
@@ -198,7 +198,7 @@ class Interpreter:
     # ---- control flow -----------------------------------------------------------------------------------------------
 
     def pack(self, values, differing):
-        """Values as pytrees of arrays, for a loop of XLA's to carry."""
+        """Return values as pytrees of arrays, which an XLA loop can carry."""
         return [
             [jnp.broadcast_to(item, (self.width,)) for item in components(value).flat] if differs else value
             for value, differs in zip(values, differing, strict=True)
@@ -216,7 +216,7 @@ class Interpreter:
         test, body = eqn.params["cond_jaxpr"], eqn.params["body_jaxpr"]
         differing = equation_outputs_differ(eqn, list(map(differs, inputs)))
         shapes = [v.aval.shape for v in eqn.outvars]
-        # A lane that is done stays as it is in what is read later; the rest of it may go on.
+        # Values that are read later are kept from a lane's last trip; its other values may keep changing.
         tested = variables_read_by(test.jaxpr.eqns) | variables(test.jaxpr.outvars)
         kept = [u or v in tested for u, v in zip(used, test.jaxpr.invars[len(test_consts) :], strict=True)]
 
@@ -262,7 +262,7 @@ class Interpreter:
             return self.pack(results[:n], carried), self.pack(results[n:], rows)
 
         def by_row(x):
-            """Components (rows, ...) -> arrays (rows, W), one for each component of a row."""
+            """Turn components (rows, ...) into arrays (rows, W), one for each component of a row."""
             columns = x.reshape(len(x), -1).T
             return [jnp.stack([jnp.broadcast_to(item, (self.width,)) for item in column]) for column in columns]
 

@@ -1,9 +1,9 @@
-"""What lanes do for each primitive of JAX: arithmetic goes component by component, structure costs nothing.
+"""Rules of lanes for JAX's primitives: arithmetic runs component by component, structural operations cost nothing.
 
-What is named in neither table is left to `vmap`: right, and slow.
+Primitives in neither table are left to `vmap`: correct, but slow.
 
-Rules are (interpreter, inputs, params, shape of the first result) -> value, or values where the primitive has several,
-or None: not by this rule, but by `vmap`.
+A rule is (interpreter, inputs, params, shape of the first result) -> value, or values if the primitive has several
+results, or None: the rule does not apply, and `vmap` does it.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ def _dot_general(interpreter, inputs, params, shape):
 
 
 def _dynamic_slice(interpreter, inputs, params, shape):
-    """Entries that lanes pick: gathered from a table that they share, selected from components of their own."""
+    """Return the entries that lanes pick: gathered from a shared table, selected from components of their own."""
     table, *starts = inputs
     starts = [start.item() if differs(start) else start for start in starts]
     picked = []
@@ -72,7 +72,7 @@ def _dynamic_slice(interpreter, inputs, params, shape):
             continue
         if jnp.ndim(start) or differs(table):
             picked.append(axis)
-            if size > 1:  # of one entry, the gather clamps the number
+            if size > 1:  # for a single entry, the gather clamps the index
                 starts[axis] = jnp.clip(start, 0, extent - size)
         else:
             table = lax.dynamic_slice_in_dim(table, start, size, axis, allow_negative_indices=False)
@@ -93,7 +93,7 @@ def _dynamic_slice(interpreter, inputs, params, shape):
         index = 0
         for axis, extent, offset in zip(picked, extents, offsets, strict=True):
             index = index * extent + (starts[axis].astype(jnp.int32) + offset)
-        # One column at a time: gathered from a reshaped table, every index would be divided and multiplied again.
+        # One column at a time: a gather from a reshaped table would divide and multiply every index again.
         blocks.append([interpreter.rows_of_column(columns[:, k], index) for k in range(columns.shape[1])])
     rest = [size for axis, size in enumerate(shape) if axis not in picked]
     block = as_components([*(shape[axis] for axis in picked), *rest], [item for items in blocks for item in items])
@@ -101,7 +101,7 @@ def _dynamic_slice(interpreter, inputs, params, shape):
 
 
 def _gather(interpreter, inputs, params, shape):
-    """One block, as a slice of which some axes of length 1 may be dropped."""
+    """Gather a single block, as a slice from which some axes of length 1 may be dropped."""
     table, starts = inputs
     numbers = params["dimension_numbers"]
     in_bounds = params["mode"] in (lax.GatherScatterMode.CLIP, lax.GatherScatterMode.PROMISE_IN_BOUNDS)
@@ -124,7 +124,7 @@ def _dynamic_update_slice(interpreter, inputs, params, shape):
     return as_components(shape, items)
 
 
-# Of operands of which one at least is known to be zero: the result, where nothing needs to be computed for it; or None.
+# Results for operands at least one of which is a known zero; None: the operation has to be computed.
 ZEROS: dict[str, Callable] = {
     "add": lambda a, b: b if is_known_zero(a) else a,
     "add_any": lambda a, b: b if is_known_zero(a) else a,
@@ -161,7 +161,7 @@ RULES = {
     "dynamic_update_slice": _dynamic_update_slice,
     "optimization_barrier": lambda interpreter, x, params, shape: x,
     "persistent_test": lambda interpreter, x, params, shape: x[0],
-    # A number may become several narrower ones.
+    # `vmap` does it where a scalar becomes several narrower ones.
     "bitcast_convert_type": lambda interpreter, x, params, shape: (
         interpreter.componentwise(partial(lax.bitcast_convert_type_p.bind, **params), x, shape)
         if x[0].shape == shape
@@ -169,7 +169,7 @@ RULES = {
     ),
 }
 
-# Every component of the result depends on the same component of the operands alone.
+# Primitives for which a component of the result depends only on the same component of the operands.
 COMPONENTWISE = frozenset(
     "abs acos acosh add add_any and asin asinh atan atan2 atanh bessel_i0e bessel_i1e cbrt ceil clamp clz complex "
     "conj convert_element_type copy copy_p cos cosh digamma div eq eq_to erf erf_inv erfc exp exp2 expm1 floor ge gt "

@@ -1,8 +1,8 @@
-"""Branches that cost much, each run for those lanes alone that take it.
+"""Expensive branches, each run only for the lanes that take it.
 
-Lanes of one branch are listed one after another, and laid side by side a few at a time. So the branches together cost
-what one costs for all lanes, and to gather what they read and to bring back their results comes on top. A branch that
-costs less than that is run for all lanes, as branches of little work are anyway.
+The lanes of a branch are listed, and gathered side by side a few at a time. So the branches together cost as much as
+one branch for all lanes, plus gathering their inputs and scattering their results. A branch that costs less than that
+is run for all lanes, as cheap branches always are.
 """
 
 from __future__ import annotations
@@ -20,22 +20,22 @@ from pathjax.compile.lanes.columns import as_components, differs, entry, gathere
 from pathjax.compile.lanes.dataflow import variables, variables_read_by
 from pathjax.compile.lanes.primitive_rules import COMPONENTWISE
 
-# Lanes that run a branch at once: one or two vectors of the processor, as few lanes take a branch, so that a longer run
-# would be idle for the most part.
+# Lanes that run a branch at once: one or two vectors of the processor. Few lanes take a branch, so that most lanes of a
+# longer run would be idle.
 WIDTH = 16
-# Operations on a number, from which on this is quicker than to run all branches and select: of those together that are
-# listed; of a branch, that it is; of a gathered number, in such operations. All are as measured.
+# Work in scalar operations, as measured: runs are faster than running all branches where the listed branches together
+# have more than _LEAST_WORK; a branch of more than _LITTLE is listed; a gathered scalar counts as _GATHER.
 _LEAST_WORK, _LITTLE, _GATHER = 1000, 200, 20
 
 
 def pays(width: int, branches: tuple[ClosedJaxpr, ...]) -> bool:
-    """Whether branches are best run so. One that does nothing is taken by lanes that wait for others."""
+    """Return whether runs pay for these branches. They do not if one does nothing: its lanes wait for the others."""
     work = list(map(_work, branches))
     return width > WIDTH and min(work) > 0 and sum(each for each in work if each > _LITTLE) > _LEAST_WORK
 
 
 def _work(program: ClosedJaxpr) -> int:
-    """Operations on a number, those of a loop once."""
+    """Count the scalar operations of a program, those of a loop once."""
     total = 0
     for eqn in program.jaxpr.eqns:
         values = [x for value in eqn.params.values() for x in (value if isinstance(value, tuple) else (value,))]
@@ -48,14 +48,14 @@ def _work(program: ClosedJaxpr) -> int:
 
 
 def in_runs(interpreter, which, branches: tuple[ClosedJaxpr, ...], operands: list) -> list:
-    """Results of the branch that each lane takes; which: (W,) int32 its number."""
+    """Return the results of the branch that each lane takes; which: (W,) int32 index of the branch."""
     width, outputs = interpreter.width, branches[0].out_avals
     active = jnp.ones((width,), bool) if interpreter.active is None else interpreter.active
     costs_little = [_work(branch) <= _LITTLE for branch in branches]
     rare = [k for k, little in enumerate(costs_little) if not little]
     operands = interpreter.materialize(operands)
 
-    # What costs little all lanes do, and keep where it is theirs, or where a run writes over it.
+    # Cheap branches run for all lanes; a lane of an expensive branch gets its results from a run below.
     results = [as_components(aval.shape, [jnp.zeros((), aval.dtype)] * math.prod(aval.shape)) for aval in outputs]
     for k, branch in enumerate(branches):
         if costs_little[k]:
@@ -63,7 +63,7 @@ def in_runs(interpreter, which, branches: tuple[ClosedJaxpr, ...], operands: lis
             results = [interpreter.select(which == k, *cases) for cases in zip(results, found, strict=True)]
     columns = interpreter.pack(results, [True] * len(outputs))
 
-    # The others' lanes are listed, branch after branch.
+    # List the lanes of the expensive branches, branch after branch.
     def enlist(lane, state):
         listed, order = state
         return listed + 1, with_entry(order, lane, listed)
@@ -83,9 +83,9 @@ def in_runs(interpreter, which, branches: tuple[ClosedJaxpr, ...], operands: lis
 
 
 def _run(narrow, branch: ClosedJaxpr, operands: list, order, end):
-    """A function that runs a branch for WIDTH of the lanes in `order`, up to `end`, and stores what it finds of each.
+    """Return a function that runs a branch for WIDTH of the lanes in `order`, up to `end`, and stores their results.
 
-    It takes and returns the place in the order and the columns of the results.
+    It takes and returns the position in `order` and the columns of the results.
     """
 
     def of_lanes(x, is_read, lanes):
@@ -119,6 +119,6 @@ def _below(end, state):
 
 
 def _reads(branch: ClosedJaxpr) -> list[bool]:
-    """Which of the operands a branch reads."""
+    """Return for each operand whether the branch reads it."""
     read = variables_read_by(branch.jaxpr.eqns) | variables(branch.jaxpr.outvars)
     return [v in read for v in branch.jaxpr.invars]

@@ -1,4 +1,4 @@
-"""How all items come into the lanes: in groups, or from a queue."""
+"""Scheduling of items on lanes: in groups, or from a queue."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from pathjax.compile.primitives import unset_p
 
 
 def in_groups(interpreter: Interpreter, program, xs, shared):
-    """Results (N, ...) of all items; the lanes of a group begin and end together."""
+    """Return the results (N, ...) of all items; the lanes of a group begin and end together."""
     width, count = interpreter.width, len(xs[0])
     groups = -(-count // width)
 
@@ -31,11 +31,11 @@ def in_groups(interpreter: Interpreter, program, xs, shared):
 
 
 def from_queue(interpreter: Interpreter, program, xs, shared, place, differ, memory=0):
-    """The same where equation `place` of the program is a `persistent_loop`: a lane that leaves it begins another item.
+    """Return the same where equation `place` is a `persistent_loop`: a lane that leaves it begins another item.
 
     Args:
-        differ: of `dataflow.differing_in`.
-        memory: how many of the last outputs are memory of `together`, carried by the loop, and returned as it is.
+        differ: result of `dataflow.differing_in`.
+        memory: number of trailing outputs that are memory of `together`, which the loop carries; returned unchanged.
     """
     width, count, jaxpr = interpreter.width, len(xs[0]), program.jaxpr
     first_memory = len(jaxpr.outvars) - memory
@@ -44,14 +44,14 @@ def from_queue(interpreter: Interpreter, program, xs, shared, place, differ, mem
     test_consts, body_consts, init = while_parts(loop, loop.invars)
 
     def begin(item, common):
-        """Values before the loop, of one item; common: what all items share, where it is known already."""
+        """Return the values before the loop, of one item; common: values that all items share, as far as known."""
         values = interpreter.initial_values(program, [*(entry(x, item) for x in xs), *shared]) | common
         interpreter.run_equations([eqn for eqn in before if any(v not in common for v in eqn.outvars)], values)
         return values | {v: interpreter.read(values, atom) for v, atom in zip(loop.outvars, init, strict=True)}
 
     first = begin(jnp.int32(0), {})
     common = {v: value for v, value in first.items() if v not in loop.outvars and not differ([v])[0]}
-    # What a lane keeps of its item: what is made of it before the loop and read later, then what the loop carries.
+    # State of a lane: values of its item that are computed before the loop and read later, then the loop's carry.
     read_later = variables_read_by(after) | variables([*test_consts, *body_consts, *jaxpr.outvars])
     own = [v for v in first if v in read_later and v not in common and v not in loop.outvars]
     kept = [*own, *loop.outvars]
@@ -74,17 +74,17 @@ def from_queue(interpreter: Interpreter, program, xs, shared, place, differ, mem
         return jnp.stack(numbers).reshape(v.aval.shape) if columns else jnp.zeros(v.aval.shape, v.aval.dtype)
 
     def idle(state):
-        """Flags of lanes that are done with their item, or have none while some are left."""
+        """Return packed flags of the lanes that are done with their item, or hold none while items are left."""
         following, item, packed, _ = state
         values = unpack(packed)
         (goes_on,) = interpreter.run(loop.params["cond_jaxpr"], read_all(values, [*test_consts, *loop.outvars]))
         return flags.packed(jnp.where(item < count, ~goes_on.item(), following < count))
 
     def refill(state):
-        """Store the results of idle lanes, then begin other items in them, lane by lane.
+        """Store the results of idle lanes, then begin new items in them, lane by lane.
 
-        In two rounds, as XLA copies columns that a loop both reads and writes, on every trip. The second counts down
-        what the first has counted up: so it comes second, and nothing is copied between them either.
+        Two loops, as XLA copies columns that one loop both reads and writes, on every trip. The second counts down
+        what the first has counted up: so it must come second, and nothing is copied between them either.
         """
         idle_lanes, (following, item, packed, results) = state
 
@@ -93,7 +93,7 @@ def from_queue(interpreter: Interpreter, program, xs, shared, place, differ, mem
             mine = map(partial(value_in_lane, lane), kept, packed, differing)
             ended = common | dict(zip(kept, mine, strict=True))
             interpreter.run_equations(after, ended)
-            # A lane without an item writes what its next one, or the last, overwrites.
+            # What a lane without an item writes is overwritten by its next item, or by the last one.
             row = jnp.minimum(entry(item, lane), following)
             outputs = zip(results, read_all(ended, own_outputs), strict=True)
             return following + 1, [with_entry(result, value, row) for result, value in outputs]
@@ -130,6 +130,6 @@ def from_queue(interpreter: Interpreter, program, xs, shared, place, differ, mem
     ]
     results = [jnp.zeros((count, *v.aval.shape), v.aval.dtype) for v in own_outputs]
     state = jnp.int32(0), jnp.full((width,), count, jnp.int32), interpreter.pack(copies, differing), results
-    # A number is taken by each lane at first, then for each item whose results are stored.
+    # The counter is incremented once per lane at the start, then once per item whose results are stored.
     _, _, packed, results = lax.while_loop(lambda state: state[0] < count + width, trip, state)
     return [*results, *read_all(unpack(packed), memory_outputs)]

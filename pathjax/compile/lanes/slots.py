@@ -1,10 +1,10 @@
-"""Searches of lanes, several at once, none of which waits for another.
+"""Interleaved searches of several lanes, none of which waits for another.
 
-A search reads one node after another, each of which says what the next is: the processor waits most of the time. So a
-few lanes search at once, each in a slot. Every trip of one loop opens a node of each slot; visits and the change to the
-next lane stand in loops of their own, of any number of trips. (XLA writes down where all that a loop carries is, in
-every trip of the loop around it, so all numbers of one size that a lane searches with are one array, and those of its
-search's state another; and a branch in place of such a loop costs more.)
+A search reads one node after another, each of which determines the next: the processor waits for memory most of the
+time. So a few lanes search at once, each in a slot. Every trip of one loop opens a node in each slot; visits, and the
+change to the next lane, are inner loops of any number of trips. (XLA writes the addresses of a loop's carry in every
+trip of the loop around it, so all scalars of one size among a lane's inputs are one array, and those of its search's
+state another; and a branch in place of such an inner loop costs more.)
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ from pathjax.compile.lanes.columns import differs, entry, split, with_entry
 from pathjax.compile.lanes.words import Words
 from pathjax.compile.primitives import Part, Search, column_p
 
-# As measured: with more the processor waits less, and each costs instructions in every trip.
+# As measured: with more slots the processor waits less, but each costs instructions in every trip.
 SLOTS = 3
 
 
 def in_slots(interpreter, program: ClosedJaxpr, search: Search[Part], inputs: list) -> list:
-    """Results of a search of each lane that is active; program: the same of one lane."""
+    """Return the results of a search for each active lane; program: the whole search of one lane."""
     width = interpreter.width
     active = jnp.ones((width,), bool) if interpreter.active is None else interpreter.active
     are_active = flags.packed(active)
-    nobody, nothing = jnp.int32(width), jnp.int32(width + 1)  # where what no lane has left goes; an empty slot
+    nobody, nothing = jnp.int32(width), jnp.int32(width + 1)  # row for results of no lane; marker of an empty slot
 
     def enlist(lane, state):
         count, order = state
@@ -50,11 +50,12 @@ def in_slots(interpreter, program: ClosedJaxpr, search: Search[Part], inputs: li
         return [entry(table, lane) for table in tables]
 
     def inputs_of(rows):
-        """Inputs of a lane, from its rows of the tables."""
+        """Return the inputs of a lane, from its rows of the tables."""
         mine = dict(zip(own, kept.values(rows), strict=True))
         return [mine.get(number, x) for number, x in enumerate(inputs)]
 
-    # A slot holds a lane, its rows, and the state of its search: numbers as words, lane first, and arrays.
+    # A slot holds a lane's rows of inputs, its index and the scalars of its search's state as words, and the state's
+    # arrays.
     nowhere = [jnp.zeros_like(table[0]) for table in tables]
     avals = jax.eval_shape(search.begin, inputs_of(nowhere))
     numbers = [k for k, aval in enumerate(avals) if not aval.shape]
@@ -62,12 +63,12 @@ def in_slots(interpreter, program: ClosedJaxpr, search: Search[Part], inputs: li
 
     def slot_of(lane, rows, state):
         mine = [lane, *(state[k] for k in numbers)]
-        # Each is computed by itself: as part of a concatenation all would be computed for each.
+        # Each is computed on its own: fused into the concatenation, all would be computed for each.
         items = words.of([[column_p.bind(x)[None]] for x in mine])
         return rows, [jnp.concatenate(each) for each in items], [x for x in state if x.shape]
 
     def held(slot):
-        """Lane, inputs and state of a slot."""
+        """Return lane, inputs and state of a slot."""
         rows, packed, arrays = slot
         lane, *mine = words.values(packed)
         of, others = dict(zip(numbers, mine, strict=True)), iter(arrays)
@@ -86,7 +87,7 @@ def in_slots(interpreter, program: ClosedJaxpr, search: Search[Part], inputs: li
         return (lane < nothing) & ~(search.opens(mine, *state)[0] | search.visits(mine, *state)[0])
 
     def next_lane(state):
-        """Put away how the search of a slot ended, and begin that of the next lane in it."""
+        """Store the final state of a slot's search, and begin the next lane's search in it."""
         taken, slot, ends = state
         lane, _, state = held(slot)
         ends = [with_entry(end, state[k], lane) for end, k in zip(ends, read, strict=True)]
@@ -104,7 +105,7 @@ def in_slots(interpreter, program: ClosedJaxpr, search: Search[Part], inputs: li
             taken, slots[number], ends = lax.while_loop(is_done, next_lane, (taken, slot, ends))
         return taken, slots, ends
 
-    # Results come after all searches, so that their program is there once, not in each slot.
+    # Results are computed after all searches, so that their program is compiled once, not for each slot.
     def put_result(lane, results):
         mine = list(state)
         for end, k in zip(ends, read, strict=True):
@@ -116,7 +117,7 @@ def in_slots(interpreter, program: ClosedJaxpr, search: Search[Part], inputs: li
     read = search.result.reads()
     ends = [jnp.zeros((width + 1, *state[k].shape), state[k].dtype) for k in read]
     start = jnp.int32(0), [slot_of(nobody, nowhere, state)] * SLOTS, ends
-    # A number is taken by each slot at the end of each search, and once before its first.
+    # The counter is incremented at the end of each search, and once per slot before its first search.
     *_, ends = lax.while_loop(lambda state: state[0] < count + SLOTS, trip, start)
     results = [jnp.zeros((width, *aval.shape), aval.dtype) for aval in program.out_avals]
     return list(map(split, flags.for_each_lane(are_active, put_result, results)))

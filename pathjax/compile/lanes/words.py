@@ -1,4 +1,4 @@
-"""Values of one lane side by side in few arrays, as a loop pays for each that it carries."""
+"""Values of one lane packed into few arrays, as a loop pays for each array that it carries."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from jax import lax
 
 
 class Words:
-    """Where values of these shapes and types lie: their bits, in one array for each size of number."""
+    """Layout of values of these shapes and dtypes: their bits, in one array for each size of scalar."""
 
     def __init__(self, avals):
         self._avals = list(avals)
@@ -23,7 +23,7 @@ class Words:
             self._places.append(slice(start, self._counts[word]))
 
     def of(self, values) -> list[list]:
-        """The bits of all numbers of such values, given as (list of numbers) each: a list for each array."""
+        """Return the bits of values, each given as a list of its scalars: one list for each array."""
         lists: dict[np.dtype, list] = {word: [] for word in self._counts}
         for aval, numbers in zip(self._avals, values, strict=True):
             word = _word(aval.dtype)
@@ -31,7 +31,7 @@ class Words:
         return list(lists.values())
 
     def values(self, arrays) -> list:
-        """What lies in such arrays."""
+        """Return the values that are packed in such arrays."""
         words = dict(zip(self._counts, arrays, strict=True))
         found = []
         for aval, place in zip(self._avals, self._places, strict=True):
@@ -41,6 +41,6 @@ class Words:
 
 
 def _word(dtype) -> np.dtype:
-    """The type of number as which values of a type are kept: an unsigned integer, or a flag."""
+    """Return the dtype in which values of a dtype are stored: an unsigned integer, or bool."""
     dtype = jnp.dtype(dtype)
     return dtype if dtype.kind == "b" else np.dtype(f"u{dtype.itemsize}")
