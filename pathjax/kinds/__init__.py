@@ -1,4 +1,4 @@
-"""What bsdfs and textures have in common: a kind is a class that declares its parameters, and a table holds their rows.
+"""Kinds of bsdfs, textures and others: a kind is a class that declares its parameters; its table has a row per object.
 
     class Phong(BSDF):
         reflectance = Color(0.5)
@@ -7,8 +7,8 @@
         @staticmethod
         def evaluate(p, wi, wo): ...  # p.reflectance (3,), p.exponent (): of this row, at this point of the surface
 
-From the declaration follow what a scene file may say and what it leaves to defaults, the table of all rows, textures in
-the place of constants, and the parameters by name that can be set, differentiated and fitted.
+The declaration determines the parameters and defaults of scene files, the table of all rows, where textures may replace
+constants, and the named parameters that can be set, differentiated and fitted.
 """
 
 from pathjax.kinds.declared import (

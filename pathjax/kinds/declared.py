@@ -1,4 +1,4 @@
-"""What a kind may declare as a class attribute: the types of its parameters."""
+"""Types of parameters, which a kind declares as class attributes."""
 
 from __future__ import annotations
 
@@ -10,29 +10,33 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Declared:
-    """A column of a kind's table. In a scene file it is named like the attribute."""
+    """A column of a kind's table. In a scene file it has the attribute's name."""
 
-    default: object = None  # None: rows may lack it, and the attribute of a `Row` is None where all do
+    default: object = None  # None: rows may lack it, and the attribute of a `Row` is None if all rows lack it
     bounds: tuple[float, float] = (-math.inf, math.inf)
-    textured: bool = False  # a texture may stand in its place
+    textured: bool = False  # a texture may replace it
     moves_paths: bool = False
-    least: float = -math.inf  # what is smaller counts as this
+    least: float = -math.inf  # smaller values are treated as this one
     required: bool = False  # files must give it
-    absent: object = 0.0  # the value of rows that lack it, which nothing reads, or which means the same
+    absent: object = 0.0  # stored in rows that lack it; it is not read there, or has the same effect as no value
     listed: bool = False  # is a parameter of the scene, to be set, differentiated and fitted
     shape = ()  # of a row's value
-    dtype = None  # of the scene's reals, unless it is given
+    dtype = None  # None: the scene's dtype of reals
     shared = False  # one array for all rows
     tag = "float"  # of the element that gives it
 
     def read(self, loader, fields, name: str, owner: str):
-        """The value that a file gives it, or the default. Raises InputError where it is out of range."""
+        """Return the value that a file gives, or the default.
+
+        Raises:
+            InputError: the value is out of range.
+        """
         return self.default
 
 
 @dataclass(frozen=True)
 class Number(Declared):
-    """A number; where it may be textured, also the mean of a colour, or the luminance of a texture, as in Mitsuba."""
+    """A scalar; where it may be textured, also the mean of a colour, or the luminance of a texture, as in Mitsuba."""
 
     listed: bool = True
 
@@ -47,11 +51,11 @@ class Number(Declared):
 
 @dataclass(frozen=True)
 class Color(Declared):
-    """Linear RGB; a default of one number stands for three."""
+    """Linear RGB; a scalar default sets all three channels."""
 
     bounds: tuple[float, float] = (0, 1)
     textured: bool = True
-    radiance: bool = False  # of a light: uniform spectra have another colour, see `Fields.color`
+    radiance: bool = False  # emitted light, for which uniform spectra have another colour, see `Fields.color`
     listed: bool = True
     shape = (3,)
     tag = "rgb"
@@ -69,7 +73,7 @@ class Color(Declared):
         return color
 
     def checked(self, loader, fields, name, texture):
-        """The texture, whose colours may be larger than those that a file says in numbers: Mitsuba takes them, too."""
+        """Return the texture. Its colours may exceed the upper bound of constants, as in Mitsuba, which adds a note."""
         low, high = self.bounds
         made, (_, largest) = _in_range(fields, name, texture, (low, math.inf)), texture.kind.span(texture)
         if largest > high:
@@ -79,7 +83,7 @@ class Color(Declared):
 
 @dataclass(frozen=True)
 class Transform2(Declared):
-    """(2, 3) applied to (u, v, 1); in files a transform of x and y."""
+    """A matrix (2, 3) applied to (u, v, 1); in files a transform of x and y."""
 
     absent: object = field(default_factory=lambda: np.eye(2, 3))
     shape = (2, 3)
@@ -93,7 +97,7 @@ class Transform2(Declared):
 
 @dataclass(frozen=True)
 class Position(Declared):
-    """A point in world space; in files a point, or the origin that `to_world` moves. No parameter of the scene."""
+    """A point in world space; in files a point, or the origin moved by `to_world`. Not a parameter of the scene."""
 
     default: object = (0.0, 0.0, 0.0)
     shape = (3,)
@@ -105,7 +109,7 @@ class Position(Declared):
 
 @dataclass(frozen=True)
 class Direction(Declared):
-    """A unit vector in world space; in files of any length, or the z axis that `to_world` turns. No parameter."""
+    """A unit vector in world space; in files of any length, or the z axis rotated by `to_world`. Not a parameter."""
 
     default: object = (0.0, 0.0, 1.0)
     shape = (3,)
@@ -118,16 +122,16 @@ class Direction(Declared):
 
     @staticmethod
     def of(vector: np.ndarray) -> np.ndarray:
-        """The unit vector that points the same way; the square of no component overflows or underflows."""
+        """Normalise a vector; it is scaled first, so that no square of a component overflows or underflows."""
         vector = vector / np.abs(vector).max()
         return vector / np.linalg.norm(vector)
 
 
 @dataclass(frozen=True)
 class Rotation(Declared):
-    """(3, 3), orthonormal: how `to_world` turns, or turns and mirrors; where it moves to and its scale are left out.
+    """An orthonormal matrix (3, 3): the rotation, or rotation and reflection, of `to_world`, without shift and scale.
 
-    No parameter of the scene.
+    Not a parameter of the scene.
     """
 
     default: object = field(default_factory=lambda: np.eye(3))
@@ -138,13 +142,13 @@ class Rotation(Declared):
         axes = axes / np.cbrt(abs(np.linalg.det(axes)))
         if not np.allclose(axes.T @ axes, np.eye(3), atol=4e-3):
             raise fields.error(name, "shears or scales unevenly, where it may only turn and mirror")
-        u, _, vt = np.linalg.svd(axes)  # the rounding of files is left out too
+        u, _, vt = np.linalg.svd(axes)  # removes the rounding of the file, too
         return u @ vt
 
 
 @dataclass(frozen=True)
 class Angle(Declared):
-    """Degrees; in files between the bounds, and neither of them. No parameter of the scene."""
+    """Degrees; in files strictly between the bounds. Not a parameter of the scene."""
 
     def read(self, loader, fields, name, owner):
         low, high = self.bounds
@@ -153,14 +157,14 @@ class Angle(Declared):
 
 @dataclass(frozen=True)
 class Setting(Declared):
-    """One of some words, the same for all rows of a table: part of the program, not of its data."""
+    """One of several words, the same for all rows of a table: static, not data."""
 
     options: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
 class Flag(Declared):
-    """A boolean, which rows that lack it have as false. No parameter of the scene."""
+    """A boolean, false in rows that lack it. Not a parameter of the scene."""
 
     dtype = bool
 
@@ -170,7 +174,7 @@ class Flag(Declared):
 
 @dataclass(frozen=True)
 class Choice(Setting):
-    """A setting that files make. Rows that differ in it have tables of their own."""
+    """A setting that files give. Rows that differ in it are in different tables."""
 
     def read(self, loader, fields, name, owner):
         return fields.string(name, self.default, choices=self.options)
@@ -182,31 +186,31 @@ class Internal(Declared):
 
 
 class PerRow(Declared):
-    """What a kind's own builder fills for each row: `shape` and `dtype` are its own."""
+    """A column that the kind's own builder fills, in a shape and dtype of its choice."""
 
 
 @dataclass(frozen=True)
 class Shared(Declared):
-    """An array that belongs to all rows together, filled by the kind's own builder."""
+    """An array that all rows share, filled by the kind's own builder."""
 
-    by_number: bool = False  # read at numbers that rows of the table tell, never as a whole: it may be longer
-    colors: bool = False  # one after another, in an array of one axis
-    wider: bool = False  # its rows are colours, and may have more numbers behind them, which are not read
+    by_number: bool = False  # read only at indices that rows of the table hold, so it may be padded
+    colors: bool = False  # colours one after another, in an array of one axis
+    wider: bool = False  # its rows are colours, and may be padded with further channels, which are not read
     shared = True
 
 
 @dataclass(frozen=True)
 class Unused:
-    """A parameter that Mitsuba's plugin takes, and on which no image depends here."""
+    """A parameter that Mitsuba's plugin accepts, and that has no effect on images here."""
 
     tag: str  # "float", "color", "integer", "boolean", "string" or "transform"
-    why: str = ""  # what the note adds
+    why: str = ""  # reason that is appended to the note
     choices: tuple[str, ...] = ()  # of a string; none: any
     at_least: float = -math.inf  # of a number; integers are never negative
 
 
 def _given_or_placed(fields, name):
-    """A vector (3,), None where the file does not give it, and the matrix (4, 4) that stands in its place."""
+    """Return the vector (3,) that the file gives, or None, and the matrix (4, 4) that may replace it."""
     given, to_world = fields.point(name, None), fields.transform("to_world")
     if given is not None and fields.has("to_world"):
         raise fields.error(name, "excludes to_world; give one or the other")

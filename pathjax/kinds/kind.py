@@ -1,4 +1,4 @@
-"""A kind, and one object of it as a file describes it."""
+"""Kinds, and objects of a kind as files describe them."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from pathjax.kinds.table import Column, Table
 
 @dataclass(frozen=True, eq=False)
 class Instance:
-    """One object of a kind: what a file says of it. Compared by identity: objects that are shared are one row."""
+    """One object of a kind, as a file describes it. Compared by identity: a shared object is one row."""
 
     kind: type[Kind]
-    name: str  # id that its parameters are looked up by
+    name: str  # id, the first part of its parameters' names
     values: Mapping[str, object]  # of declared parameters: numbers, arrays, instances of textures, None
 
 
@@ -32,15 +32,15 @@ class Stored(ABC):
 
     @abstractmethod
     def write(self, path: Path, data: np.ndarray) -> None:
-        """Write a file like the value's own, with these numbers."""
+        """Write these values to a file of the same format as the value's own."""
 
 
 class Kind:
     """A class whose attributes of type `Declared` are the parameters of a kind."""
 
     declared: ClassVar[Mapping[str, Declared]] = {}
-    unused: ClassVar[Mapping[str, Unused]] = {}  # what files may say of it without effect
-    fills_places: ClassVar[bool] = False  # of parameters, as textures do
+    unused: ClassVar[Mapping[str, Unused]] = {}  # parameters that files may give, without effect
+    fills_places: ClassVar[bool] = False  # objects of it replace parameters, as textures do
 
     def __init_subclass__(cls):
         classes = [vars(each) for each in reversed(cls.__mro__)]
@@ -49,17 +49,17 @@ class Kind:
 
     @classmethod
     def place(cls, name: str) -> int:
-        """Return the place of a declared parameter among the columns of the table."""
+        """Return the index of a declared parameter's column in the table."""
         return cls._places[name]
 
     @classmethod
     def read(cls, loader, fields, name: str, **known) -> Instance:
-        """What a scene file says of one object of this kind.
+        """Read one object of this kind from a scene file.
 
         Args:
-            loader: of scene files: `loader.texture(fields, parameter, owner)`, `loader.notes`, ...
-            fields: `description.fields.Fields`, which refuses what nobody asks for.
-            name: by which its parameters are known.
+            loader: loader of scene files: `loader.texture(fields, parameter, owner)`, `loader.notes`, ...
+            fields: `description.fields.Fields`, which refuses parameters that nothing reads.
+            name: first part of its parameters' names.
             known: values of parameters that are not to be read.
         """
         asked = {key: d for key, d in cls.declared.items() if key not in known}
@@ -72,7 +72,7 @@ class Kind:
 
     @classmethod
     def instance(cls, name: str = "", **values) -> Instance:
-        """An object of this kind without a file; what is not given has its default."""
+        """Return an object of this kind without a file; parameters that are not given have their defaults."""
         unknown = sorted(values.keys() - cls.declared.keys())
         if unknown:
             raise InputError(f"{cls.__name__} has no parameter {unknown[0]!r}; it has {', '.join(cls.declared)}")
@@ -80,17 +80,18 @@ class Kind:
 
     @classmethod
     def variant(cls, instance: Instance) -> tuple:
-        """What is the same for all rows of a table: what its program is made for."""
+        """Return the values that all rows of a table must share, for which its program is compiled."""
         return tuple(instance.values[key] for key, d in cls.declared.items() if isinstance(d, Setting))
 
     @classmethod
     def build(
         cls, instances: list[Instance], dtype, path: tuple, parameters: Parameters, code: Callable | None
     ) -> Table:
-        """The table of rows of the same `variant`.
+        """Build the table of instances of the same `variant`.
 
         Args:
-            path: where the table will be in the scene; parameters: to enter those of the rows.
+            path: where the table will be in the scene.
+            parameters: the rows' parameters are entered here.
             code: instance of a texture -> its kind and row among the textures; None: nothing is textured.
         """
         columns = [
@@ -111,15 +112,15 @@ class Kind:
 
     @classmethod
     def derived(cls, table: Table, changed: Collection[str] = ()) -> Table:
-        """The table with columns that follow from others; whoever changes parameters of a scene calls it.
+        """Return the table with its derived columns up to date; called when a table is built or its parameters change.
 
-        changed: names of the columns that differ from before; none of a table that is built.
+        changed: names of the columns that have changed; empty for a table that is built.
         """
         return table
 
 
 def _column(declared: Declared, values: list, dtype, code: Callable | None) -> Column | None:
-    """The column of one parameter; None where no row has it, or where the kind's own builder fills it."""
+    """Return the column of one parameter; None: no row has it, or it is a setting or shared."""
     if isinstance(declared, Setting) or declared.shared or all(value is None for value in values):
         return None
     textured = [isinstance(value, Instance) for value in values]
@@ -134,7 +135,7 @@ def _column(declared: Declared, values: list, dtype, code: Callable | None) -> C
 
 
 def ordered(instances, kinds: Mapping[str, type]) -> dict[type, list[Instance]]:
-    """Instances by kind. Scenes of the same kinds share a structure, whatever the order of the file."""
+    """Group instances by kind. Scenes of the same kinds share a structure, whatever the order in the file."""
     known = list(kinds.values())
     by_kind: dict[type, list[Instance]] = {}
     for each in sorted(instances, key=lambda each: known.index(each.kind) if each.kind in known else len(known)):
@@ -143,12 +144,12 @@ def ordered(instances, kinds: Mapping[str, type]) -> dict[type, list[Instance]]:
 
 
 def register(kinds: dict[str, type], base: type, name: str, room: str, fault: Callable = lambda kind: ""):
-    """A decorator that enters a class among the kinds of a room, for scene files to name it.
+    """Return a decorator that adds a class to the kinds of a room, so that scene files can name it.
 
-    fault: class -> what the room cannot do with it, in words; empty: nothing.
-
+    Args:
+        fault: class -> message why the room cannot use it; empty: it can.
     Raises:
-        InputError: the name is taken by another class, or the class is not of the room's kind.
+        InputError: the name is taken by another class, the class is not derived from `base`, or it has a fault.
     """
 
     def enter(cls):
@@ -157,7 +158,7 @@ def register(kinds: dict[str, type], base: type, name: str, room: str, fault: Ca
         if why := fault(cls):
             raise InputError(f"{room}.register({name!r}): {cls.__qualname__} {why}")
         known = kinds.get(name)
-        # A cell of a notebook that runs again defines its class again.
+        # A notebook cell that runs again defines its class again.
         if known and (known.__module__, known.__qualname__) != (cls.__module__, cls.__qualname__):
             raise InputError(f"{room}.register({name!r}): the name is taken by {known.__qualname__}; use another one")
         kinds[name] = cls

@@ -1,4 +1,4 @@
-"""Parameters of a scene by name, `ID.field`, and where each lives in its tables."""
+"""Parameters of a scene by name, `ID.field`, and the location of each in its tables."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from pathjax.core.math import luminance
 
 
 class Fixed:
-    """Whole numbers that stand in what programs are kept by: equal to others of the same content."""
+    """An integer array that is hashable and compares by content, for static parts of pytrees."""
 
     def __init__(self, values: np.ndarray):
         self.values = values
@@ -36,33 +36,32 @@ class Fixed:
 
 @dataclass(frozen=True)
 class Mean:
-    """Where the mean of a texture stands, by which lights are chosen: the row of an array."""
+    """Location of the mean of a texture, by which lights are chosen, as a row of an array; and the terms of its sum."""
 
     path: tuple[str | int, ...]
     row: int
-    parts: tuple[tuple[float, Parameter], ...]  # what it is the sum of: parameters times their shares,
-    rest: tuple[float, ...]  # and (3,) of what is no parameter
+    parts: tuple[tuple[float, Parameter], ...]  # factors and the parameters that they multiply
+    rest: tuple[float, ...]  # (3,) the sum of all that is not a parameter
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """Where a parameter lives: attributes and tuple places down to an array, and the entry in it."""
+    """Location of a parameter: attributes and tuple indices that lead to an array, and the entry in it."""
 
     path: tuple[str | int, ...]
     index: tuple[int, ...]
     shape: tuple[int, ...]
     bounds: tuple[float, float]
-    field: str = ""  # what its kind calls it
-    moves_paths: bool = False  # as the IOR of smooth glass does; others change what paths carry
-    least: float = -math.inf  # smaller numbers count as this one, and images do not change with them
-    rows: int | None = None  # of a texture: how many entries of the array, from the index on; None: the entry alone
-    means: tuple[Mean, ...] = ()  # of what it is a part of
-    # (rows, 3) which of the values that vertices or faces of a mesh carry a corner has; None: they are of no mesh.
+    field: str = ""  # its name in its kind
+    moves_paths: bool = False  # as the IOR of smooth glass does; others change the radiance that paths carry
+    least: float = -math.inf  # smaller values are treated as this one, so images do not depend on them
+    rows: int | None = None  # for a texture: number of array entries from the index on; None: not a texture
+    means: tuple[Mean, ...] = ()  # means that it contributes to
+    # (rows, 3) index of each corner's value among the values of a mesh's vertices or faces; None: not of a mesh.
     corners: Fixed | None = None
-    # Of a texture: the parameters of bsdfs and lights in whose places it stands, by what kinds call them; None: it may
-    # be any.
+    # For a texture: names of the fields of bsdfs and lights that it sets; None: it may be any.
     stands_in: frozenset[str] | None = None
-    of_numbers: bool = False  # of a texture: a last axis of 3 is three texels, and no channels
+    of_numbers: bool = False  # for a texture of scalars: a last axis of 3 is three texels, not channels
 
     @property
     def is_texture(self) -> bool:
@@ -70,17 +69,17 @@ class Parameter:
 
     @property
     def is_color(self) -> bool:
-        """Whether its last axis is r, g, b."""
+        """Return whether its last axis is r, g, b."""
         return self.shape[-1:] == (3,) and not self.of_numbers
 
     def get(self, values: Shaped[Array, "R ..."]) -> Shaped[Array, "..."]:
-        """Its value, of the array where it lives; of a texture of numbers the luminance of its texels."""
+        """Return its value from its array; for a texture of scalars the luminance of its texels."""
         if not self.is_texture:
             return values[self.index]
         first = self.index[0]
         mine = values[first : first + self.rows]
         if self.corners is not None:
-            # What no corner has is 0.
+            # A value that no corner has is 0.
             corners = self.corners.values
             corner_of = np.full(self.shape[0], corners.size)
             corner_of[corners.ravel()] = np.arange(corners.size)
@@ -90,13 +89,13 @@ class Parameter:
         return mine.reshape(self.shape)
 
     def put(self, values: Shaped[Array, "R ..."], value: Shaped[Array, "..."]) -> Shaped[Array, "R ..."]:
-        """The array with another value of the parameter; a number stands for all channels of a texel."""
+        """Return the array with another value of the parameter; a scalar sets all channels of a texel."""
         if not self.is_texture:
             return _with_entry(values, self.index, value)
         return with_textures(values, [(self, value)])
 
     def of_rows(self, values: Shaped[Array, "R ..."], value: Shaped[Array, "..."]) -> Shaped[Array, "rows ..."]:
-        """Of a texture: its rows of the array, for a value of the parameter."""
+        """Return a texture's rows of the array for a value of the parameter."""
         if self.corners is not None:
             return value[self.corners.values].astype(values.dtype)
         others = values.shape[1:]
@@ -104,21 +103,21 @@ class Parameter:
         return value.reshape(self.rows, *others).astype(values.dtype)
 
     def transposed(self, values: Shaped[Array, "R ..."]) -> Shaped[Array, "..."]:
-        """The transpose of `put` into zeros: of derivatives in the array, those in the parameter."""
+        """Apply the transpose of `put` into zeros: maps derivatives in the array to derivatives in the parameter."""
         zero = jnp.zeros(self.shape, values.dtype)
         (found,) = jax.linear_transpose(lambda x: self.put(jnp.zeros_like(values), x), zero)(values)
         return found
 
     @property
     def table(self) -> tuple[str | int, ...] | None:
-        """Path to the table of its kind, which holds `columns[place].values`; None: it is of a mesh or of a grid."""
+        """Return the path to its kind's table, which holds `columns[place].values`; None: it is of a mesh or a grid."""
         return self.path[:-3] if "columns" in self.path else None
 
 
 def with_textures(
     values: Shaped[Array, "R ..."], textures: Sequence[tuple[Parameter, Shaped[Array, "..."]]]
 ) -> Shaped[Array, "R ..."]:
-    """The array with other values of some textures. If it is of these alone, it is not read: it may be large."""
+    """Return the array with other values of some textures. If they fill it, it is not read, as it may be large."""
     new = [(parameter.index[0], parameter.of_rows(values, value)) for parameter, value in textures]
     if sum(len(rows) for _, rows in new) == len(values):
         if len(new) == 1:
@@ -129,29 +128,29 @@ def with_textures(
     return values
 
 
-@functools.partial(jax.jit, inline=True)  # one program, where JAX would compile one for each of its operations
+@functools.partial(jax.jit, inline=True)  # one program; without jit JAX would compile one for each operation
 def _with_entry(values, index, value):
     return values.at[index].set(value)
 
 
 @dataclass(frozen=True, eq=False)
 class Parameters:
-    """What builders find while they fill tables."""
+    """Parameters that builders collect while they fill tables."""
 
     known: dict[str, Parameter] = field(default_factory=dict)
-    refused: dict[str, str] = field(default_factory=dict)  # names that look like parameters, and why they are none
-    # Textures that are one parameter each, named after what they stand in: where they live, and their first name.
+    refused: dict[str, str] = field(default_factory=dict)  # names that look like parameters -> why they are not
+    # Textures that are one parameter each, named after the first field that they set: their locations and their names.
     textures: dict[object, Parameter] = field(default_factory=dict)
     names: dict[object, str] = field(default_factory=dict)
 
     def enter_texture(self, name: str, texture, declared, field: str | None) -> None:
-        """Enter a texture that stands in the place of what is `declared`, and would be the parameter `name`.
+        """Enter a texture that replaces the parameter `name`, which is `declared`.
 
-        An image that stands in several places is named after the first one, and has the bounds of all. Where all want
-        numbers it is a parameter of numbers.
+        An image that replaces several parameters is named after the first, and has the intersection of their bounds. If
+        all of them are scalars, it is a parameter of scalars.
 
         Args:
-            field: what its kind calls the parameter; None: the texture stands in another one.
+            field: the parameter's name in its kind; None: the texture stands in another texture.
         """
         if texture not in self.textures:
             self.refused.update(texture.kind.refused(name))

@@ -1,4 +1,4 @@
-"""Tables of the rows of a kind, and one row as the physics sees it."""
+"""Tables of the rows of a kind, and the view of one row that the physics reads."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from pathjax.core.types import Number, Surface
 @register_dataclass
 @dataclass(frozen=True)
 class Column:
-    values: Shaped[Array, "R ..."]  # of a row with a texture: not read
+    values: Shaped[Array, "R ..."]  # not read in rows with a texture
     texture: Int[Array, "R 2"] | None = None  # kind, -1 for none, and row of the texture; None: no row has one
-    # Added to what is looked up, in all channels, for derivatives in it; of each row, or of all. None: nothing.
+    # Added to the looked-up value, in all channels, for derivatives in it; per row, or for all rows. None: nothing.
     nudge: Float[Array, ""] | Float[Array, " R"] | None = None
 
 
@@ -38,7 +38,7 @@ class Table:
         return self.columns[self.kind.place(name)]
 
     def with_column(self, name: str, values: Shaped[Array | np.ndarray, "R ..."] | None) -> Table:
-        """The table with other values of a parameter."""
+        """Return the table with other values of a parameter."""
         columns = list(self.columns)
         old = columns[self.kind.place(name)]
         texture = None if old is None else old.texture
@@ -46,7 +46,7 @@ class Table:
         return Table(tuple(columns), self.kind, self.settings)
 
     def nudged(self, nudges: Mapping[int, Array]) -> Table:
-        """The table to whose columns, by place, something is added as they are looked up."""
+        """Return the table with nudges for some columns, by the index of the column."""
         columns = list(self.columns)
         for place, nudge in nudges.items():
             columns[place] = replace(columns[place], nudge=nudge)
@@ -54,7 +54,7 @@ class Table:
 
     @property
     def textured(self) -> tuple[int, ...]:
-        """Places of the columns in which some row has a texture."""
+        """Return the indices of the columns in which some row has a texture."""
         return tuple(i for i, column in enumerate(self.columns) if column is not None and column.texture is not None)
 
     def with_setting(self, name: str, value: str) -> Table:
@@ -62,21 +62,23 @@ class Table:
 
 
 class Row:
-    """Parameters of one row as attributes, looked up as they are asked for: at a point of the surface if textured."""
+    """Parameters of one row as attributes, looked up on access: at a point of the surface if textured."""
 
     def __init__(self, table: Table, row: Number, surface: Surface | None = None, textures=None, colors=None):
-        """surface, textures: what `look_up` of a texture takes; not used where no row has one.
+        """Create the view.
 
-        colors: what was looked up at this point already, for each of `Table.textured`; None: nothing.
+        Args:
+            surface, textures: arguments of the textures' `look_up`; unused where no row has a texture.
+            colors: colours that are looked up already at this point, one for each of `Table.textured`; None: none is.
         """
         self._table, self._row, self._surface, self._textures, self._colors = table, row, surface, textures, colors
 
     def on(self, uv: Float[Array, "2"]) -> Row:
-        """The row with its textures looked up at uv."""
+        """Return the row with its textures looked up at uv."""
         return Row(self._table, self._row, SimpleNamespace(uv=uv), self._textures)
 
     def nudged(self, nudges: Mapping[int, Array]) -> Row:
-        """The row of `Table.nudged`."""
+        """Return this row of `Table.nudged`."""
         return Row(self._table.nudged(nudges), self._row, self._surface, self._textures, self._colors)
 
     def __getattr__(self, name: str):
@@ -100,7 +102,7 @@ class Row:
         return value if nudge is None else value + nudge
 
     def nudge(self, name: str) -> Float[Array, ""] | None:
-        """What is added to a parameter, or to what a kind finds in a `Shared` array; None: nothing."""
+        """Return the value that is added to a parameter, or to a kind's look-up in a `Shared` array; None: nothing."""
         column = self._table.column(name)
         nudge = None if column is None else column.nudge
         return nudge if nudge is None or not nudge.ndim else at(nudge, self._row)
@@ -111,7 +113,7 @@ class Row:
         return self._textures.look_up(at(column.texture, self._row), self._surface)
 
     def gradient(self, name: str) -> Float[Array, "2"]:
-        """How a number changes with u and v of the surface."""
+        """Return the derivatives of a scalar parameter in u and v of the surface."""
 
         def at_uv(uv):
             return getattr(Row(self._table, self._row, self._surface._replace(uv=uv), self._textures), name)
