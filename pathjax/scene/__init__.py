@@ -1,4 +1,4 @@
-"""The scene: a pytree of the tables of all rooms, how it is built, and its parameters by name."""
+"""The scene: a pytree of the tables of all rooms, its builder, and its parameters by name."""
 
 from pathjax.scene.builder import build
 from pathjax.scene.scene import UNBOUNDED, Scene

@@ -1,4 +1,4 @@
-"""Calls that all processes make alike: a difference is found before they compute past each other."""
+"""Calls that all processes must make alike: differences are detected before the computation begins."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ from pathjax.scene.scene import Scene
 
 P = ParamSpec("P")
 R = TypeVar("R")
-# Where a process has a function, in what Python prints of it.
+# Memory address in a function's repr, which differs between processes.
 _ADDRESS = re.compile(" at 0x[0-9a-f]+")
 
 
 def fingerprint(x: object) -> str:
-    """Hash of a scene's structure and arrays; names and files do not count. Of other arguments: of what they hold."""
+    """Return a hash of a scene's structure and arrays, without names and files, or of another argument's contents."""
     leaves, structure = jax.tree.flatten(jax.tree.map(_plain, x, is_leaf=lambda x: isinstance(x, Scene)))
     digest = hashlib.sha256(_ADDRESS.sub("", str(structure)).encode())
     for leaf in map(np.asarray, leaves):
-        if leaf.dtype == object:  # whose bytes are where it is in memory
+        if leaf.dtype == object:  # its bytes are memory addresses
             continue
         digest.update(f"{leaf.dtype}{leaf.shape}".encode())
         digest.update(leaf.tobytes())
@@ -38,7 +38,7 @@ def fingerprint(x: object) -> str:
 
 
 def _plain(x: object) -> object:
-    """Something that is made of arrays alone."""
+    """Reduce an object to its arrays."""
     if isinstance(x, Scene):
         return nameless(x)
     if callable(x):
@@ -47,14 +47,14 @@ def _plain(x: object) -> object:
 
 
 def by_all(f: Callable[P, R]) -> Callable[P, R]:
-    """f, whose kernels all processes share, if there are several: each must call it, and with the same arguments.
+    """Return f with a check that all processes, which share its kernels, call it with the same arguments.
 
-    It returns when they have done it. Within `jax.jit` and other transformations, where values are not known, none are
-    compared. `progress` may differ.
+    With several processes, it returns when the result is computed. Within `jax.jit` and other transformations, where
+    values are traced, nothing is compared. `progress` may differ.
 
     Raises:
-        InputError: processes differ in what they call, or in an argument.
-        ProcessLost: one has ended.
+        InputError: processes differ in the function that they call, or in an argument.
+        ProcessLost: a process has ended.
     """
     signature = inspect.signature(f)
 

@@ -1,4 +1,4 @@
-"""From a description to a scene: each room builds its own tables."""
+"""Build a scene from a description: each room builds its own tables."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ def build(description: desc.Description, dtype=jnp.float32, split_rule: str = "s
     """Compile a description into tables grouped by kind.
 
     Args:
-        dtype: of all reals; float64 needs `jax_enable_x64`.
-        split_rule: of the hierarchies, for experiments: "sah" (least expected cost), "equal" (equal counts) or "middle"
-            (of the centroids' bounds). Hits and images are the same; only their cost differs.
+        dtype: dtype of all reals; float64 needs `jax_enable_x64`.
+        split_rule: split rule of the hierarchies, for experiments: "sah" (least expected cost), "equal" (equal counts)
+            or "middle" (of the centroids' bounds). Hits and images are the same; only their cost differs.
     Raises:
         InputError: float64 without `jax_enable_x64`; an unknown split_rule.
     """
@@ -45,14 +45,14 @@ def build(description: desc.Description, dtype=jnp.float32, split_rule: str = "s
         within = media.build(sides, description.view.medium, dtype, ("media",), parameters)
     about = About(description, parameters.known, parameters.refused, trees)
     view = seen(description, dtype)
-    # NumPy up to here: `jnp.asarray` compiles a program for every shape that it meets.
+    # All arrays are NumPy's up to here: `jnp.asarray` compiles a program for every new shape.
     free_passes = free_passes and bsdfs.occurs(materials, "passes")
     parts = {"geometry": geometry, "materials": materials, "emitters": lights, "about": about, "media": within}
     return jax.device_put(Scene(**parts, **view, free_passes=free_passes))
 
 
 def seen(description: desc.Description, dtype) -> dict[str, object]:
-    """The fields of a scene that say how it is looked at."""
+    """Return the fields of a scene that come from the sensor and the integrator."""
     integrator = description.integrator
     return {
         "camera": description.view.camera.build(description.view.film, dtype),

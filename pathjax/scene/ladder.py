@@ -1,13 +1,13 @@
-"""Scenes of one structure as scenes of the same array sizes, so that they share compiled kernels.
+"""Pads the arrays of scenes of one structure to the same sizes, so that the scenes share compiled kernels.
 
-A kernel is compiled for the sizes of a scene's arrays. What is counted in thousands (triangles, nodes and leaves of
-hierarchies, texels, cells of volumes) and what is counted in pieces (shapes, bsdfs, textures, lights) is padded up to
-rungs of a coarse ladder here. Whatever is read is found by number, and nothing holds the number of a padded entry: no
-ray searches it, no light is chosen there, and images are those of the scene itself. Their last bits may differ, as the
-kernel is another program: so `render_until` pads every scene, of a batch or not.
+A kernel is compiled for the sizes of a scene's arrays. Arrays with thousands of entries (triangles, nodes and leaves of
+hierarchies, texels, cells of volumes) and arrays with few (shapes, bsdfs, textures, lights) are padded up to rungs of a
+coarse ladder. Entries are read by index only, and nothing holds the index of a padded entry: rays do not visit it, it
+is never chosen as a light, and images are those of the scene itself. Their last bits may differ, as the kernel is
+another program: so `render_until` pads every scene, whether in a batch or not.
 
-What stays as it is, and so tells kernels apart: whether lights are so many that a tree chooses among them, backgrounds,
-and shapes of a kind of which there are so few that rays test them all.
+Some properties are not padded and still distinguish kernels: whether there are so many lights that a tree chooses among
+them, backgrounds, and shapes of a kind with so few that rays test them all.
 """
 
 from __future__ import annotations
@@ -26,17 +26,17 @@ from pathjax.scene.scene import Scene
 from pathjax.shapes import Geometry
 from pathjax.shapes.shape import Table as ShapeTable
 
-# The lowest rung of what is many, in bytes: it is filled in a millisecond, and holds meshes of some 10^5 triangles. Of
-# what is few, in rows. Each rung is STEP times the one below.
+# The lowest rung of long arrays, in bytes: it is filled in a millisecond, and holds meshes of some 10^5 triangles. The
+# lowest rung of short arrays, in rows. Each rung is STEP times the one below.
 MANY_BYTES, FEW_ROWS, STEP = 1 << 22, 64, 4
-# Bytes; JAX's CPU devices copy arrays that begin elsewhere.
+# Alignment in bytes; JAX's CPU devices copy unaligned arrays.
 _ALIGNED = 64
-# Levels of a hierarchy: the stack of a search holds one number for each.
+# The depth of a hierarchy is padded to a multiple of this: the stack of a search holds one index per level.
 LEVELS = 16
 
 
 def padded(scene: Scene) -> Scene:
-    """The scene with arrays of the ladder's sizes, for kernels alone: who counts its rows finds more than there are."""
+    """Return the scene with arrays of the ladder's sizes, only for kernels: its tables have more rows than are real."""
     materials = scene.materials
     textures = materials.textures
     if textures is not None:
@@ -57,7 +57,7 @@ def padded(scene: Scene) -> Scene:
     lit, emitters = _emitters(scene.emitters, np.asarray(scene.geometry.light))
     geometry = _geometry(replace(scene.geometry, light=lit))
     scene = replace(scene, geometry=geometry, materials=materials, media=media, emitters=emitters)
-    return jax.device_put(scene)  # which each call of a kernel would do again
+    return jax.device_put(scene)  # once here, instead of in each call of a kernel
 
 
 def _geometry(geometry: Geometry) -> Geometry:
@@ -66,7 +66,7 @@ def _geometry(geometry: Geometry) -> Geometry:
     parted = np.cumsum(counts)[:-1]
 
     def numbered(values):
-        """Pad values of all primitives, which are numbered through the tables."""
+        """Pad values of all primitives, whose indices run through the tables."""
         parts = zip(np.split(np.asarray(values), parted), tables, strict=True)
         return np.concatenate([_rows(part, table.count) for part, table in parts]) if tables else values
 
@@ -74,9 +74,12 @@ def _geometry(geometry: Geometry) -> Geometry:
 
 
 def _emitters(emitters: tuple[Lights, ...], light: Int[np.ndarray, " N"]) -> tuple[np.ndarray, tuple[Lights, ...]]:
-    """Lights with others of power 0 before those of each kind, and `Geometry.light` with the numbers that they have.
+    """Add lights of power 0 before the lights of each kind.
 
-    The last light of all stays the last, so that the largest of random numbers chooses it.
+    The last light of all stays the last, so that the largest random number chooses it.
+
+    Returns:
+        `Geometry.light` with the new indices of the lights, and the lights.
     """
     extra = [_more_lights(lights) for lights in emitters]
     made = [_lights(lights, more) for lights, more in zip(emitters, extra, strict=True)]
@@ -91,7 +94,7 @@ def _emitters(emitters: tuple[Lights, ...], light: Int[np.ndarray, " N"]) -> tup
 
 
 def _plant(emitters: tuple[Lights, ...], made: list[Lights], extra: list[int]) -> None:
-    """Put added lights into empty leaves, with the place that these have when empty: so no node of the tree changes."""
+    """Put added lights into empty leaves, with the bounds of an empty leaf, so that no node of the tree changes."""
     placed = [place for place, lights in enumerate(emitters) if lights.places is not None]
     places = np.concatenate([emitters[place].places for place in placed])
     leaf = np.concatenate([emitters[place].leaf for place in placed])
@@ -110,10 +113,10 @@ def _plant(emitters: tuple[Lights, ...], made: list[Lights], extra: list[int]) -
 
 
 def _more_lights(lights: Lights) -> int:
-    """How many are added. A single one stays so, where nothing is chosen.
+    """Return the number of lights to add, which makes the count a power of two.
 
-    To a power of two: the tree by which they are chosen has then as many levels as without padding. Where there is none
-    choosing takes time for each light.
+    So the tree that chooses among them has as many levels as without padding, and without a tree, where choosing takes
+    time for each light, few are added. A single light stays alone: nothing is chosen there.
     """
     dark = lights.lamps is not None or any(isinstance(x, Color) and x.radiance for x in lights.kind.declared.values())
     if lights.count == 1 or not dark or _all_around(lights):
@@ -122,7 +125,7 @@ def _more_lights(lights: Lights) -> int:
 
 
 def _all_around(lights: Lights) -> bool:
-    """Backgrounds, all of which every ray asks that leaves the scene."""
+    """Return whether these are backgrounds, which every ray that leaves the scene evaluates."""
     return lights.kind.distant and not lights.kind.dirac
 
 
@@ -153,7 +156,7 @@ def _lights(lights: Lights, more: int) -> Lights:
 
 
 def _shapes(table: ShapeTable) -> ShapeTable:
-    """Primitives of one kind. Where there is no tree, rays test all leaves, padded ones too: those stay."""
+    """Pad the primitives of one kind. Without a tree they are not padded, as rays would test the padded leaves, too."""
     if table.tree is None:
         return table
     by_row, tree = table.by_row(), table.tree
@@ -164,7 +167,7 @@ def _shapes(table: ShapeTable) -> ShapeTable:
 
 
 def _kind(table: Table) -> Table:
-    """Rows of one kind of bsdf or texture; texels, which they share."""
+    """Pad the rows of one kind of bsdf or texture, and the texels that they share."""
 
     def of(declared, column):
         if column is None or (declared.shared and not declared.by_number):
@@ -179,7 +182,7 @@ def _kind(table: Table) -> Table:
 
 
 def _grids(grids: Grids | None) -> Grids | None:
-    """Cells, which grids share; what there is of each grid, and of each medium."""
+    """Pad the cells, which all grids share, and the arrays per grid and per medium."""
     if grids is None:
         return None
     few = {key: _rows(x, _few(len(x))) for key, x in vars(grids).items() if key != "values" and x is not None}
@@ -187,7 +190,7 @@ def _grids(grids: Grids | None) -> Grids | None:
 
 
 def _rows(values: Shaped[np.ndarray, "R ..."], rows: int) -> Shaped[np.ndarray, "rows ..."]:
-    """With zeros at the end: memory that nobody touches takes none of the machine's, if JAX does not copy the array."""
+    """Pad with zeros at the end. Untouched pages take no physical memory unless JAX copies the array."""
     values = np.asarray(values)
     size = rows * _row_bytes(values)
     memory = np.zeros(size + _ALIGNED, np.uint8)
@@ -210,9 +213,11 @@ def _many(rows: int, row_bytes: int) -> int:
 
 
 def _few(rows: int) -> int:
-    """Powers of two of rows from which lanes select, which takes time for each: a scene of glass and mirrors took 3 %
-    more with tables of 8 instead of 2 and 4, and 9 % more with as many lights. A table of one row stays so, where XLA
-    leaves out the look-up; one from which lanes select does not become one from which they gather, which takes longer.
+    """Return the padded number of rows of a short table: a power of two up to SELECTED_ROWS, then a rung.
+
+    Lanes select from up to SELECTED_ROWS rows, which takes time for each row: a scene of glass and mirrors took 3 %
+    longer with tables of 8 rows instead of 2 and 4, and 9 % longer with 8 lights. A table of one row stays so, as XLA
+    omits its look-up. No table from which lanes select becomes one from which they gather, which takes longer.
     """
     return 1 << (rows - 1).bit_length() if rows <= SELECTED_ROWS else _rung(rows, FEW_ROWS)
 

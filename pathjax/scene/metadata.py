@@ -1,4 +1,4 @@
-"""What people ask of a scene and kernels do not."""
+"""Data of a scene that users read and kernels do not."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from pathjax.shapes.accel.build import Tree
 
 @dataclass(frozen=True, eq=False)
 class About:
-    """What people ask of a scene and kernels do not: names, the file, reports. Equal for scenes of one loading."""
+    """Names, the description and reports of a scene. Equal for scenes that come from one loading."""
 
     description: desc.Description
     parameters: Mapping[str, Parameter]
-    refused: Mapping[str, str]  # what is none, though it looks like one, and why
+    refused: Mapping[str, str]  # names that look like parameters -> why they are not
     trees: Mapping[str, Tree]  # kind of shape -> its hierarchy, for reports
 
     def __eq__(self, other):
@@ -28,7 +28,7 @@ class About:
 
 @dataclass(frozen=True)
 class Names:
-    """The part of `About` that sets parameters: equal for all scenes that have these in the same places."""
+    """The part of `About` that sets parameters: equal for all scenes with the same parameters in the same locations."""
 
     places: tuple[tuple[str, Parameter], ...]
 

@@ -1,4 +1,4 @@
-"""Parameters by name: where each lives in the scene's tables, and scenes with other values for some of them."""
+"""Get and set the parameters of a scene by name."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def with_parameters(scene: Scene, values: Mapping[str, ArrayLike | Sequence[floa
     """Return the scene with other values for some of its parameters; nothing is compiled again.
 
     Args:
-        values: name -> value of the parameter's shape; a number stands for all channels. Values may be traced.
+        values: name -> value of the parameter's shape; a scalar sets all channels. Values may be traced.
     Raises:
         InputError: a name is unknown, or a value has the wrong shape or lies outside the parameter's bounds.
     """
@@ -46,16 +46,17 @@ def with_parameters(scene: Scene, values: Mapping[str, ArrayLike | Sequence[floa
 
 
 def attached(scene: Scene) -> Scene:
-    """The scene whose tables carry the derivatives of `varied`: for what is differentiated by way of the tables."""
+    """Return the scene with `varied` in its tables, for code that differentiates through the tables."""
     return with_values(scene, scene.varied, scene.described.parameters) if scene.varied else scene
 
 
 def with_values(
     scene: Scene, values: Mapping[str, jax.Array], parameters: Mapping[str, Parameter], placed: bool = False
 ) -> Scene:
-    """The scene with values of parameters in its tables, unchecked.
+    """Return the scene with values of parameters in its tables, unchecked.
 
-    placed: the arrays hold the values already, and only what follows from them is set.
+    Args:
+        placed: the arrays hold the values already, and only derived data is updated.
     """
     textures: dict[tuple, list[tuple[Parameter, jax.Array]]] = {}
     for name, value in values.items():
@@ -72,7 +73,7 @@ def with_values(
         for share, part in mean.parts:
             value = given.get((part.path, part.index))
             value = part.get(get(scene, part.path)) if value is None else value
-            # Known values as builders take them, to the last bit.
+            # Concrete values as the builders compute with them, equal to the last bit.
             value = lax.stop_gradient(value) if is_traced(value) else np.asarray(value, np.float64)
             total = total + share * (value.mean((0, 1)) if part.is_texture else value)
         scene = put(scene, mean.path, get(scene, mean.path).at[mean.row].set(total))
@@ -108,10 +109,10 @@ def _offer(near, parameters):
 
 
 def checked(name, value, parameter: Parameter, dtype):
-    """The value as an array of the parameter's shape; values that are known must lie within its bounds."""
+    """Return the value as an array of the parameter's shape; concrete values must lie within its bounds."""
     given = value
     try:
-        # Of what is no array of JAX's yet, NumPy compiles nothing.
+        # Values that are not JAX arrays go through NumPy, which compiles nothing.
         own = isinstance(given, jax.Array) or is_traced(given)
         value = given if own else np.broadcast_to(np.asarray(given, dtype), parameter.shape)
         value = jnp.broadcast_to(jnp.asarray(value, dtype), parameter.shape)
@@ -123,7 +124,7 @@ def checked(name, value, parameter: Parameter, dtype):
         raise InputError(f"{name} takes {wanted}, not {given!r}") from None
     if not is_traced(value):
         low, high = parameter.bounds
-        known = np.asarray(value)  # of which NumPy compiles nothing
+        known = np.asarray(value)  # compared by NumPy, which compiles nothing
         if not np.all((known >= low) & (known <= high) & np.isfinite(known)):
             given = "a value" if parameter.is_texture else np.asarray(value).tolist()
             raise InputError(f"{name} = {given} lies outside its bounds [{low:g}, {high:g}]")
@@ -131,7 +132,7 @@ def checked(name, value, parameter: Parameter, dtype):
 
 
 def refuse_constant(scene: Scene, wanted: Mapping[str, Parameter]) -> None:
-    """Refuse a derivative in a parameter that is known to be below its least value."""
+    """Refuse a derivative in a parameter whose value is concrete and not above its least value."""
     for name, parameter in wanted.items():
         values = get(scene, parameter.path)
         if not math.isfinite(parameter.least) or parameter.is_texture or is_traced(values):
@@ -145,14 +146,14 @@ def refuse_constant(scene: Scene, wanted: Mapping[str, Parameter]) -> None:
 
 
 def get(tree, path):
-    """What `path` leads to."""
+    """Return the part of a tree that `path` leads to."""
     for step in path:
         tree = tree[step] if isinstance(step, int) or isinstance(tree, Mapping) else getattr(tree, step)
     return tree
 
 
 def put(tree, path, value):
-    """The tree with `value` where `path` leads."""
+    """Return the tree with the part that `path` leads to replaced by `value`."""
     if not path:
         return value
     step, rest = path[0], path[1:]

@@ -1,4 +1,4 @@
-"""The scene: a pytree whose structure says what occurs, so that only that is compiled."""
+"""The scene: a pytree whose structure tells which kinds occur, so that only these are compiled."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from pathjax.sensors import Camera
 from pathjax.sensors.film import Film
 from pathjax.shapes import Geometry
 
-# Depth that stands for "no limit": more bounces than any path survives roulette.
+# Depth that stands for "no limit": no path survives roulette for so many bounces.
 UNBOUNDED = 1 << 30
 
 
@@ -35,24 +35,24 @@ class Scene:
     max_depth: Int[Array, ""]  # vertices of the longest path; 1: emission only
     rr_depth: Int[Array, ""]  # vertices before roulette begins
     hide_emitters: bool = field(metadata={"static": True})  # from the camera
-    about: About | Names | None = field(metadata={"static": True})  # Names: within fits; None: within kernels
-    free_passes: bool = field(default=False, metadata={"static": True})  # straight through a surface is no vertex
-    media: Media | None = None  # between surfaces; None: all is clear
+    about: About | Names | None = field(metadata={"static": True})  # Names in fits; None in kernels
+    free_passes: bool = field(default=False, metadata={"static": True})  # straight passes are no vertices
+    media: Media | None = None  # between surfaces; None: vacuum everywhere
     # Parameters that `with_parameters` set to traced values, by name. They carry the derivative, and tables hold the
-    # same numbers detached: so a derivative that comes by a table is one that was asked for by other means.
+    # same values detached: so a derivative through a table was requested in another way.
     varied: dict[str, Array] = field(default_factory=dict)
 
     @property
     def sensors(self) -> tuple[str, ...]:
-        """Names of the sensors of the scene's file, in its order: ids, or numbers from 0 where they have none."""
+        """Names of the sensors in the order of the scene's file: ids, or indices from 0 for sensors without an id."""
         return tuple(self.described.description.views)
 
     @usual_promotion
     def with_sensor(self, which: int | str) -> Scene:
-        """The scene seen by another sensor of its file, with its film; all else is shared, also present parameters.
+        """Return the scene seen by another sensor of its file, with its film; all else, also parameters, is shared.
 
         Args:
-            which: one of `sensors`, or its number, from 0.
+            which: one of `sensors`, or its index, from 0.
         Raises:
             InputError: there is no such sensor, it is not supported, or it stands in another medium.
         """
@@ -69,10 +69,10 @@ class Scene:
 
     @property
     def described(self) -> About | Names:
-        """`about`, where it is there: outside of fits the whole of it.
+        """Return `about`, which is an `About` outside of fits.
 
         Raises:
-            InputError: the scene was stripped of it.
+            InputError: the scene was stripped of its names.
         """
         if self.about is None:
             raise InputError("this scene was stripped of its names; take the one that load_scene returned")
@@ -80,10 +80,10 @@ class Scene:
 
     @property
     def scatters(self) -> bool:
-        """Whether light is scattered between surfaces."""
+        """Return whether light is scattered between surfaces."""
         return self.media is not None and self.media.scatters
 
     @property
     def samples_lights(self) -> bool:
-        """Whether anything scatters what a light sample finds: Dirac lobes do not."""
+        """Return whether light samples can contribute, as something other than Dirac lobes scatters light."""
         return self.scatters or bsdfs.occurs(self.materials, "smooth")
