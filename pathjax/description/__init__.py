@@ -1,7 +1,7 @@
-"""What a scene file says: plain NumPy records between a loader (`io/`) and the compiled `Scene` (`scene.py`).
+"""The contents of a scene file: plain NumPy records between a loader (`io/`) and the compiled `Scene` (`scene.py`).
 
 A loader fills these in world space and checks the file; `scene.build` groups them by kind. Colours are linear RGB.
-Matrices are float64, (4, 4), acting on column vectors. `name` is the id that parameters are looked up by.
+Matrices are float64, (4, 4), acting on column vectors. `name` is the id that parameter names begin with.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ class Shape:
     name: str
     geometry: object  # a `shapes.Shape`
     bsdf: Instance
-    emitter: Instance | None  # that shines from it
+    emitter: Instance | None  # area light on it
     flip_normals: bool
     interior: Instance | None = None  # medium on the side that the normals point away from
     exterior: Instance | None = None
@@ -31,40 +31,40 @@ class Integrator:
     max_depth: int = -1  # -1: unbounded; 1: emission only
     rr_depth: int = 5
     hide_emitters: bool = False
-    free_passes: bool = False  # straight through a surface is no bounce that counts for max_depth
-    media: bool = False  # participating media are rendered; else they are left out
+    free_passes: bool = False  # straight passes through a surface do not count towards max_depth
+    media: bool = False  # render participating media; False: ignore them
 
 
 class View(NamedTuple):
-    """What one sensor says."""
+    """The settings of one sensor."""
 
     camera: object  # a `sensors.Sensor`
     film: object  # a `sensors.film.HDRFilm`
     spp: int
-    sampler: str  # the type that the file names; pathjax uses its own
-    medium: Instance | None = None  # in which the camera is
+    sampler: str  # type in the file; pathjax uses its own sampler
+    medium: Instance | None = None  # that the camera is in
 
 
 @dataclass(frozen=True)
 class Description:
     file: str
-    view: View  # which is used
+    view: View  # the one in use
     integrator: Integrator
     shapes: tuple[Shape, ...]
-    emitters: tuple[Instance, ...] = ()  # those that stand outside of shapes
-    notes: tuple[str, ...] = field(default=())  # what `info` should tell: dropped triangles, replaced samplers
-    # What was read, to be written again, and what each of its elements became: an `Instance`, a `Shape`, ...
+    emitters: tuple[Instance, ...] = ()  # not on shapes
+    notes: tuple[str, ...] = field(default=())  # for `info`: dropped triangles, replaced samplers
+    # The parsed file, for writing it again, and the object made from each element: an `Instance`, a `Shape`, ...
     document: Document | None = None
     made: Mapping[Element, object] = field(default_factory=dict)
-    # All sensors in the order of the file, by id, or by number where they have none; or why one cannot be used.
+    # All sensors in the order of the file, by id, or by index where they have none; an error: it cannot be used.
     views: Mapping[str, View | InputError] = field(default_factory=dict)
     seen: str = ""  # the name of `view`
 
     def seen_by(self, which: int | str) -> Description:
-        """The description as the sensor of this number or name sees it.
+        """Return the description with the sensor of this index or name in use.
 
         Raises:
-            InputError: there is none, or it cannot be used.
+            InputError: there is no such sensor, or it cannot be used.
         """
         name = chosen(list(self.views), which, self.file)
         view = self.views[name]
@@ -74,10 +74,10 @@ class Description:
 
 
 def chosen(sensors: list[str], which: int | str, file: str) -> str:
-    """The name of the sensor of this name or number.
+    """Return the name of the sensor of this name or index.
 
     Raises:
-        InputError: there is none.
+        InputError: there is no such sensor.
     """
     if which in sensors:
         return str(which)

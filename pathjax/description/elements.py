@@ -1,4 +1,4 @@
-"""What a scene file is made of: elements that know their place in it, whoever wrote them."""
+"""Elements of a scene file or dictionary, which know their place in it."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ class Element:
     tag: str
     attributes: dict[str, str]
     file: str  # or the keys that lead to it in a dictionary
-    line: int  # 0: of a dictionary
+    line: int  # 0: in a dictionary
     children: list[Element] = field(default_factory=list)
-    data: np.ndarray | None = None  # of an <array>, which no file can write
+    data: np.ndarray | None = None  # of an <array>, which exists only in dictionaries
 
     @property
     def id(self) -> str:
@@ -29,7 +29,7 @@ class Element:
 
     @property
     def place(self) -> str:
-        """Where it stands, for messages."""
+        """Its place in the file or dictionary, for messages."""
         return f"{self.file}:{self.line}" if self.line else self.file
 
     def error(self, message: str) -> InputError:
@@ -46,12 +46,12 @@ class Element:
 class Document:
     root: Element  # <scene>; its children have includes expanded and `default`, `path` taken out
     ids: Mapping[str, Element]
-    folders: tuple[Path, ...]  # searched in this order for what the file names
+    folders: tuple[Path, ...]  # searched in this order for files that the scene file names
     found: dict[Element, Path] = field(default_factory=dict)  # the files that elements name
-    notes: tuple[str, ...] = ()  # what `info` should tell of how it was read
+    notes: tuple[str, ...] = ()  # for `info`, about the reading
 
     def resolve(self, element: Element) -> Element:
-        """The element itself, or what it refers to if it is a <ref>."""
+        """Return the element itself, or its target if it is a <ref>."""
         if element.tag != "ref":
             return element
         require_attributes(element, required=("id",), optional=("name",))
@@ -62,13 +62,13 @@ class Document:
         return self.ids[element.id]
 
     def find(self, filename: str, element: Element) -> Path:
-        """The file that `element` names, or InputError."""
+        """Return the path of a file that `element` names, or raise InputError."""
         self.found[element] = find_file(filename, self.folders, element)
         return self.found[element]
 
 
 def nearest(name: str, known: Mapping[str, object] | list[str]) -> str:
-    """`; did you mean "x"?` with the closest known names, or nothing."""
+    """Return `; did you mean "x"?` with the closest known names, or an empty string."""
     matches = get_close_matches(name, list(known), n=3, cutoff=0.6)
     return "; did you mean " + " or ".join(f'"{match}"' for match in matches) + "?" if matches else ""
 

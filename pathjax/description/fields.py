@@ -1,4 +1,4 @@
-"""Typed reading of one plugin element: each parameter is asked for once, and `finish` refuses what nobody asked for."""
+"""Typed reading of one plugin element: each parameter is read once, and `finish` refuses parameters not read."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from pathjax.errors import InputError
 from pathjax.kinds import Unused
 
 VALUES = ("float", "integer", "boolean", "string", "rgb", "spectrum", "point", "vector", "transform")
-# Objects that are the value of a parameter, and others.
+# Objects that are values of parameters; and all objects.
 NAMED = ("texture", "volume")
 OBJECTS = ("integrator", "sensor", "sampler", "film", "rfilter", "shape", "bsdf", "emitter", "medium", "phase", *NAMED)
 
-# Spectra that are plugins of their own, and so are textures, too: of one colour. (`uniform` is a kind of texture here.)
+# Spectra that are plugins, which are also textures of one colour. (`uniform` is a kind of texture here.)
 TYPED = ("uniform", "d65", "srgb", "rawconstant")
 ONE_COLOR = TYPED[1:]
 REQUIRED = object()
-# How dictionaries give what stands in files as an element.
+# Tag of an element -> the form of its value in dictionaries, for messages.
 IN_DICTIONARIES = {
     "float": "a float",
     "integer": "an integer",
@@ -40,7 +40,7 @@ IN_DICTIONARIES = {
 
 
 class Fields:
-    """What one plugin element holds: parameters by name, and the objects nested in it or referred to."""
+    """The contents of one plugin element: parameters by name, and nested or referenced objects."""
 
     def __init__(self, document: Document, element: Element):
         require_attributes(element, required=("type",), optional=("id", "name"))
@@ -51,7 +51,7 @@ class Fields:
         self._values: dict[str, Element] = {}
         self._objects: list[Element] = []
         self._taken: set[str] = set()
-        self.notes: list[str] = []  # what `info` should tell
+        self.notes: list[str] = []  # for `info`
         for child in element.children:
             target = document.resolve(child)
             if child.tag not in (*VALUES, *OBJECTS, "ref") and child.data is None:
@@ -63,7 +63,7 @@ class Fields:
                 continue
             name = child.attributes.get("name")
             if not name and target.tag == "texture":
-                name = f"_arg_{len(self._values)}"  # as Mitsuba calls it; `only_texture` takes it, nothing else does
+                name = f"_arg_{len(self._values)}"  # Mitsuba's name for it; only `only_texture` takes it
             if not name:
                 raise self._nameless(child)
             if name in self._values:
@@ -71,7 +71,7 @@ class Fields:
             self._values[name] = child
 
     def where(self, name: str) -> Element:
-        """The element that sets `name`; the plugin's own where the file leaves it to its default."""
+        """Return the element that sets `name`, or the plugin's own if the file does not set it."""
         return self._values.get(name, self.element)
 
     def error(self, name: str, message: str) -> InputError:
@@ -83,7 +83,7 @@ class Fields:
     def float(
         self, name: str, default=REQUIRED, *, above=-math.inf, at_least=-math.inf, below=math.inf, at_most=math.inf
     ):
-        """A finite number, above < number < below and at_least <= number <= at_most; `default` if it is not given."""
+        """Return a finite number, above < number < below and at_least <= number <= at_most; `default` if not given."""
         element = self._take(name, default, ("float", "integer"))
         if element is None:
             return default
@@ -128,20 +128,20 @@ class Fields:
         return text.lower()
 
     def float_or_name(self, name: str, default: str | float, *, at_least: float):
-        """A number, or the text of a <string>."""
+        """Return a number, or the text of a <string>."""
         if self.has(name) and self._values[name].tag == "string":
             return self.string(name)
         return self.float(name, default, at_least=at_least)
 
     def point(self, name: str, default=REQUIRED):
-        """(3,) float64, written as x, y, z attributes or as value="x, y, z"."""
+        """Return (3,) float64, written as x, y, z attributes or as value="x, y, z"."""
         element = self._take(name, default, ("point", "vector"))
         return default if element is None else triple(element, default=None, extra=("name",))
 
     def color(self, name: str, default=REQUIRED, *, at_most: float = math.inf, radiance: bool = False):
-        """(3,) float64 linear RGB, each channel in [0, at_most], from <rgb>, <spectrum> or a number.
+        """Return (3,) float64 linear RGB, each channel in [0, at_most], from <rgb>, <spectrum> or a number.
 
-        radiance: of a light; else it is a reflectance, or an index of refraction, as seen under white light.
+        radiance: it is emitted light; otherwise a reflectance or an index of refraction, as seen under white light.
         """
         if self._one_color(name):
             return self._typed_spectrum(self.document.resolve(self._take(name, default, ("texture", "ref"))), at_most)
@@ -166,7 +166,7 @@ class Fields:
         return values * scale
 
     def _typed_spectrum(self, element: Element, at_most: float) -> np.ndarray:
-        """The colour of a spectrum with a type. Mitsuba takes all of these as linear RGB and converts none."""
+        """Return the colour of a spectrum with a type. Mitsuba takes all of these as linear RGB without conversion."""
         fields = Fields(self.document, element)
         match fields.type:
             case "uniform":
@@ -188,7 +188,7 @@ class Fields:
         return color
 
     def triple_or_color(self, name: str, default=REQUIRED, *, at_most: float = math.inf):
-        """`color`, which may also be given as a vector."""
+        """Return `color`, which may also be given as a vector."""
         if self.where(name).tag not in ("vector", "point"):
             return self.color(name, default, at_most=at_most)
         given = self.point(name)
@@ -197,14 +197,14 @@ class Fields:
         return given
 
     def gives_color(self, name: str) -> bool:
-        """Whether what sets a parameter is a colour, rather than a number or a texture."""
+        """Return whether the element that sets a parameter is a colour, rather than a number or a texture."""
         return self.where(name).tag in ("rgb", "spectrum") or self._one_color(name)
 
     def _one_color(self, name: str) -> bool:
         return self.has(name) and is_one_color(self.document.resolve(self._values[name]))
 
     def _listed_spectrum(self, element: Element, at_most: float, radiance: bool) -> np.ndarray:
-        """The colour of values by wavelength, which stand in the scene file or in a file that it names."""
+        """Return the colour of values by wavelength, given in the scene file or in a file that it names."""
         if "filename" in element.attributes:
             require_attributes(element, required=("name", "filename"))
             pairs = _pairs_of_file(self.document.find(element.attributes["filename"], element), element)
@@ -225,20 +225,19 @@ class Fields:
         return shown
 
     def array(self, name: str, default=REQUIRED) -> np.ndarray | None:
-        """An array of any shape, which dictionaries alone can give."""
+        """Return an array of any shape, which only dictionaries can give."""
         element = self._take(name, default, ("array",))
         return default if element is None else element.data
 
     def texture(self, name: str, tag: str = "texture") -> Element | None:
-        """The <texture>, or other object of NAMED, that sets `name`; None where it is something else, to be read by
-        `color`."""
+        """Return the <texture>, or other object of NAMED, that sets `name`; None: read the parameter by `color`."""
         if not self.has(name) or self.document.resolve(self._values[name]).tag != tag or self._one_color(name):
             return None
         self._take(name, None, (tag, "ref"))
         return self.document.resolve(self._values[name])
 
     def only_texture(self) -> Element:
-        """The one <texture> in the element, by whatever name."""
+        """Return the only <texture> in the element, which may have any name."""
         names = [name for name, child in self._values.items() if self.document.resolve(child).tag == "texture"]
         if len(names) != 1:
             raise self.element.error(f"{self.element} needs one <texture> inside, and has {len(names)}")
@@ -246,12 +245,12 @@ class Fields:
         return self.document.resolve(self._values[names[0]])
 
     def transform(self, name: str) -> np.ndarray:
-        """(4, 4) float64: the element's steps in the order of the file; the identity if it is not given."""
+        """Return (4, 4) float64, the element's steps in the order of the file; the identity if it is not given."""
         element = self._take(name, None, ("transform",))
         return np.eye(4) if element is None else transform(element)
 
     def objects(self, tag: str, limit: int = 1) -> list[Element]:
-        """The nested or referenced objects of this kind, in the order of the file."""
+        """Take the nested or referenced objects of this tag, in the order of the file."""
         found = [child for child in self._objects if self.document.resolve(child).tag == tag]
         self._objects = [child for child in self._objects if child not in found]
         if len(found) > limit:
@@ -259,7 +258,7 @@ class Fields:
         return [self.document.resolve(child) for child in found]
 
     def object(self, tag: str, name: str) -> Element | None:
-        """The nested or referenced object of this kind that has this name, if there is one."""
+        """Take the nested or referenced object of this tag and name; None: there is none."""
         for child in self._objects:
             if child.attributes.get("name") == name and self.document.resolve(child).tag == tag:
                 self._objects = [each for each in self._objects if each is not child]
@@ -267,7 +266,7 @@ class Fields:
         return None
 
     def without_effect(self, parameters: Mapping[str, Unused]) -> list[str]:
-        """Check those of the parameters that the file gives. Returns a note for each."""
+        """Check those of the parameters that the file gives, and return a note for each."""
         notes = []
         for name, unused in parameters.items():
             match unused.tag:
@@ -289,7 +288,7 @@ class Fields:
         return notes
 
     def finish(self) -> None:
-        """Refuse what no call has asked for."""
+        """Refuse parameters and objects that no call has read."""
         for name, child in self._values.items():
             if name not in self._taken:
                 if not child.attributes.get("name"):
@@ -302,7 +301,7 @@ class Fields:
             raise child.error(f"{child} has no place inside {self.element}")
 
     def lacks(self, tag: str, name: str, remedy: str = "") -> InputError:
-        """That a parameter is not given, which has to be, and what may be meant to be it."""
+        """Return the error that a required parameter is missing, with a parameter that may be a misspelling of it."""
         given = [self._values[other] for other in self._values if other not in self._taken]
         misspelt = [each for each in given if nearest(each.attributes.get("name", ""), [name])]
         remedy += f"; is it {misspelt[0]} at {misspelt[0].place}?" if misspelt else ""
@@ -310,7 +309,7 @@ class Fields:
         return self.element.error(f"{self.element} needs {what}{remedy}")
 
     def _shown(self, tag: str) -> str:
-        """An element of that tag, as whoever wrote the scene has it."""
+        """Return an element of that tag as it is written in this scene, a file or a dictionary."""
         return f"<{tag}>" if self.element.line else IN_DICTIONARIES.get(tag, f"a {tag}")
 
     def _nameless(self, child: Element) -> InputError:
@@ -334,12 +333,12 @@ class Fields:
 
 
 def is_one_color(element: Element) -> bool:
-    """Whether a <texture> is a spectrum, which has one colour everywhere."""
+    """Return whether a <texture> is a spectrum, which has one colour everywhere."""
     return element.tag == "texture" and element.attributes.get("type") in ONE_COLOR
 
 
 def _pairs_of_file(path: Path, element: Element) -> list[list[float]]:
-    """Wavelengths and values, a pair a line; what begins with # is a comment."""
+    """Return the pairs of wavelength and value in a file, one pair per line; lines that begin with # are comments."""
     try:
         text = path.read_text(encoding="utf-8", errors="replace")
     except OSError as error:

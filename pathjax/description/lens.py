@@ -1,4 +1,4 @@
-"""What a lens shows: how scene files say it of cameras and projectors."""
+"""Field of view of cameras and projectors, as scene files give it."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pathjax.description.fields import Fields
 
 
 def half_extent(fov: float, fov_axis: str, aspect: float) -> np.ndarray:
-    """(2,) half of width and height of what is seen at distance 1. aspect: width over height."""
+    """Return (2,) half of the width and height of the field of view at distance 1. aspect: width over height."""
     tan = math.tan(math.radians(fov) / 2)
     tan_x = {
         "x": tan,
@@ -24,7 +24,7 @@ def half_extent(fov: float, fov_axis: str, aspect: float) -> np.ndarray:
 
 
 def field_of_view(fields: Fields) -> tuple[float, str]:
-    """Degrees, and the axis along which they are measured; a focal length is one of 35 mm film, 36 x 24 mm."""
+    """Return the angle in degrees and its axis; a focal length is for 35 mm film, 36 x 24 mm, along the diagonal."""
     if fields.has("focal_length") and (fields.has("fov") or fields.has("fov_axis")):
         raise fields.error("focal_length", "excludes fov and fov_axis; give one or the other")
     if fields.has("fov_axis") and not fields.has("fov"):

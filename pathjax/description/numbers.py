@@ -1,4 +1,4 @@
-"""Numbers, vectors and transforms as elements of scene files write them."""
+"""Parsing of numbers, vectors and transforms in elements of scene files."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 
 
 def number(element: Element, text: str) -> float:
-    """One decimal number, finite in float32 too."""
+    """Parse one decimal number that is finite in float32, too."""
     if not NUMBER.fullmatch(text.strip()) or not abs(float(text)) < 3e38:
         raise element.error(f"{element}: {text.strip()[:40]!r} is not a finite number")
     return float(text)
 
 
 def numbers(element: Element, text: str) -> list[float]:
-    """Numbers between commas or blanks; at least one."""
+    """Parse numbers separated by commas or blanks; at least one."""
     return [number(element, part) for part in re.split(r"[\s,]+", text.strip().rstrip(","))]
 
 
 def triple(element: Element, default: float | None, extra: tuple[str, ...] = ()) -> np.ndarray:
-    """(3,) from x, y, z attributes or `value` (one number stands for three); `default` None: all must be there."""
+    """Parse (3,) from x, y, z attributes or `value` (one number sets all three); `default` None: all are required."""
     require_attributes(element, optional=("value", "x", "y", "z", *extra))
     attributes = element.attributes
     if "value" in attributes:
@@ -43,7 +43,7 @@ def triple(element: Element, default: float | None, extra: tuple[str, ...] = ())
 
 
 def transform(element: Element) -> np.ndarray:
-    """(4, 4) float64, affine and invertible: the steps of a <transform>, the first in the file applied first."""
+    """Parse the steps of a <transform>, the first in the file applied first: (4, 4) float64, affine and invertible."""
     require_attributes(element, required=("name",))
     matrix = np.eye(4)
     for step in element.children:
@@ -64,7 +64,7 @@ def _rotate(step: Element) -> np.ndarray:
     require_attributes(step, required=("angle",), optional=("value", "x", "y", "z"))
     if not axis.any():
         raise step.error(f"{step}: the axis is the zero vector")
-    # As Mitsuba, which takes the axis as it is: one that is not of unit length scales too.
+    # As in Mitsuba the axis is not normalised: an axis that is not a unit vector scales, too.
     return rotation(axis, number(step, step.attributes["angle"]))
 
 

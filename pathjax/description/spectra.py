@@ -1,8 +1,8 @@
-"""Spectra given by wavelengths, as the linear RGB that they stand for.
+"""Conversion of spectra given by wavelengths to linear RGB.
 
-Mitsuba's RGB mode turns a list of wavelengths and values into a colour as its file is read, by sums over a grid of
-wavelengths. The same grid is used here, so that images agree. It makes a white surface a thousandth too dark, and may
-find nothing of what is narrower than half a nanometre.
+Mitsuba's RGB mode converts a list of wavelengths and values to a colour when it reads the file, by sums over a grid of
+wavelengths. This uses the same grid, so that images agree. The grid makes a white surface a thousandth too dark, and
+may miss peaks narrower than half a nanometre.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-# Linear sRGB of CIE XYZ, as Mitsuba rounds it.
+# CIE XYZ to linear sRGB, rounded as in Mitsuba.
 _TO_RGB = np.array(
     [[3.240479, -1.537150, -0.498535], [-0.969256, 1.875991, 0.041556], [0.055648, -0.204043, 1.057311]]
 )
@@ -22,16 +22,16 @@ _TO_RGB = np.array(
 UNIFORM_RADIANCE = _TO_RGB.sum(axis=1)
 
 _FIRST, _LAST, _STEPS = 360.0, 830.0, 1000
-# By which Mitsuba divides the tables: the integral of y, and the mean of D65 weighted by y, a ten-thousandth too large.
+# Mitsuba divides the tables by these: the integral of y, and the mean of D65 weighted by y, a ten-thousandth too large.
 _Y, _WHITE = 106.75026, 98.997418
 
 
 def rgb(wavelengths: Float[np.ndarray, " N"], values: Float[np.ndarray, " N"], lit: bool) -> Float[np.ndarray, "3"]:
-    """Colour of a spectrum, which is linear between its wavelengths and 0 outside of them. May have negative channels.
+    """Return the colour of a spectrum that is linear between its wavelengths and 0 outside; channels may be negative.
 
     Args:
         wavelengths: nm, ascending.
-        lit: seen under D65, as what reflects light is; else it is light itself.
+        lit: the spectrum is a reflectance seen under D65; otherwise it is light itself.
     """
     grid, observer, white = _observer()
     spectrum = np.interp(grid, wavelengths, values, left=0, right=0)
@@ -42,7 +42,7 @@ def rgb(wavelengths: Float[np.ndarray, " N"], values: Float[np.ndarray, " N"], l
 
 @cache
 def _observer() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The grid (nm), and there the observer's x, y, z, and D65; both such that a spectrum of 1, or D65, has Y = 1."""
+    """Return the grid (nm) with the observer's x, y, z and D65 on it; a spectrum of 1, or D65, has Y = 1."""
     table = np.loadtxt(Path(__file__).parent / "cie.txt")
     grid = np.linspace(_FIRST, _LAST, _STEPS)
     x, y, z, white = (np.interp(grid, np.linspace(_FIRST, _LAST, len(table)), column) for column in table.T)

@@ -15,14 +15,14 @@ from pathjax.errors import InputError
 class Transform:
     """An affine map of space, to place shapes, sensors and lights: like `mitsuba.ScalarTransform4f`.
 
-    Each method returns another transform, which acts before what is there already:
+    Each method returns a new transform with a step that is applied before the existing ones:
     `Transform().translate([0, 0, 4]).rotate([0, 1, 0], 90)` rotates, and then shifts. `a @ b` applies b and then a, and
     `a @ points` maps points (..., 3).
 
     Args:
         matrix: (4, 4), acting on column vectors; its last row is 0 0 0 1. The identity by default.
     Raises:
-        InputError: another shape, numbers that are not finite, or another last row.
+        InputError: the matrix has another shape, entries that are not finite, or another last row.
     """
 
     matrix: np.ndarray = field(default_factory=lambda: np.eye(4))
@@ -41,13 +41,13 @@ class Transform:
         return self @ Transform(matrix)
 
     def scale(self, v: ArrayLike) -> Transform:
-        """Scale by one number, or along each axis by one of three."""
+        """Scale by v: one factor, or three, one for each axis."""
         return self @ Transform(np.diag([*_numbers("scale", v, (3,)), 1.0]))
 
     def rotate(self, axis: ArrayLike, angle: float) -> Transform:
-        """Turn about an axis (3,) through the origin; angle in degrees, counterclockwise seen against the axis.
+        """Rotate about an axis (3,) through the origin; angle in degrees, counterclockwise seen against the axis.
 
-        The axis may have any length. (Mitsuba takes it as it is, and its map is no rotation unless that is 1.)
+        The axis may have any length. (Mitsuba does not normalise it: its map is a rotation only for a unit axis.)
 
         Raises:
             InputError: the axis is 0.
@@ -56,16 +56,16 @@ class Transform:
         return self @ Transform(rotation(axis, float(_numbers("rotate", angle, ()))))
 
     def look_at(self, origin: ArrayLike, target: ArrayLike, up: ArrayLike = (0, 0, 0)) -> Transform:
-        """What carries the origin to `origin` and the z axis towards `target`, y being up: to_world of a camera.
+        """Map the origin to `origin` and the z axis towards `target`, with y up: the to_world of a camera.
 
-        up: any vector that is not parallel to the line of sight; all zeros: any will do.
+        up: any vector that is not parallel to the line of sight; all zeros: an arbitrary one.
 
         Raises:
             InputError: origin and target coincide, or up is parallel to the line of sight.
         """
         origin, target, up = (_numbers("look_at", v, (3,)) for v in (origin, target, up))
         forward = _unit("look_at", target - origin, "origin and target coincide")
-        if not up.any():  # any will do; this is the one that Mitsuba takes
+        if not up.any():  # Mitsuba's choice
             x, y, z = forward
             sign = math.copysign(1, z)
             up = np.array([1 - sign * x * x / (sign + z), -sign * x * y / (sign + z), -sign * x])
@@ -76,10 +76,10 @@ class Transform:
         return self @ Transform(matrix)
 
     def inverse(self) -> Transform:
-        """What undoes this transform.
+        """Return the inverse transform.
 
         Raises:
-            InputError: it flattens space.
+            InputError: the transform flattens space.
         """
         try:
             linear = np.linalg.inv(self.matrix[:3, :3])
@@ -96,7 +96,7 @@ class Transform:
 
 
 def rotation(axis: np.ndarray, angle: float) -> np.ndarray:
-    """(4, 4) of Rodrigues' formula, which is a rotation if the axis (3,) is unit; angle in degrees."""
+    """Return the matrix (4, 4) of Rodrigues' formula, a rotation if the axis (3,) is unit; angle in degrees."""
     x, y, z = axis
     turn = math.radians(math.fmod(angle, 360))
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
@@ -106,7 +106,7 @@ def rotation(axis: np.ndarray, angle: float) -> np.ndarray:
 
 
 def _numbers(what: str, value: ArrayLike, shape: tuple[int, ...]) -> np.ndarray:
-    """The value as float64 of this shape; one number may stand for three."""
+    """Return the value as float64 of this shape; a scalar may set all three components."""
     try:
         made = np.broadcast_to(np.asarray(value, float), shape)
     except (TypeError, ValueError):
