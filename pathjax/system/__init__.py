@@ -1,1 +1,1 @@
-"""The process: files that appear whole, results and messages, JSON, signals. Knows nothing of rendering."""
+"""The process: atomic file writes, results and messages, JSON, signals. Independent of rendering."""

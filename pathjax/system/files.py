@@ -16,31 +16,32 @@ def write_text(path: str | Path, text: str) -> None:
 
 
 def encodable(text: str, encoding: str = "utf-8") -> str:
-    r"""The text with \escapes for what the encoding lacks, as for a byte of a file's name that is not UTF-8."""
+    r"""Return the text with \escapes for characters that the encoding lacks, such as non-UTF-8 bytes of file names."""
     return text.encode(encoding, "backslashreplace").decode(encoding)
 
 
 def write_whole(path: Path, write: Callable[[BinaryIO], object]) -> None:
-    """Let `write` fill a file beside `path`, then put it in its place: who reads `path` never sees half a file.
+    """Let `write` fill a file beside `path`, then move it to `path`: readers of `path` never see an incomplete file.
 
     Raises:
-        InputError: it cannot be written, and `path` is as it was.
+        InputError: the file cannot be written; `path` is unchanged.
     """
     with _beside(path) as beside:
         with open(beside, "wb") as file:
             write(file)
             file.flush()
-            os.fsync(file.fileno())  # quotas and disks across a network may refuse no sooner
+            os.fsync(file.fileno())  # quotas and network disks may refuse only here
         os.replace(beside, path)
 
 
 def check_writable(path: str | Path, sources: Iterable[str | Path] = ()) -> None:
-    """Refuse before the work what `write_whole` would refuse after it, as far as can be known.
+    """Raise before the work the errors that `write_whole` would raise after it, as far as they can be known.
 
     Args:
         sources: files that must not be overwritten.
     Raises:
-        InputError: no folder, no right to write in it, a name that is too long, a folder, a read-only file or a source.
+        InputError: the folder is missing or not writable, or `path` is too long a name, a folder, a read-only file or a
+            source.
     """
     path = Path(path)
     with _beside(path) as beside:
@@ -51,10 +52,10 @@ def check_writable(path: str | Path, sources: Iterable[str | Path] = ()) -> None
 
 
 def check_room(folder: Path) -> None:
-    """Refuse a folder in which no file can be made, or no page of one: the rest of the disk is known when it is full.
+    """Check that a file of one page can be written in a folder; whether more fits is known only when the disk is full.
 
     Raises:
-        InputError
+        InputError: it cannot be written.
     """
     probe = folder / f".{os.getpid()}.part"
     try:
@@ -71,7 +72,7 @@ def check_room(folder: Path) -> None:
 
 @contextlib.contextmanager
 def _beside(path: Path) -> Iterator[Path]:
-    """A file beside `path`, gone afterwards; any failure to write is an InputError that names `path`."""
+    """Yield a temporary path beside `path`; any failure to write becomes an InputError that names `path`."""
     try:
         if not path.parent.is_dir():
             raise InputError(f"{path}: there is no folder {path.parent}; make it first")

@@ -1,6 +1,6 @@
-"""What is imported first: from here until `done`, Python looks for no garbage.
+"""The module to import first: from here until `done`, Python's garbage collector is off.
 
-Importing makes modules, which stay, and to go through them time and again takes a fifth of it.
+Imports create lasting objects; scanning these again and again takes a fifth of the import time.
 """
 
 import gc
@@ -16,9 +16,9 @@ def done() -> None:
 
 
 def age() -> None:
-    """Let Python take all objects for old ones, which it seldom goes through, without going through them now.
+    """Move all objects to the oldest generation, which the collector seldom scans, without scanning them now.
 
-    Where a program has frozen some, which only all together are let go of again, all stay as they are.
+    It does nothing if the program has frozen objects, as these can be unfrozen only all together.
     """
     if not gc.get_freeze_count():
         gc.freeze()

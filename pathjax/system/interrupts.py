@@ -1,8 +1,8 @@
-"""Signals that ask the program to end: Ctrl-C, `kill` and a closed terminal. The whole package hears them here.
+"""Signals that ask the program to end: Ctrl-C, `kill` and a closed terminal. The whole package handles them here.
 
-Work that must not be left half done stands within `Interrupts`, where signals are only noted; parts of it that may
-be given up stand within its `raised`. What cannot be stopped, since it runs in XLA, is waited for by `wait_for`; so is
-what takes long in Python, as an exception that is raised while Python collects garbage is lost.
+Work that must not be left half done runs within `Interrupts`, where signals are only noted; parts of it that may be
+abandoned run within its `raised`. Calls that cannot be stopped, since they run in XLA, go through `wait_for`; so do
+long calls in Python, as an exception that is raised during garbage collection is lost.
 """
 
 from __future__ import annotations
@@ -17,18 +17,19 @@ from types import FrameType
 from typing import Any, TypeVar
 
 R = TypeVar("R")
-# Not every system has the one of a closed terminal.
+# Not every system has SIGHUP, the signal of a closed terminal.
 SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
 
-# Set at the end of calls that `wait_for` began. (A thread whose `join` was interrupted is said to be dead, in 3.11.)
+# Events that are set at the end of the calls of `wait_for`. (In 3.11 a thread whose `join` was interrupted counts as
+# dead.)
 _ends: list[threading.Event] = []
 
 
 class Interrupts:
-    """Within it signals are noted, however many come, and nothing else happens.
+    """Context in which signals, however many come, are only noted.
 
-    In other threads than the main one, where Python hears no signals, and for signals that the process ignores it does
-    nothing.
+    It does nothing in threads other than the main one, where Python handles no signals, and for signals that the
+    process ignores.
     """
 
     heard = False  # whether a signal came, also to an `Interrupts` around or within this one
@@ -53,7 +54,7 @@ class Interrupts:
 
     @contextmanager
     def raised(self) -> Iterator[None]:
-        """For a part of the work that may be given up: a signal raises KeyboardInterrupt, also one that came before."""
+        """Context for work that may be abandoned: a signal, also an earlier one, raises KeyboardInterrupt."""
         self._raises = True
         try:
             if self.heard:
@@ -69,9 +70,9 @@ class Interrupts:
 
 
 def wait_for(call: Callable[[], R]) -> R:
-    """Return the call's result, or raise KeyboardInterrupt as soon as a signal does, while the call itself goes on.
+    """Return the call's result, or raise KeyboardInterrupt as soon as a signal does, while the call continues.
 
-    It goes on in a thread of its own, so the program must end by `leave`.
+    The call runs in a thread of its own, so the program must end by `leave`.
     """
     outcome: list[tuple[bool, Any]] = []
     end = threading.Event()
@@ -94,9 +95,9 @@ def wait_for(call: Callable[[], R]) -> R:
 
 
 def leave(status: int, at_once: bool = False) -> int:
-    """Return a program's exit status; or end it, if a call that it no longer waits for goes on, or `at_once`.
+    """Return a program's exit status, or end the process with it if `at_once` or if a call of `wait_for` still runs.
 
-    XLA aborts the process if the interpreter ends under such a call.
+    XLA aborts the process if the interpreter ends during such a call.
     """
     if at_once or not all(end.is_set() for end in _ends):
         for stream in (sys.stdout, sys.stderr):

@@ -1,4 +1,4 @@
-"""JSON of results, which may hold NumPy's arrays and numbers, infinities and nan."""
+"""JSON of results that may hold NumPy arrays and scalars, infinities and NaN."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 
 def json_text(value: object, indent: int | None = None) -> str:
-    """Strict JSON: arrays are lists, and what is infinite or undefined is null, for JSON has no words for them."""
+    """Return strict JSON: arrays become lists; infinities and NaN, which JSON lacks, become null."""
     return json.dumps(_plain(value), indent=indent, allow_nan=False)
 
 

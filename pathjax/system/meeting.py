@@ -1,4 +1,4 @@
-"""Processes that are to work together meet at the address of the first, and learn what would keep them from it."""
+"""Connects processes that are to work together at the address of the first, and checks that they can."""
 
 from __future__ import annotations
 
@@ -12,31 +12,33 @@ from contextlib import ExitStack, suppress
 from pathjax.errors import InputError
 from pathjax.system.output import say
 
-# Bytes of a message at most, and seconds for which a caller may keep the first process waiting.
+# Most bytes of a message, and most seconds for which a caller may keep the first process waiting.
 _LONGEST, _SLOWEST = 1 << 16, 5.0
 _PAUSE = 0.1
-# Seconds of waiting after which it is told for whom; and for which the first process tells those who come late that
-# there is nothing to come to.
+# Seconds of waiting after which a message says who is missing; and seconds for which the first process tells latecomers
+# the problem.
 _TOLD, _LATE = 10.0, 5.0
-# What the first process says at once to each that comes, who then knows of its end.
+# Immediate reply of the first process to each caller, which from then on notices if the first process ends.
 _SEEN = "seen"
 
 
 def meet(
     address: str, processes: int, process: int, facts: Mapping[str, str], seconds: float
 ) -> dict[int, socket.socket]:
-    """Return when all processes have come; others may listen at the address then.
+    """Return when all processes have connected; the address is free again then.
 
     Args:
         address: HOST:PORT of process 0.
-        facts: what must be the same in all, by what it is.
-        seconds: for which they wait for each other.
+        processes: number of processes.
+        process: index of this process.
+        facts: name -> value that must be the same in all processes.
+        seconds: for which processes wait for each other.
     Returns:
-        connections, by the number of the process at the other end: of the first one with all others, of each of them
-        with the first.
+        connections by the index of the process at the other end: the first process has one with each other process, and
+        these have one with the first.
     Raises:
-        InputError: the address is none, or in use; nobody is there; processes are missing, one has ended meanwhile, two
-            have one number, or they differ in a fact.
+        InputError: the address is malformed or in use; nobody answers; processes are missing, one has ended meanwhile,
+            two have the same index, or they differ in a fact.
     """
     host, _, port = address.rpartition(":")
     if not host or not port.isdecimal() or not 0 < int(port) < 1 << 16:
@@ -49,7 +51,7 @@ def meet(
 
 
 def _welcome(port: int, address: str, own: dict, seconds: float) -> dict[int, socket.socket]:
-    """Connections with all others, who are told what keeps the processes from working together, if anything does."""
+    """Accept connections from all other processes, and tell them the problem if they cannot work together."""
     try:
         dual = socket.has_dualstack_ipv6()
         family = socket.AF_INET6 if dual else socket.AF_INET
@@ -72,7 +74,7 @@ def _welcome(port: int, address: str, own: dict, seconds: float) -> dict[int, so
             if now >= told:
                 say(f"process 0 waits at {address} for {missing}, {until - now:.0f} s more")
                 told = until
-            # Nobody speaks before all have come, so what can be read of one who has come is his end.
+            # No process sends anything before all have connected: a readable connection is one that has ended.
             readable = {key.data for key, _ in selector.select(min(told, until) - now)}
             if gone := sorted(readable - {0}):
                 problem = f"process {gone[0]} has ended before all had come"
@@ -83,7 +85,7 @@ def _welcome(port: int, address: str, own: dict, seconds: float) -> dict[int, so
                     other = json.loads(_line(call))
                     problem = _problem(own, came, other)
                     _tell(call, _SEEN)
-                except (OSError, ValueError, KeyError, TypeError):  # somebody else, who is not of us
+                except (OSError, ValueError, KeyError, TypeError):  # another program
                     call.close()
                     continue
                 number = other["process"]
@@ -101,7 +103,7 @@ def _welcome(port: int, address: str, own: dict, seconds: float) -> dict[int, so
 
 
 def _turn_away(server: socket.socket, problem: str, missing: int, until: float) -> None:
-    """Tell those who come a little later, too, who else would look for the first process for long."""
+    """Tell the problem to latecomers, too, which would otherwise keep looking for the first process."""
     for _ in range(missing):
         with suppress(OSError):
             server.settimeout(max(until - time.monotonic(), 0.01))
@@ -117,7 +119,7 @@ def _tell(call: socket.socket, what: object) -> None:
 
 
 def _line(call: socket.socket) -> bytes:
-    """The next line, and nothing of what follows."""
+    """Read the next line, and nothing of what follows."""
     return call.makefile("rb", buffering=0).readline(_LONGEST)
 
 
@@ -133,7 +135,7 @@ def _problem(own: dict, came: dict, other: dict) -> str:
 
 
 def _call(host: str, port: int, address: str, own: dict, seconds: float) -> socket.socket:
-    """The connection with the first process, which has said that nothing keeps them from working together."""
+    """Connect with the first process, and return once it has confirmed that all processes can work together."""
     why, begun, told = "it does not answer", time.monotonic(), False
     while (left := begun + seconds - time.monotonic()) > 0:
         if left <= seconds - _TOLD and not told:
@@ -150,7 +152,7 @@ def _call(host: str, port: int, address: str, own: dict, seconds: float) -> sock
                 why = getattr(error, "strerror", None) or why
                 time.sleep(_PAUSE)
                 continue
-            # For as long as the first process, which may have begun later, waits for the others.
+            # As long as the first process, which may have started later, waits for the others.
             call.settimeout(seconds + _SLOWEST)
             try:
                 problem = json.loads(_line(call))

@@ -1,4 +1,4 @@
-"""How much memory there is, so that what does not fit is refused before it is begun."""
+"""The size of memory, to refuse work that does not fit before it begins."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathjax.errors import InputError
 
 
 def limit() -> int | None:
-    """Bytes of all memory where arrays live; None if nobody says."""
+    """Return the bytes of memory of the device that holds arrays; None: unknown."""
     device = jax.local_devices()[0]
     if device.platform != "cpu":
         return (device.memory_stats() or {}).get("bytes_limit")
@@ -21,7 +21,11 @@ def limit() -> int | None:
 
 
 def check(needed: int, what: str, remedy: str) -> None:
-    """Refuse `what` if it needs more bytes than there are."""
+    """Refuse `what` if it needs more bytes than there are.
+
+    Raises:
+        InputError: it does not fit.
+    """
     there = limit()
     if there is not None and needed > there:
         raise InputError(f"{what} take {_text(needed)} of memory, and there are {_text(there)}; {remedy}")

@@ -1,4 +1,4 @@
-"""What a command hands over: files, results on stdout, messages on stderr. None that fails costs the others."""
+"""Output of a command: files, results on stdout, messages on stderr. A failure of one does not affect the others."""
 
 from __future__ import annotations
 
@@ -24,25 +24,25 @@ def _encodable_on(stream: TextIO | None, text: str) -> str:
 
 
 class Output:
-    """The output of one command; `written` once a file is, `failed` once something could not go where it should."""
+    """The output of one command; `written`: a file was written; `failed`: something could not be written as asked."""
 
     def __init__(self) -> None:
         self.failed = self.written = False
         self._moved: dict[Path, Path] = {}
 
     def file(self, path: str | Path, write: Callable[[Path], object]) -> Path | None:
-        """Let `write` make a file of what was computed: `path`, or where that fails one beside, which a message names.
+        """Let `write` create the file `path`, or, if that fails, a file elsewhere, which a message names.
 
         Args:
-            write: makes the file it is given, whole or not at all, or raises.
+            write: creates the file that it is given, completely or not at all, or raises.
         Returns:
-            where it is; None: nowhere.
+            path of the file; None: it could not be written anywhere.
         """
         path, problems = Path(path), []
         for place in self._places(path):
             try:
                 write(place)
-            except Exception as error:  # whatever it is, the work is done and must not be lost
+            except Exception as error:  # any error: the work is done and must not be lost
                 problems.append(str(error) or type(error).__name__)
                 continue
             self.written = True
@@ -55,7 +55,7 @@ class Output:
         return None
 
     def _places(self, path: Path) -> Iterator[Path]:
-        """`path`; where it went before; a new name in the current folder; one in the folder for temporary files."""
+        """Yield `path`, its earlier replacement, a new name in the current folder, one in a temporary folder."""
         yield path
         if path in self._moved:
             yield self._moved[path]
@@ -67,7 +67,7 @@ class Output:
         with contextlib.suppress(OSError):
             folder = Path(tempfile.mkdtemp(prefix="pathjax-"))
             yield folder / path.name
-            folder.rmdir()  # asked for more: it failed there, too
+            folder.rmdir()  # resumed: writing failed there, too
 
     def text(self, text: str) -> None:
         """Print a result on stdout."""
@@ -77,10 +77,10 @@ class Output:
             print(_encodable_on(sys.stdout, text), flush=True)
         except OSError as error:
             self.failed = True
-            # A reader such as `head` that has enough is no news.
+            # A reader that stops early, such as `head`, needs no message.
             if not isinstance(error, BrokenPipeError):
                 say(f"stdout cannot be written: {error.strerror or error}")
             if sys.stdout is not None:
-                # What is left in its buffer must not fail again when Python ends.
+                # Flushing the rest of its buffer must not fail again when Python exits.
                 with open(os.devnull, "w") as nowhere:
                     os.dup2(nowhere.fileno(), sys.stdout.fileno())

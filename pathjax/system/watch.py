@@ -1,10 +1,10 @@
-"""Processes that work together watch each other: when one is lost the others end, and say which it was.
+"""Processes that work together watch each other: when one is lost, the others end with a message that names it.
 
-The first process hears from all others, and each of them from it, by connections that stay open from their meeting. A
-connection ends with its process; a process that has stopped, or whose machine has, is silent.
+The first process has a connection with each other process, which stays open from their meeting on. A connection ends
+with its process; a process that has stopped, or whose machine has, is silent.
 
-JAX, too, ends a process whose first one is lost, at once and without a name. So it talks with the first process through
-`Relay`, which stays open.
+JAX ends a process that has lost the first one, too, but at once and without naming it. So JAX talks to the first
+process through a `Relay`, which stays open.
 """
 
 from __future__ import annotations
@@ -16,20 +16,20 @@ import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 
-# Seconds between two beats, and beats that may be missing: a process in a long call of NumPy's cannot send any.
+# Seconds between two heartbeats, and how many may be missed: a process in a long NumPy call cannot send any.
 BEAT, PATIENCE = 0.5, 20
 _BEAT, _END = b"", b"end"
 _LONGEST = 1 << 12
 
 
 class Watch:
-    """A thread that hears the other processes, and calls `lost`, once, with the reason for which one is lost."""
+    """A thread that listens to the other processes, and calls `lost`, once, with the reason when one is lost."""
 
     def __init__(self, peers: Mapping[int, socket.socket], lost: Callable[[str], object]):
         self._peers, self._lost = dict(peers), lost
-        self._watched = dict(peers)  # those that have not ended as they should
-        self._heard = dict.fromkeys(peers, b"")  # of each, the line that it has begun
-        self._silent = dict.fromkeys(peers, 0)  # beats since it was heard
+        self._watched = dict(peers)  # peers that have not ended regularly
+        self._heard = dict.fromkeys(peers, b"")  # incomplete last line of each peer
+        self._silent = dict.fromkeys(peers, 0)  # own beats since the peer's last message
         self._speaking = threading.Lock()
         self._selector = selectors.DefaultSelector()
         for number, peer in peers.items():
@@ -39,13 +39,13 @@ class Watch:
         self._thread.start()
 
     def close(self) -> None:
-        """Watch no longer: a thread that goes on while Python ends ends it badly."""
+        """Stop watching: a thread that still runs when Python exits may crash it."""
         self._watched.clear()
         self._thread.join()
         self._selector.close()
 
     def end(self, reason: str = "") -> None:
-        """Tell the others that this process ends: as it should, or why not."""
+        """Tell the others that this process ends: regularly, or for a reason."""
         self._say(" ".join(reason.split()).encode() or _END)
 
     def _watch(self) -> None:
@@ -63,7 +63,7 @@ class Watch:
             for key, _ in self._selector.select(left):
                 self._hear(key.data, self._peers[key.data])
         for number in list(self._watched):
-            # In beats and not in seconds, during which this process may have been stopped itself.
+            # Counted in beats, not seconds, as this process may have been stopped itself.
             self._silent[number] += 1
             if self._silent[number] > PATIENCE:
                 raise _Loss(f"process {number} has not answered for {BEAT * PATIENCE:g} s")
@@ -89,22 +89,22 @@ class Watch:
     def _say(self, line: bytes) -> None:
         with self._speaking:
             for peer in self._peers.values():
-                with suppress(OSError):  # who does not listen is found to be silent
+                with suppress(OSError):  # a peer that does not listen is detected by its silence
                     peer.sendall(line + b"\n")
 
 
 class _Loss(Exception):
-    """A process is lost; its text says which, and why."""
+    """A process is lost; the message says which and why."""
 
 
 class Relay:
-    """An address on this machine, where a caller is connected with who is at another one.
+    """A local address that connects its callers with another address.
 
-    When the other one ends, the connection with the caller stays.
+    When the other side ends, the connection with the caller stays open.
     """
 
     def __init__(self, target: str, seconds: float):
-        """target: HOST:PORT. seconds: for which a caller waits until somebody is there."""
+        """target: HOST:PORT. seconds: for which a caller waits until the target answers."""
         host, _, port = target.rpartition(":")
         self._target, self._seconds, self._closed = (host, int(port)), seconds, False
         self._server = socket.create_server(("127.0.0.1", 0))
@@ -117,8 +117,8 @@ class Relay:
         self._thread.join()
 
     def _serve(self) -> None:
-        others: dict[socket.socket, socket.socket] = {}  # where to pass on what comes
-        calls: list[socket.socket] = []  # which are closed when nobody holds them
+        others: dict[socket.socket, socket.socket] = {}  # source -> target of its data
+        calls: list[socket.socket] = []  # kept open by these references
         with selectors.DefaultSelector() as selector:
             selector.register(self._server, selectors.EVENT_READ)
             while not self._closed:
@@ -150,7 +150,7 @@ class Relay:
 
 
 def _passed(source: socket.socket, target: socket.socket) -> bool:
-    """Pass on what has come; False: the source has ended."""
+    """Pass on the data that has arrived; False: the source has ended."""
     try:
         said = source.recv(1 << 16)
         target.sendall(said)
