@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from pathjax.system import imports as _imports  # isort: skip  before all that takes long
+from pathjax.system import imports as _imports  # isort: skip  before all slow imports
 
 import pathjax.compile  # noqa: F401  first: sets XLA up before a backend starts
 from pathjax.batch import render_batch
@@ -58,7 +58,7 @@ if TYPE_CHECKING:
 else:
 
     def __getattr__(name):
-        # What needs optimistix or scipy.stats, half a second of imports, is loaded when it is asked for.
+        # Modules that need optimistix or scipy.stats, half a second of imports, are loaded on first access.
         if name in ("Fit", "NormalEquations", "Target", "fit", "normal_equations", "read_target"):
             from pathjax import inverse
 

@@ -7,14 +7,14 @@ import sys
 
 
 def main() -> int:
-    """The command line; handles Ctrl-C during imports, for importing JAX takes a while."""
+    """Run the command line; handles Ctrl-C during imports, as importing JAX takes a while."""
     _open_streams()
     sys.stderr = _Messages(sys.stderr)
     try:
         _end_like_ctrl_c()
         from pathjax import cli
 
-        gc.freeze()  # modules live to the end; to search them for garbage, at exit too, takes a fifth of a second
+        gc.freeze()  # modules live to the end; collecting garbage among them, also at exit, takes a fifth of a second
         return cli.main()
     except KeyboardInterrupt:
         print("pathjax: interrupted; nothing was written", file=sys.stderr)
@@ -22,16 +22,16 @@ def main() -> int:
 
 
 def _open_streams() -> None:
-    """Let no file of the work become stdin, stdout or stderr: it would where these are closed (`>&-`)."""
+    """Open stdin, stdout and stderr where they are closed (`>&-`): a file opened later would take their place."""
     while (number := os.open(os.devnull, os.O_RDWR)) <= 2:
         pass
     os.close(number)
-    # Else what is printed there would go to stdout.
+    # Without a stderr, `print` would write to stdout.
     sys.stderr = sys.stderr or open(os.devnull, "w")
 
 
 class _Messages:
-    """Stderr on which nothing fails: where nobody can hear a message (a full disk, a closed terminal) work goes on."""
+    """Stderr that ignores errors: the work continues where messages cannot be written (full disk, closed terminal)."""
 
     def __init__(self, stream):
         self._stream = stream
@@ -53,7 +53,7 @@ class _Messages:
 
 
 def _end_like_ctrl_c() -> None:
-    """Let `kill`, and the end of the terminal, keep what Ctrl-C keeps."""
+    """Handle `kill` and the end of the terminal like Ctrl-C."""
     for name in ("SIGTERM", "SIGHUP"):
         number = getattr(signal, name, None)
         if number is not None and signal.getsignal(number) == signal.SIG_DFL:
