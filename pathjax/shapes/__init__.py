@@ -1,7 +1,7 @@
-"""Shapes: a file a kind, a bounding volume hierarchy over any of them, and `geometry`, which the rest of the code sees.
+"""Shapes: one file per kind, a bounding volume hierarchy over any of them, and `geometry`, which other rooms use.
 
-A kind is a class of `shape.Shape`, what a scene file says of one, which names the `shape.Table` that its primitives go
-into. Kinds may share a table, as cubes and rectangles do. One row in `KINDS` makes a kind exist for scene files,
+A kind is a subclass of `shape.Shape`, the record of a shape in a scene file. It names the `shape.Table` that stores its
+primitives. Kinds may share a table, as cubes and rectangles do. One row in `KINDS` registers a kind for scene files,
 builders and kernels.
 """
 
@@ -44,7 +44,7 @@ __all__ = [
     "lamp_table",
 ]
 
-# By the name that scene files give them; of a mesh it is the format of its file.
+# Kinds by their names in scene files. The name of a mesh is the format of its file.
 KINDS: dict[str, type[Shape]] = {
     "sphere": Sphere,
     "rectangle": Rectangle,
@@ -55,26 +55,26 @@ KINDS: dict[str, type[Shape]] = {
     "mesh": ArrayMesh,
     "cylinder": Cylinder,
 }
-# The same of tables, in which order scenes hold them; instances make what no file names.
+# Kinds of tables, in the order in which scenes hold them. No file names an ellipsoid: only instances create them.
 TABLES = tuple(dict.fromkeys(kind.table for kind in (*KINDS.values(), Ellipsoid)))
 
 
 class Lamp(NamedTuple):
     """Primitives of one shape that emit as one light."""
 
-    shape: int  # its place among the shapes
-    table: int  # of the geometry
+    shape: int  # index among the shapes
+    table: int  # index among the tables of the geometry
     first: int  # first row in that table
     count: int
     area: float
-    primitive: int  # number of the first one among all of the geometry
-    place: np.ndarray  # (3, 3) lower and upper corner of a box around it, and mean of the normals
+    primitive: int  # index of the first primitive, over all tables of the geometry
+    place: np.ndarray  # (3, 3) lower and upper corner of its bounding box, and mean of the normals
 
 
 class _Part(NamedTuple):
     shape: int
     primitives: Primitives
-    glass: bool  # lies between two media
+    glass: bool  # an interface between two media
     lamp: bool
 
 
@@ -87,12 +87,12 @@ def build(
     tangents: bool = False,
     along: bool = False,
 ) -> tuple[Geometry, list[Lamp], dict[str, Tree]]:
-    """Tables of primitives, which lack the numbers of their lights; what emits; hierarchies by `kind`, for reports.
+    """Return the geometry, without the indices of its lights; its lamps; and hierarchies by `kind`, for reports.
 
     Args:
-        shapes: of `description.Shape`; rule: of `accel.build`.
-        path: where the geometry will be in the scene; parameters: to enter the attributes that bsdfs ask for.
-        tangents, along: whether a bsdf asks for those of `Surface`.
+        shapes: records `description.Shape`; rule: of `accel.build`.
+        path: path of the geometry in the scene; parameters: receives the mesh attributes that bsdfs read.
+        tangents, along: whether a bsdf reads these fields of `Surface`.
     """
     by_table: dict[type[Table], list[_Part]] = {table: [] for table in TABLES}
     asked = {t.values["names"] for shape in shapes for _, _, t in mesh_attribute.asked(shape.bsdf)}
@@ -132,13 +132,13 @@ def build(
 
 
 def _enter_attributes(parameters: Parameters, path: tuple, shape, primitives: Primitives, first: int) -> None:
-    """Enter the attributes that the bsdf of a shape asks for. first: row of the shape's first primitive."""
+    """Enter the attributes that the bsdf of a shape reads. first: row of the shape's first primitive."""
     for key, declared, texture in mesh_attribute.asked(shape.bsdf):
         attribute, scale = texture.values["names"], texture.values["scale"]
         name, values = f"{shape.name}.{attribute}", shape.geometry.attributes[attribute]
         if not declared.listed:
             parameters.refused[name] = f"{name} stands in {key} of its bsdf, which is no parameter"
-        if "." in shape.name:  # as loaders name them
+        if "." in shape.name:  # loaders name shapes of instances so
             parameters.refused[name] = f"{name} is of a mesh that an instance shows, as others may"
         if name in parameters.refused:
             parameters.known.pop(name, None)
@@ -152,7 +152,7 @@ def _enter_attributes(parameters: Parameters, path: tuple, shape, primitives: Pr
 
 
 def lamp_table(lamps: list[Lamp], dtype) -> Lamps:
-    """The lamps as kernels take them."""
+    """Return the lamps as arrays for kernels."""
     _, table, first, count, area, *_ = zip(*lamps, strict=True)
     tables = tuple(sorted(set(table)))
     integers = (np.asarray(x, np.int32) for x in ([tables.index(each) for each in table], first, count))
@@ -160,7 +160,7 @@ def lamp_table(lamps: list[Lamp], dtype) -> Lamps:
 
 
 def _lamps(parts: list[_Part], table, primitive):
-    """Yield the lamps of one table, whose first primitive has the number `primitive`."""
+    """Yield the lamps of one table, whose first primitive has the index `primitive`."""
     first = 0
     for shape, primitives, _, lamp in parts:
         if lamp:
@@ -176,7 +176,7 @@ def _lamps(parts: list[_Part], table, primitive):
 
 
 def _part_coincident(by_table: dict[type[Table], list[_Part]], dtype):
-    """Move faces as `coincident` has it, in place, and return margins (P,) by table, where one has any."""
+    """Move coincident faces apart, in place, and return margins (P,) by table, for tables with nonzero ones."""
     margins: dict[type[Table], list] = {table: [] for table in by_table}
     flat = []
     for table, parts in by_table.items():

@@ -1,4 +1,4 @@
-"""Round primitives carried from a space of their own, in which their radius is 1, by any linear map."""
+"""Round primitives with an object space in which their radius is 1, mapped to the world by any affine map."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from pathjax.shapes.shape import Primitives, Table
 
 @dataclass
 class Placed(Primitives):
-    to_world: np.ndarray  # (1, 3, 4) from its own space
+    to_world: np.ndarray  # (1, 3, 4) from object space
     sign: np.ndarray  # (1,)
     table: type[Carried]
 
@@ -39,17 +39,17 @@ class Placed(Primitives):
 
 @dataclass(frozen=True)
 class Carried(Table):
-    """A primitive is met, and its point and normal are found, in its own space; distances are the same there.
+    """Primitives that are intersected, and whose points and normals are computed, in object space; t is the same there.
 
-    The first `axes_across` coordinates are of the round cross-section.
+    The first `axes_across` coordinates span the round cross-section.
     """
 
-    leaves: jax.Array  # of the origin of the own space, and of `duals`
+    leaves: jax.Array  # the origin of object space, and `duals`
     tree: Tree | None
-    to_world: jax.Array  # (P, 3, 4) from the own space
-    duals: jax.Array  # (P, 3, 3) to it: the inverse of the linear part
+    to_world: jax.Array  # (P, 3, 4) from object space
+    duals: jax.Array  # (P, 3, 3) to object space: the inverse of the linear part
     sign: jax.Array  # (P,) -1 where the normal points inwards
-    margins: jax.Array | None  # (P,) of `coincident`; None: no two of these coincide
+    margins: jax.Array | None  # (P,) of `coincident`; None: no two of these primitives coincide
 
     axes_across: ClassVar[int]
 
@@ -64,57 +64,57 @@ class Carried(Table):
 
     @classmethod
     def own_margins(cls, parts, dtype):
-        """0 for those that lie in no other one."""
+        """Return margins (P,): 0 for primitives that coincide with no other one."""
         to_world = np.concatenate([part.to_world for part in parts])
         where, across = cls.where(to_world)
         directions, sizes, _ = np.linalg.svd(across, full_matrices=False)
-        shape = (directions * sizes[:, None]) @ directions.swapaxes(1, 2)  # the same however the own space is turned
+        shape = (directions * sizes[:, None]) @ directions.swapaxes(1, 2)  # independent of rotations of object space
         low, high = cls.bounds(to_world)
         reach = np.linalg.norm(np.maximum(np.abs(low), np.abs(high)), axis=1)
         return coincident.margins_of_alike(np.concatenate([where, shape.reshape(-1, 9)], 1), reach, dtype)
 
-    # ---- of each kind
+    # ---- defined by each kind
 
     @classmethod
     @abstractmethod
     def bounds(cls, to_world: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(P, 3, 4) -> two (P, 3)."""
+        """Return the bounds, two (P, 3), for to_world (P, 3, 4)."""
 
     @classmethod
     @abstractmethod
     def where(cls, to_world: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(P, 3, 4) -> the same numbers (P, K) for what may coincide, and the axes across (P, 3, A)."""
+        """Return keys (P, K), equal for primitives that may coincide, and the axes across (P, 3, A)."""
 
     @classmethod
     def areas_of(cls, to_world: np.ndarray) -> np.ndarray:
-        """(P, 3, 4) -> (P,); of kinds that shine."""
+        """Return the areas (P,) for to_world (P, 3, 4). Only kinds that may be lamps implement it."""
         raise NotImplementedError
 
     @staticmethod
     @abstractmethod
     def meets(t, f, d):
-        """Whether the ray from f along d, in the own space, is on the primitive at t, where it meets what is round."""
+        """Return whether the ray f + t d in object space is on the primitive at t, a root of its round surface."""
 
     @staticmethod
     @abstractmethod
     def on(outward, along):
-        """The point in the own space; outward: (A,) unit; along: () beyond those coordinates."""
+        """Return the point in object space; outward: (A,) unit; along: () the third coordinate, where A is 2."""
 
     @staticmethod
     @abstractmethod
     def uv(local): ...
 
-    # ---- of a ray
+    # ---- one ray
 
     def intersect(self, leaf, prepared, start):
-        """As spheres are (see `sphere`), in the own space. What the ray starts on has a root that is exactly 0."""
+        """Intersect as spheres do (see `sphere`), in object space. The primitive of the start has a root exactly 0."""
         block = at(self.leaves, leaf)
         numbers = numbers_of(block, prepared[0].dtype)
         o, d = prepared
         from_origin = [o[i] - numbers[i] for i in range(3)]
         f, d = ([dot(numbers[3 + 3 * i : 6 + 3 * i], v) for i in range(3)] for v in (from_origin, d))
         f_across, d_across = f[: self.axes_across], d[: self.axes_across]
-        speed = jnp.sqrt(_squared(d_across))  # 0 along a cylinder: comparisons drop what follows
+        speed = jnp.sqrt(_squared(d_across))  # 0 along a cylinder: comparisons drop the inf and NaN that follow
         e = [each / speed for each in d_across]
         b = -_product(f_across, e)
         closest = [each + b * along for each, along in zip(f_across, e, strict=True)]
@@ -133,14 +133,14 @@ class Carried(Table):
         return self.sign.shape[0]
 
     def surface(self, row, o, d, t):
-        """No margin but where two coincide."""
+        """Compute the surface at t; the margin is 0 unless primitives coincide."""
         f, d = self.local(row, o), at(self.duals, row) @ d
         f_across, d_across = f[: self.axes_across], d[: self.axes_across]
         speed = safe_sqrt(_squared(d_across))
         e = d_across * safe_divide(1, speed)
         b = -_product(f_across, e)
         closest = f_across + b * e
-        # t says which of the two roots was found.
+        # t tells which of the two roots was hit.
         half_chord = jnp.copysign(safe_sqrt(1 - _squared(closest)), t * speed - b)
         outward = closest + half_chord * e
         outward = compute_once(outward * safe_divide(1, safe_sqrt(_squared(outward))))
@@ -150,7 +150,7 @@ class Carried(Table):
         return Surface(self.point(row, local), n, margin, n, self.uv(local))
 
     def local(self, row, p):
-        """A point of the world in the own space."""
+        """Transform a point from the world to object space."""
         return at(self.duals, row) @ (p - at(self.to_world, row)[:, 3])
 
     def point(self, row, local):
@@ -158,7 +158,7 @@ class Carried(Table):
         return to_world[:, 3] + to_world[:, :3] @ local
 
     def normal(self, row, outward):
-        """Unit; outward: (A,) of the own space."""
+        """Return the unit normal in the world; outward: (A,) in object space."""
         return normalize(outward @ at(self.duals, row)[: self.axes_across]) * at(self.sign, row)
 
     def along_u(self, row, surface):
@@ -167,7 +167,7 @@ class Carried(Table):
 
 
 def _product(a, b):
-    """Scalar product of two or three components."""
+    """Return the scalar product of two or three components."""
     return sum(a[i] * b[i] for i in range(1, len(a))) + a[0] * b[0]
 
 
@@ -176,7 +176,7 @@ def _squared(v):
 
 
 def invertible(to_world: np.ndarray) -> bool:
-    """Whether the inverse of (4, 4) is more than rounding in kernels, whatever the lengths of its axes are."""
+    """Return whether kernels can invert to_world (4, 4) beyond rounding error, whatever the lengths of its axes."""
     with np.errstate(all="ignore"):
         lengths = np.linalg.norm(to_world[:3, :3], axis=0)
         sizes = np.float32(lengths)

@@ -1,13 +1,12 @@
-"""Surfaces that lie in one another, found when a scene is built, so that rays leave all of them and see the right one.
+"""Coincident surfaces, detected when a scene is built, so that rays leave all of them and see the right one.
 
-The primitive that a ray starts on is excluded by number, and a lone rectangle, disk or sphere needs no more. Where
-another one lies in the same place, the origin as it was rounded may be on the far side of that one. There, and only
-there, so that sheets may be as thin as elsewhere, origins are moved along the normal by a margin that covers the
-rounding of both.
+The primitive that a ray starts on is excluded by index, which suffices for a lone rectangle, disk or sphere. If another
+primitive lies in the same place, the rounded origin may be on the far side of it. Only there, so that sheets elsewhere
+may be thin, origins are moved along the normal by a margin that covers the rounding of both.
 
-Some pairs have an order, and are parted by a gap that rounding cannot close, which costs nothing afterwards: there is
-air between a body and what it touches, and a lamp that lies in a wall shines from it. So a cube and glass shrink by the
-gap, and a sheet that shines comes forward. Meshes that are not flat stay as they are, and are not compared with each
+Some pairs have an order and are separated by a gap that rounding cannot close, at no cost while rendering: there is air
+between a body and whatever it touches, and a lamp that lies in a wall shines from it. So a cube and glass shrink by the
+gap, and an emitting sheet moves forward. Meshes that are not flat stay as they are, and are not compared with each
 other.
 """
 
@@ -20,32 +19,32 @@ import numpy as np
 
 from pathjax.system.cores import SMALL, over_cores
 
-# In machine epsilons of the coordinates along the normal, for each of the two primitives: an upper bound on what its
-# point, its plane and a distance from that lose by rounding (see `planar.leaf_numbers`).
+# In machine epsilons of the coordinates along the normal, for each of the two primitives: an upper bound on the
+# rounding errors of its point, its plane and a distance from the plane (see `planar.leaf_numbers`).
 MARGIN = 4
 # In machine epsilons of the scene's size, since rays come from anywhere in it.
 _GAP = 8
-# Of a large mesh all faces are compared with so many planes; for more of them, sorting the faces takes less.
+# All faces of a large mesh are compared with up to this number of planes; for more planes, sorting the faces is faster.
 MOST_PLANES = 64
-BLOCK = 1 << 13  # of them at a time: their numbers stay in the cache
+BLOCK = 1 << 13  # faces compared at a time: their coordinates stay in the cache
 
 
 class Faces(NamedTuple):
     """The flat faces of a shape."""
 
-    corners: np.ndarray  # (F, K, 3) float64; of a disk or a flat mesh those of a rectangle around it
-    normal: np.ndarray | None  # (F, 3) unit; None: they are fixed, share corners with others and would gape if moved
-    depth: np.ndarray | None  # (F,) of the body that the face closes; inf: it is a sheet
+    corners: np.ndarray  # (F, K, 3) float64; for a disk or a flat mesh, of a rectangle around it
+    normal: np.ndarray | None  # (F, 3) unit; None: fixed faces, which share corners and would leave gaps if moved
+    depth: np.ndarray | None  # (F,) depth of the body that the face bounds; inf: it is a sheet
     glass: bool
     lamp: bool
 
 
 def contacts(shapes: list[Faces], dtype) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """What is to be done about faces of different shapes that lie in one plane, up to rounding, and overlap.
+    """Resolve contacts of faces of different shapes that lie in one plane, up to rounding, and overlap.
 
     Returns:
-        By shape the moves (F, 3) that part its faces from what they touch, (3,) zeros if they are fixed; and its
-        margins (F,), 0 for lone faces.
+        For each shape, the moves (F, 3) that separate its faces from those they touch, (3,) zeros if they are fixed;
+        and its margins (F,), 0 for lone faces.
     """
     moves = [np.zeros(3 if each.normal is None else each.normal.shape) for each in shapes]
     margins = [np.zeros(len(each.corners)) for each in shapes]
@@ -53,7 +52,7 @@ def contacts(shapes: list[Faces], dtype) -> tuple[list[np.ndarray], list[np.ndar
     movable = [i for i, each in enumerate(shapes) if each.normal is not None]
     fixed = [i for i, each in enumerate(shapes) if each.normal is None]
     eps = np.finfo(dtype).eps
-    # Points are projected onto planes, which in one through the origin leaves what a rounding is of a rounding.
+    # Points are projected onto planes. In a plane through the origin this leaves an error of second order in eps.
     least = MARGIN * (eps * eps) * size
     for others in (movable, fixed):
         for i, row, j, partners, margin in _coplanar(shapes, movable, others, least, dtype):
@@ -83,26 +82,26 @@ def _face(faces: Faces, row) -> _Face:
 
 
 def _yields(face: _Face, other: _Face) -> bool:
-    """Whether a face makes way for another one that lies in it."""
+    """Return whether a face is moved away from another one that it coincides with."""
     body, other_body = np.isfinite(face.depth), np.isfinite(other.depth)
     if face.glass:
         return True
-    if body:  # two bodies side by side, but not one in the other
+    if body:  # two bodies move apart if they are side by side, not if one is inside the other
         return not other_body or face.normal @ other.normal < 0
     return face.lamp and not (other.lamp or other.glass or other_body)
 
 
 def unit_normal(vertices):
-    """(..., 3, 3) -> (..., 3) of triangles."""
+    """Return the unit normals (..., 3) of triangles (..., 3, 3)."""
     n = np.cross(vertices[..., 1, :] - vertices[..., 0, :], vertices[..., 2, :] - vertices[..., 0, :])
     return n / np.linalg.norm(n, axis=-1, keepdims=True)
 
 
 def margins_of_alike(keys: np.ndarray, reach: np.ndarray, dtype) -> np.ndarray:
-    """Margins (P,) of round primitives: 0 for those that coincide with no other one of their kind.
+    """Return margins (P,) of round primitives: 0 for those that coincide with no other one of their kind.
 
     Args:
-        keys: (P, K), the same numbers for primitives in the same place; reach: (P,) largest size of their coordinates.
+        keys: (P, K), equal for primitives in the same place; reach: (P,) largest magnitude of their coordinates.
     """
     margins = np.zeros(len(keys))
     pairs = close_pairs(keys, precision(dtype) * reach.max(initial=0))
@@ -111,10 +110,10 @@ def margins_of_alike(keys: np.ndarray, reach: np.ndarray, dtype) -> np.ndarray:
 
 
 def close_pairs(points: np.ndarray, distance: float) -> np.ndarray:
-    """(M, 2) pairs of the points (N, K) that lie so close to each other.
+    """Return the pairs (M, 2) of points (N, K) that lie within a distance of each other.
 
-    Points are sorted along a direction that is drawn, to which no regular arrangement is perpendicular: so the few
-    neighbours there are all that may be close. (SciPy's tree takes a quarter of a second to import.)
+    Points are sorted along a random direction, to which no regular arrangement is perpendicular, so only the few
+    neighbours in that order can be close. (SciPy's tree takes a quarter of a second to import.)
     """
     direction = np.random.default_rng(0).normal(size=points.shape[1])
     along = points @ (direction / np.linalg.norm(direction))
@@ -122,7 +121,7 @@ def close_pairs(points: np.ndarray, distance: float) -> np.ndarray:
     pairs = [np.empty((0, 2), int)]
     for shift in range(1, len(points)):
         both = np.stack([order[:-shift], order[shift:]], 1)
-        # Thrice, since places along the direction are rounded.
+        # 3 times the distance, since positions along the direction are rounded.
         both = both[np.diff(along[both])[:, 0] <= 3 * distance]
         if not len(both):
             break
@@ -132,15 +131,15 @@ def close_pairs(points: np.ndarray, distance: float) -> np.ndarray:
 
 
 def precision(dtype):
-    """Relative difference up to which coordinates may round to the same number, after transforms have rounded them."""
+    """Return the relative difference up to which coordinates, rounded by transforms, may round to the same value."""
     return np.finfo(dtype).eps / 2 + 8 * np.finfo(np.float64).eps
 
 
 def _coplanar(shapes: list[Faces], movable, others, least, dtype):
-    """For each movable face and each of the others that it touches: i, row, j, rows (N,), margins (N,) that clear both.
+    """Yield each movable face with each other that it touches: i, row, j, rows (N,), margins (N,) that clear both.
 
     Args:
-        movable, others: numbers i and j of shapes; least: margin to begin with.
+        movable, others: indices i and j of shapes; least: constant part of a margin.
     """
     if not movable or not others:
         return
@@ -166,7 +165,7 @@ def _coplanar(shapes: list[Faces], movable, others, least, dtype):
         for row, (mine, normal) in enumerate(zip(shapes[i].corners, shapes[i].normal, strict=True)):
             slack = precision(dtype) * np.abs(mine).max(0)
             bottom, top = mine.min(0) - slack, mine.max(0) + slack
-            # What may overlap along an axis is a range. It is short where the face is thin, but for tiles of a floor.
+            # Candidates that overlap along an axis are a range, short where the face is thin, except for floor tiles.
             for axis in np.argsort(top - bottom):
                 order, ends = by_lower_end(axis)
                 start, stop = np.searchsorted(ends, (bottom[axis] - longest[axis], np.nextafter(top[axis], np.inf)))
@@ -174,22 +173,22 @@ def _coplanar(shapes: list[Faces], movable, others, least, dtype):
                     break
             near = order[start:stop]
             near = near[(lo[near] <= top).all(1) & (hi[near] >= bottom).all(1) & (owner[near] != i)]
-            # The size of coordinates along the normal, to which rounding is relative.
+            # Magnitude of the coordinates along the normal, to which rounding is relative.
             reach = (np.abs(mine).max(0) + np.abs(corners[near]).max(1)) @ np.abs(normal)
             within = np.abs((corners[near] - mine[0]) @ normal).max(1, initial=0) <= precision(dtype) * reach
             near, margin = near[within], least + MARGIN * np.finfo(dtype).eps * reach[within]
             for j in np.unique(owner[near]):
                 touches = owner[near] == j
                 partners = rows[near[touches]], margin[touches]
-                # The faces of a body differ from each other, and those of a mesh that stays in place are alike here.
+                # The faces of a body are handled one by one; those of a fixed mesh are treated alike, as one group.
                 groups = zip(*partners, strict=True) if shapes[j].normal is not None else [partners]
                 yield from ((i, row, j, *map(np.atleast_1d, group)) for group in groups)
 
 
 def _near_any(corners, bottoms, tops, points, normals, tolerance):
-    """Return the rows of the faces (F, K, 3) that may lie in the plane of a box that reaches the faces' own.
+    """Return the rows of the faces (F, K, 3) that may lie in the plane of a box that overlaps the faces' bounds.
 
-    Few triangles of a large mesh are near what it stands on.
+    Few triangles of a large mesh are near the plane on which it stands.
 
     Args:
         bottoms, tops: (M, 3) the boxes; points, normals: (M, 3) a point of each plane, and its unit normal.
@@ -212,14 +211,14 @@ def _near_any(corners, bottoms, tops, points, normals, tolerance):
 
 
 def _in_any_plane(corners, points, normals, tolerance):
-    """Rows of the corners (F, 3) that lie in any of the planes, up to what rounding may be."""
+    """Return the rows of the corners (F, 3) that lie in any of the planes, up to rounding."""
 
     def within(begin):
         x, y, z = np.ascontiguousarray(corners[begin : begin + BLOCK].T)
         farthest = [np.abs(column).max() for column in (x, y, z)]
         found = np.zeros(len(x), bool)
         for point, n in zip(points, normals, strict=True):
-            # Twice: these sums are rounded, and have other orders than those that decide.
+            # Twice: these sums are rounded, and in another order than the sums of the final test.
             reach = 2 * tolerance * ((np.abs(point) + farthest) @ np.abs(n))
             found |= np.abs(n[0] * x + n[1] * y + n[2] * z - point @ n) <= reach
         return begin + np.flatnonzero(found)
@@ -229,5 +228,5 @@ def _in_any_plane(corners, points, normals, tolerance):
 
 
 def _ends(corners):
-    """(F, K, 3) -> lower and upper ends (F, 3)."""
+    """Return the lower and upper ends (F, 3) of faces (F, K, 3)."""
     return [reduce(end, np.moveaxis(corners, 1, 0)) for end in (np.minimum, np.maximum)]

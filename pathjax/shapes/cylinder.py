@@ -14,16 +14,16 @@ from pathjax.description.fields import Fields
 from pathjax.shapes.carried import Carried, Placed, invertible
 from pathjax.shapes.shape import ROUND, Shape
 
-# Share of the way to a lamp: what lies in its last part, seen from a point on the lamp itself, is that point.
+# Relative tolerance: a crossing of the wall that lies within this share of the distance to `ref` is `ref` itself.
 CLEAR = 1e-3
-# After so many of Gauss's means, which square the error each time, those of any two float32 numbers agree.
+# Steps of Gauss's mean, which squares the error each time: enough for the means of any two float32 values to agree.
 MEANS = 12
 
 
 @register_dataclass
 @dataclass(frozen=True)
 class Cylinders(Carried):
-    """The own space has the unit circles around the z axis from z = 0, where v = 0, to z = 1."""
+    """Cylinders; in object space they are the unit circles around the z axis from z = 0, where v = 0, to z = 1."""
 
     kind = "cylinder"
     axes_across = 2
@@ -36,7 +36,7 @@ class Cylinders(Carried):
 
     @classmethod
     def where(cls, to_world):
-        """The line of the axis, by its direction, whichever way, and its point nearest to the origin."""
+        """Return the axis as a line: its direction, of fixed sign, and point nearest to the origin; and axes across."""
         axis, start = to_world[:, :, 2], to_world[:, :, 3]
         axis = axis / np.linalg.norm(axis, axis=1, keepdims=True)
         axis = axis * np.copysign(1, axis[np.arange(len(axis)), np.abs(axis).argmax(1)])[:, None]
@@ -47,7 +47,7 @@ class Cylinders(Carried):
 
     @classmethod
     def areas_of(cls, to_world):
-        """Perimeters of the ellipse that tells how the area spreads over the azimuth, by Gauss's means."""
+        """Return areas as perimeters, by Gauss's mean, of the ellipse that gives the area per azimuth."""
         x, y, z = np.moveaxis(to_world[:, :, :3], 2, 0)
         a, b = np.linalg.svd(np.stack([np.cross(x, z), np.cross(y, z)], 2), compute_uv=False).T
         rest, weight = a * a, 0.5
@@ -58,7 +58,7 @@ class Cylinders(Carried):
 
     @staticmethod
     def meets(t, f, d):
-        """The ends are inclusive by rounding, so that disks close them without a gap."""
+        """Include the ends up to rounding, so that disks close them without a gap."""
         slack = 8 * np.finfo(t.dtype).eps
         rise = t * d[2]
         slack = slack * (jnp.abs(f[2]) + 1 + jnp.abs(rise))
@@ -75,16 +75,16 @@ class Cylinders(Carried):
     # ---- light
 
     def sample(self, row, u):
-        """Uniform in the azimuth of the own space, and along the axis: in area, where it is round."""
+        """Draw uniformly in the azimuth of object space and along the axis: uniformly in area, if it is round."""
         return self.from_square(row, u)
 
     def sample_lamp(self, lamps, lamp, ref, u, u_part):
-        """Draw as for any lamp; of an inner wall only what is seen through the ends: a shadow ray passes its lamp."""
+        """Draw as for any lamp, with pdf 0 for inner points that the wall hides: shadow rays ignore their own lamp."""
         drawn = super().sample_lamp(lamps, lamp, ref, u, u_part)
         row, distance = drawn.primitive, drawn.distance
         f, d = self.local(row, ref), at(self.duals, row) @ drawn.d
         outward = f[:2] + distance * d[:2]
-        # How far back along the ray the wall is met again; as far as `ref`, or farther, where that lies inside.
+        # Distance back along the ray to the other crossing of the wall; at `ref` or beyond it, if `ref` lies inside.
         chord = safe_divide(2 * (d[0] * outward[0] + d[1] * outward[1]), d[0] * d[0] + d[1] * d[1])
         along = f[2] + (distance - chord) * d[2]
         enters = (chord > 0) & (chord < distance * (1 - CLEAR)) & (along > 0) & (along < 1)
@@ -96,7 +96,7 @@ class Cylinders(Carried):
         return super().lamp_density(lamps, lamp, first, ray, hit, surface) * thinning
 
     def _thinning(self, lamps, lamp, row, local):
-        """Density of points of a lamp, over that of points that are uniform in area."""
+        """Return the density of sampled points of a lamp, relative to a density uniform in area."""
         axes = at(self.to_world, row)
         spread = cross(local[0] * axes[:, 1] - local[1] * axes[:, 0], axes[:, 2])
         return safe_divide(at(lamps.area, lamp) / (2 * math.pi), jnp.sqrt(dot(spread, spread)))
@@ -131,7 +131,7 @@ class Cylinders(Carried):
 
 @dataclass(frozen=True)
 class Cylinder(Shape):
-    to_world: np.ndarray  # (4, 4) carries the unit circles around the z axis at z = 0 and at z = 1 to the two ends
+    to_world: np.ndarray  # (4, 4) maps the unit circles around the z axis at z = 0 and z = 1 to the two ends
     table = Cylinders
 
     @classmethod
@@ -142,7 +142,7 @@ class Cylinder(Shape):
         if not 0 < length < 3e38:
             raise fields.error("p1", "is where p0 is; the two are the ends of the axis")
         axis = (p1 - p0) / length
-        # The frame that Mitsuba takes, so that u begins where it does.
+        # Mitsuba's frame, so that u begins where it does there.
         sign = math.copysign(1, axis[2])
         s = [1 - sign * axis[0] ** 2 / (sign + axis[2]), -sign * axis[0] * axis[1] / (sign + axis[2]), -sign * axis[0]]
         local = np.eye(4)
@@ -154,7 +154,7 @@ class Cylinder(Shape):
 
     @classmethod
     def of(cls, to_world: np.ndarray) -> Cylinder | None:
-        """What the unit cylinder becomes, if that is not flat."""
+        """Return the transformed unit cylinder; None if it is flat."""
         return cls(to_world) if invertible(to_world) else None
 
     def placed(self, to_world):

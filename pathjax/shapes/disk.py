@@ -53,6 +53,6 @@ class Disks(Planar):
 
 
 class Disk(PlanarShape):
-    """Unit disk in the xy plane, normal +z, carried by `to_world`."""
+    """Unit disk in the xy plane, normal +z, transformed by `to_world`."""
 
     table = Disks

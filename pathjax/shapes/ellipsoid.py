@@ -1,4 +1,4 @@
-"""Ellipsoids: what instances make of spheres where they scale unevenly or shear."""
+"""Ellipsoids, which instances make of spheres if they scale unevenly or shear."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from pathjax.shapes.shape import Shape
 @register_dataclass
 @dataclass(frozen=True)
 class Ellipsoids(Carried):
-    """The own space has the unit sphere."""
+    """Ellipsoids; in object space they are the unit sphere."""
 
     kind = "ellipsoid"
     axes_across = 3
@@ -50,9 +50,9 @@ class Ellipsoids(Carried):
 
 @dataclass(frozen=True)
 class Ellipsoid(Shape):
-    """No scene file names it."""
+    """A unit sphere transformed by `to_world`. No scene file names it."""
 
-    to_world: np.ndarray  # (4, 4) carries the unit sphere
+    to_world: np.ndarray  # (4, 4)
     table = Ellipsoids
     closed = True
 

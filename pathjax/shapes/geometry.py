@@ -1,6 +1,6 @@
-"""All shapes of a scene behind three questions: what does a ray hit first, is it blocked, what is there.
+"""All shapes of a scene behind three queries: the closest hit of a ray, whether it is occluded, the surface at a hit.
 
-Hits are found on detached rays; `surface` then computes the point again from the ray, differentiably.
+Hits are found on detached rays; `surface` then recomputes the point from the ray, differentiably.
 """
 
 from __future__ import annotations
@@ -20,29 +20,29 @@ from pathjax.core.types import Hit, Ray, Surface
 from pathjax.shapes.accel import traverse as bvh
 from pathjax.shapes.shape import Lamps, LampSample, Searched, Table
 
-# As a primitive: none. As the bits of a float32 distance: beyond infinity.
+# As a primitive index: no hit. As the bits of a float32 distance: beyond infinity.
 NO_HIT = np.int32(0x7FFFFFFF)
 
 
 @register_dataclass
 @dataclass(frozen=True)
 class Geometry:
-    tables: tuple[Table, ...]  # one for each kind of primitive present, through which these are numbered in this order
-    shape: Int[Array, " P"]  # of each primitive, its place in the scene file
-    light: Int[Array, " P"] | None  # number of its light; -1: emits nothing. None: lights are not built yet
-    tangents: bool = field(default=False, metadata={"static": True})  # whether `surface` tells them
+    tables: tuple[Table, ...]  # one for each kind of primitive present; primitives are numbered through them in order
+    shape: Int[Array, " P"]  # index in the scene file of each primitive's shape
+    light: Int[Array, " P"] | None  # index of each primitive's light; -1: emits nothing. None: lights not yet built
+    tangents: bool = field(default=False, metadata={"static": True})  # whether `surface` returns these fields
     along: bool = field(default=False, metadata={"static": True})
     corners: bool = field(default=False, metadata={"static": True})
 
 
 def firsts(geometry: Geometry) -> list[int]:
-    """Number of the first primitive of each table."""
+    """Return the index of the first primitive of each table."""
     counts = [table.count for table in geometry.tables]
     return np.cumsum([0, *counts])[:-1].tolist()
 
 
 def closest_hit(geometry: Geometry, ray: Ray) -> Hit:
-    """First primitive that the ray meets at 0 < t <= ray.t_max; of coincident ones the lowest."""
+    """Find the first primitive that the ray meets at 0 < t <= ray.t_max; among coincident ones the lowest index."""
     none = jnp.int32(NO_HIT)
     ray = jax.tree.map(lax.stop_gradient, ray)
 
@@ -53,7 +53,7 @@ def closest_hit(geometry: Geometry, ray: Ray) -> Hit:
 
     def search(traverse, intersect, first, t, primitive):
         def row_in(leaf):
-            """Row of the nearest primitive of a leaf; of coincident ones the lowest, as rows ascend with the lanes."""
+            """Return the nearest primitive of a leaf; if coincident, the lowest row, as rows ascend with the lanes."""
             distances, rows = intersect(leaf)
 
             def pick():
@@ -62,11 +62,11 @@ def closest_hit(geometry: Geometry, ray: Ray) -> Hit:
                 tied = jnp.sum(jnp.left_shift((order == _least(order)).astype(jnp.int32), lanes), dtype=jnp.int32)
                 return at(rows, lax.population_count(~tied & (tied - 1)))
 
-            # A branch reads what was computed before it; without, each that reads distances would compute them again.
+            # A branch reads operands computed before it; without one, each reader would compute the distances again.
             return lax.cond(leaf >= 0, pick, lambda: none)
 
         def lowest_at(distance, row):
-            """The lowest row of all that are hit at this distance, one of which is known."""
+            """Return the lowest row of all that are hit at this distance, given one of them."""
             wanted = _order(distance)
 
             def lower(leaf, t, row):
@@ -75,8 +75,8 @@ def closest_hit(geometry: Geometry, ray: Ray) -> Hit:
 
             return traverse(lower, distance, row)[1]
 
-        # Most leaves are left as they are found: which of their primitives is hit is asked at the end. `found` is the
-        # leaf with the nearest one, doubled, and 1 is added if another leaf has one as near; -1: none is found.
+        # Traversal keeps only the nearest leaf; which of its primitives is hit is determined at the end. `found` is
+        # twice the leaf with the nearest hit, plus 1 if another leaf has a hit at the same distance; -1: no hit yet.
         def leaf_test(leaf, t, found):
             nearest = jnp.min(_order(intersect(leaf)[0]))
             beyond = lax.bitcast_convert_type(jnp.maximum(_bits(t), 0), nearest.dtype)
@@ -96,7 +96,7 @@ def closest_hit(geometry: Geometry, ray: Ray) -> Hit:
 
         return traverse(leaf_test, t, jnp.int32(-1), result)
 
-    # A miss is infinitely far, and no bound may equal that.
+    # A miss is infinitely far, so the bound on t must be finite.
     farthest = smaller(ray.t_max, jnp.full_like(ray.t_max, jnp.finfo(ray.t_max.dtype).max))
     t, primitive = _visit(geometry, ray, test_one, search, farthest, none)
     found = primitive != none
@@ -105,7 +105,7 @@ def closest_hit(geometry: Geometry, ray: Ray) -> Hit:
 
 
 def occluded(geometry: Geometry, ray: Ray, target: Int[Array, ""]) -> Bool[Array, ""]:
-    """Whether anything but the primitive `target` lies at 0 < t < ray.t_max."""
+    """Return whether any primitive but `target` lies at 0 < t < ray.t_max."""
 
     def test_one(distances, rows, first, t, primitive):
         blocked = jnp.any((distances > 0) & (distances < t) & (rows != target - first))
@@ -116,7 +116,7 @@ def occluded(geometry: Geometry, ray: Ray, target: Int[Array, ""]) -> Bool[Array
             distances, rows = intersect(leaf)
             order = _order(distances)
             before = order < lax.bitcast_convert_type(jnp.maximum(_bits(t), 1) - 1, order.dtype)
-            # Sums of numbers vectorise, those of flags do not.
+            # Integer sums vectorise, reductions of booleans do not.
             blocked = jnp.sum((before & (rows != target - first)).astype(jnp.int32)) != 0
             return jnp.where(blocked, -1, t), primitive
 
@@ -128,7 +128,7 @@ def occluded(geometry: Geometry, ray: Ray, target: Int[Array, ""]) -> Bool[Array
 
 
 def surface(geometry: Geometry, ray: Ray, hit: Hit) -> Surface:
-    """What the ray sees at its hit; differentiable in the ray. A miss gives the surface of some primitive."""
+    """Return the surface at the hit, differentiable in the ray. A miss gives the surface of some primitive."""
     first = firsts(geometry)
     primitive = jnp.maximum(hit.primitive, 0)
     names = [name for table in geometry.tables for name in table.attributes]
@@ -153,7 +153,7 @@ def surface(geometry: Geometry, ray: Ray, hit: Hit) -> Surface:
 
 
 def _tangent(along_u, n):
-    """Unit vector across n; any, where u does not grow along the surface."""
+    """Return the unit vector of `along_u` made perpendicular to n; an arbitrary one if u is constant on the surface."""
     across = along_u - dot(along_u, n) * n
     squared = dot(across, across)
     found = squared > 0
@@ -161,7 +161,7 @@ def _tangent(along_u, n):
 
 
 def _along(surface, o, n):
-    """Derivatives of the point in u and in v, detached, from how both change as the ray moves sideways."""
+    """Return the derivatives of the point in u and in v, detached, from those of both as the ray moves sideways."""
     across = frame_from_normal(n)
 
     def moved(direction):
@@ -173,7 +173,7 @@ def _along(surface, o, n):
 
 
 def emits(geometry: Geometry, hit: Hit) -> Bool[Array, ""]:
-    """Whether what was hit is a light."""
+    """Return whether the hit primitive emits."""
     return (hit.primitive >= 0) & (at(geometry.light, jnp.maximum(hit.primitive, 0)) >= 0)
 
 
@@ -185,7 +185,7 @@ def sample_lamp(
     u: Float[Array, "2"],
     u_part: Float[Array, ""],
 ) -> LampSample:
-    """A point of a lamp as seen from `ref`: uniform in area, for spheres in the cone that they fill.
+    """Sample a point of a lamp as seen from `ref`: uniform in area, for spheres in the cone that they subtend.
 
     lamp: row of `lamps`; u_part: chooses the triangle of a mesh.
     """
@@ -204,7 +204,7 @@ def sample_lamp(
 def lamp_density(
     geometry: Geometry, lamps: Lamps, lamp: Int[Array, ""], ray: Ray, hit: Hit, surface: Surface
 ) -> Float[Array, ""]:
-    """Density [1/sr] with which `sample_lamp`, seen from ray.o, finds what the ray hit, a point of this lamp."""
+    """Return the density [1/sr] with which `sample_lamp`, from ray.o, draws the point of this lamp that the ray hit."""
     first = firsts(geometry)
 
     def of(index):
@@ -219,7 +219,7 @@ def _switch_by_lamp(lamps, lamp, of):
 
 
 def switch_by_range(number: Int[Array, ""], first: list[int], branches: list[Callable]):
-    """Call the branch whose range, starting at first[i], holds the number. One branch is called without a test."""
+    """Call the branch whose range, starting at first[i], holds the number. A single branch is called without a test."""
     if len(branches) == 1:
         return branches[0]()
     index = sum((number >= start).astype(jnp.int32) for start in first[1:])
@@ -227,13 +227,13 @@ def switch_by_range(number: Int[Array, ""], first: list[int], branches: list[Cal
 
 
 def _visit(geometry: Geometry, ray: Ray, test_one, search, t, primitive):
-    """Give all primitives that the ray may meet to a test.
+    """Test all primitives that the ray may meet.
 
     Args:
         test_one: (distances (1,), rows (1,), first, t, primitive) -> (t, primitive), where there is no tree. The
             primitives are first + rows.
         search: (traverse, intersect, first, t, primitive) -> (t, primitive), where there is a tree. traverse is that of
-            `bvh`: (leaf test, t, found, result); intersect: number of a leaf -> (distances (W,), rows (W,)).
+            `bvh`: (leaf test, t, found, result); intersect: index of a leaf -> (distances (W,), rows (W,)).
     """
     for table, first in zip(geometry.tables, firsts(geometry), strict=True):
         for part in table.searched():
@@ -259,18 +259,18 @@ def _visit_table(table: Searched, first, ray, test_one, search, t, primitive):
     found = lax.fori_loop(
         0, len(table.leaves), lambda number, state: test_one(*intersect(number), first, *state), (t, primitive)
     )
-    # XLA dissolves a loop of one trip, and would test again for each consumer.
+    # XLA inlines a loop of one iteration, and would repeat the test for each consumer.
     return compute_once(found)
 
 
 def _order(x):
-    """(W,) unsigned integers that order as positive floats x do, whose bits less 1 they are; others come last."""
+    """Return (W,) unsigned integers, the bits of x less 1, that order as positive floats x do; others come last."""
     bits = _bits(x)
     return lax.bitcast_convert_type(bits, np.dtype(f"u{bits.dtype.itemsize}")) - 1
 
 
 def _least(x):
-    """Minimum of (W,) integers, W a power of 2. (XLA reduces one by one; halves fold into each other.)"""
+    """Return the minimum of (W,) integers, W a power of 2, by halving. (XLA would reduce them one by one.)"""
     while len(x) > 1:
         half = len(x) // 2
         x = smaller(x[:half], x[half:])
@@ -278,5 +278,5 @@ def _least(x):
 
 
 def _bits(x):
-    """Integers that order as the positive floats x do."""
+    """Return integers that order as the positive floats x do."""
     return lax.bitcast_convert_type(x, integer_like(x.dtype))

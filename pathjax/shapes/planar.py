@@ -1,7 +1,7 @@
-"""What rectangles and disks have in common: a plane, and two coordinates on it.
+"""Common base of rectangles and disks: a plane with two coordinates.
 
 A point of the plane is c + x a + y b; the shape is |x|, |y| <= 1 for a rectangle (a parallelogram where sheared) and
-x^2 + y^2 <= 1 for a disk (an ellipse). One test stands for the two triangles of a rectangle, and a disk is exact.
+x^2 + y^2 <= 1 for a disk (an ellipse). One test replaces the two triangles of a rectangle, and a disk is exact.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from pathjax.shapes.accel.traverse import Tree
 from pathjax.shapes.coincident import Faces
 from pathjax.shapes.shape import Primitives, Searched, Shape, Table
 
-# The frame, as in `Frames`, of [-1, 1]^2 in the xy plane, or of what lies in it.
+# The frame, as in `Frames`, of [-1, 1]^2 in the xy plane, or of the disk in it.
 FLAT = np.array([[[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]], float)
 
 
@@ -30,10 +30,10 @@ FLAT = np.array([[[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]], float)
 class Frames(Primitives):
     frames: np.ndarray  # (F, 4, 3) centre, directions of u and v as long as half the sides, unit normal
     areas: np.ndarray  # (F,)
-    found_by: ClassVar[type[Searched] | None] = None  # instead of one by one
+    found_by: ClassVar[type[Searched] | None] = None  # intersects several faces at once; None: one by one
 
     def depths(self):
-        """(F,) of the body that the face closes; inf: it is a sheet."""
+        """Return the depths (F,) of the body that each face bounds; inf: the face is a sheet."""
         return np.full(len(self.frames), np.inf)
 
     def boxes(self):
@@ -81,10 +81,10 @@ class Planar(Table):
     leaves: jax.Array  # of `leaf_numbers`
     tree: Tree | None
     frames: jax.Array  # (P, 4, 3): c, a, b, unit normal
-    margins: jax.Array | None  # (P,) of `coincident`; None: no other primitive lies in any of these
-    more: Searched | None  # which finds the last of them, in place of the leaves; None: there are no such
+    margins: jax.Array | None  # (P,) of `coincident`; None: no other primitive coincides with any of these
+    more: Searched | None  # intersects the last primitives, which `leaves` lacks; None: `leaves` has all
 
-    unit_area: ClassVar[float]  # where a and b are unit and orthogonal
+    unit_area: ClassVar[float]  # area if a and b are unit and orthogonal
 
     @classmethod
     def build(cls, parts, lit, dtype, rule, margins):
@@ -100,7 +100,7 @@ class Planar(Table):
 
     @classmethod
     def bounds(cls, frames):
-        """(P, 4, 3) -> two (P, 3)."""
+        """Return the bounds, two (P, 3), of frames (P, 4, 3)."""
         c, a, b, _ = np.moveaxis(frames, 1, 0)
         reach = cls.reach(a, b)
         return c - reach, c + reach
@@ -108,7 +108,7 @@ class Planar(Table):
     @staticmethod
     @abstractmethod
     def reach(a, b):
-        """(P, 3) from the middle to the bounds."""
+        """Return the extents (P, 3) from the centre to the bounds."""
 
     @classmethod
     def areas_of(cls, frames):
@@ -121,7 +121,7 @@ class Planar(Table):
         return super().searched() + ([] if self.more is None else [self.more])
 
     def intersect(self, leaf, prepared, start):
-        """The border is inclusive by the rounding error of the coordinate, so faces that share an edge leave no gap."""
+        """Include the border up to the rounding error of a coordinate, so that faces sharing an edge leave no gap."""
         o, d = prepared
         block = at(self.leaves, leaf)
         leaf = numbers_of(block, d.dtype)
@@ -138,15 +138,17 @@ class Planar(Table):
     @staticmethod
     @abstractmethod
     def inside(x, y, reach):
-        """(W,) bool: whether the point of these coordinates lies in the shape of this size, 1 but for rounding."""
+        """Return (W,) bool: whether the point (x, y) lies in the shape scaled by reach, which is 1 plus rounding."""
 
     @property
     def count(self):
         return self.frames.shape[0]
 
     def surface(self, row, o, d, t):
-        """No margin where nothing else lies in the plane: the primitive is excluded by number, and its few neighbours
-        err only within rounding of the shared edge. So a sheet of glass may be as thin as the coordinates can tell.
+        """Compute the surface at t.
+
+        The margin is 0 if nothing else lies in the plane: the primitive is excluded by index, and its few neighbours
+        err only within rounding of the shared edge. So a sheet of glass may be as thin as coordinates can represent.
         """
         c, a, b, n = at(self.frames, row)
         from_c = o - c
@@ -159,18 +161,18 @@ class Planar(Table):
     @staticmethod
     @abstractmethod
     def uv(x, y):
-        """(2,) of the point of these coordinates."""
+        """Return uv (2,) of the point (x, y)."""
 
     @staticmethod
     @abstractmethod
     def from_unit_square(u):
-        """Coordinates x, y that are uniform in area: u (2,) -> (2,)."""
+        """Map uniform u (2,) to coordinates x, y (2,) that are uniform in area."""
 
     def sample(self, row, u):
         return self.point(row, self.from_unit_square(u))
 
     def point(self, row, xy):
-        """The point (3,) of coordinates (2,), the normal (3,), and the rounding error along it ()."""
+        """Return the point (3,) of coordinates xy (2,), the normal (3,), and the rounding error along it ()."""
         c, a, b, n = at(self.frames, row)
         margin = dot(jnp.abs(n), jnp.abs(c) + jnp.abs(a) + jnp.abs(b)) * (4 * np.finfo(c.dtype).eps)
         return c + xy[0] * a + xy[1] * b, n, margin
@@ -182,11 +184,11 @@ class Planar(Table):
     @staticmethod
     @abstractmethod
     def square(x, y):
-        """(2,) in [0, 1], in which equal areas are equal."""
+        """Map x, y to coordinates (2,) in [0, 1] that preserve area ratios."""
 
 
 def _coordinates(q, a, b):
-    """x and y of q = x a + y b."""
+    """Return x and y of q = x a + y b."""
     aa, ab, bb = dot(a, a), dot(a, b), dot(b, b)
     qa, qb = dot(q, a), dot(q, b)
     scale = 1 / (aa * bb - ab * ab)
@@ -194,7 +196,7 @@ def _coordinates(q, a, b):
 
 
 def leaf_numbers(frames):
-    """(P, 4, 3) float64 -> (P, 14): c, normal, dual vectors of a and b, bound on the coordinates' rounding."""
+    """Return (P, 14) from frames (P, 4, 3) float64: c, normal, duals of a and b, bound on the rounding of x and y."""
     c, a, b, n = np.moveaxis(np.asarray(frames, np.float64), 1, 0)
     normal = np.cross(a, b)
     squared = (normal**2).sum(-1, keepdims=True)
@@ -208,6 +210,6 @@ def leaf_numbers(frames):
 
 
 def corners(frames):
-    """(P, 4, 3) -> (P, 4, 3) of the rectangle, or of that around the disk."""
+    """Return the corners (P, 4, 3) of the rectangle, or of that around the disk, for frames (P, 4, 3)."""
     c, a, b, _ = np.moveaxis(frames, 1, 0)
     return np.stack([c - a - b, c + a - b, c + a + b, c - a + b], 1)

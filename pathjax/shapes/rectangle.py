@@ -53,7 +53,7 @@ class Rectangles(Planar):
 
 
 class Rectangle(PlanarShape):
-    """[-1, 1]^2 in the xy plane, normal +z, carried by `to_world`."""
+    """[-1, 1]^2 in the xy plane, normal +z, transformed by `to_world`."""
 
     unused = PlanarShape.unused | {"face_normals": Unused("boolean")}  # Mitsuba makes a mesh of it
     table = Rectangles

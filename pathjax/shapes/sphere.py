@@ -50,12 +50,12 @@ class Ball(Primitives):
 @register_dataclass
 @dataclass(frozen=True)
 class Spheres(Table):
-    leaves: jax.Array  # of center, radius
+    leaves: jax.Array  # center, radius
     tree: Tree | None
     balls: jax.Array  # (P, 4) center, radius
     to_local: jax.Array  # (P, 3, 3) rotation into the frame of its uv
     sign: jax.Array  # (P,) -1 where the normal points inwards
-    margins: jax.Array | None  # (P,) of `coincident`; None: no two of these coincide
+    margins: jax.Array | None  # (P,) of `coincident`; None: no two spheres coincide
 
     kind = "sphere"
     even_chords = True
@@ -68,14 +68,14 @@ class Spheres(Table):
 
     @classmethod
     def own_margins(cls, parts, dtype):
-        """0 for spheres that no other one coincides with."""
+        """Return margins (P,): 0 for spheres that coincide with no other one."""
         balls = np.concatenate([part.balls for part in parts])
         return coincident.margins_of_alike(balls, np.linalg.norm(balls[:, :3], axis=1) + balls[:, 3], dtype)
 
     def intersect(self, leaf, prepared, start):
-        """Discriminant from the vector of closest approach, roots without cancellation (Haines, Gunther, Akenine-Moller
-        2019, "Precision improvements for ray/sphere intersection"). The sphere that the ray starts on has a root there
-        that is exactly 0.
+        """Compute the discriminant from the vector of closest approach, and the roots without cancellation (Haines,
+        Gunther, Akenine-Moller 2019, "Precision improvements for ray/sphere intersection"). The sphere that the ray
+        starts on has a root that is exactly 0.
         """
         o, d = prepared
         block = at(self.leaves, leaf)
@@ -84,7 +84,7 @@ class Spheres(Table):
         f = [o[axis] - leaf[axis] for axis in range(3)]
         b = -dot(f, d)
         closest = [f[axis] + b * d[axis] for axis in range(3)]
-        half_chord = jnp.sqrt(radius * radius - dot(closest, closest))  # NaN: a miss, and every comparison drops it
+        half_chord = jnp.sqrt(radius * radius - dot(closest, closest))  # NaN: a miss, which every comparison drops
         f_length = jnp.sqrt(dot(f, f))
         rows = rows_of(block)
         c = jnp.where(rows == start, 0, (f_length - radius) * (f_length + radius))
@@ -98,14 +98,14 @@ class Spheres(Table):
         return self.balls.shape[0]
 
     def surface(self, row, o, d, t):
-        """No margin but where two coincide."""
+        """Compute the surface at t; the margin is 0 unless spheres coincide."""
         ball = at(self.balls, row)
         center, radius = ball[:3], ball[3]
         f = o - center
         b = -dot(f, d)
         closest = f + b * d
         half_chord = safe_sqrt(radius * radius - dot(closest, closest))
-        # t says which of the two roots was found.
+        # t tells which of the two roots was hit.
         outward = compute_once(normalize(closest + jnp.copysign(half_chord, t - b) * d))
         local = compute_once(at(self.to_local, row) @ outward)
         n = outward * at(self.sign, row)
@@ -116,7 +116,7 @@ class Spheres(Table):
         return cross(at(self.to_local, row)[2], surface.p - at(self.balls, row)[:3])
 
     def sample_lamp(self, lamps, lamp, ref, u, u_part):
-        """Uniform over the cone that the sphere fills seen from `ref`, or over its area from inside."""
+        """Sample uniformly the cone that the sphere subtends at `ref`; from inside, uniformly its area."""
         row = at(lamps.first, lamp)
         ball = at(self.balls, row)
         center, radius = ball[:3], ball[3]
@@ -124,7 +124,7 @@ class Spheres(Table):
         to_center = center - ref
         axis = normalize(to_center)
         frame = frame_from_normal(axis)
-        # Read by five results: without the barrier each computes it again.
+        # Five results read d: without the barrier each would compute it again.
         d = compute_once(to_world(frame, square_to_cone(u, one_minus_cos)))
         b = dot(to_center, d)
         closest = b * d - to_center
@@ -152,7 +152,7 @@ class Spheres(Table):
 
     @property
     def turned_inwards(self):
-        """(P,) bool: the normal points inwards."""
+        """Whether each normal points inwards, (P,) bool."""
         return np.asarray(self.sign) < 0
 
     def areas(self):
@@ -181,7 +181,7 @@ class Spheres(Table):
 class Sphere(Shape):
     center: np.ndarray  # (3,) world
     radius: float
-    to_world: np.ndarray  # (4, 4) carries the unit sphere at the origin; only its rotation matters further (uv)
+    to_world: np.ndarray  # (4, 4) maps the unit sphere at the origin; in kernels only its rotation matters (uv)
     table = Spheres
     closed = True
 
@@ -202,7 +202,7 @@ class Sphere(Shape):
 
     @classmethod
     def of(cls, to_world: np.ndarray) -> Sphere | None:
-        """What the unit sphere becomes, if that is a sphere."""
+        """Return the transformed unit sphere; None if it is not a sphere."""
         radius = float(np.linalg.norm(to_world[:3, 0]))
         with np.errstate(all="ignore"):
             unit = to_world[:3, :3] / radius
@@ -225,7 +225,7 @@ class Sphere(Shape):
 
 
 def _rounded(to_world):
-    """What turns and moves like it, and scales all axes as it scales x."""
+    """Return a transform of the same rotation and translation that scales all axes as `to_world` scales x."""
     with np.errstate(all="ignore"):
         u, _, vt = np.linalg.svd(to_world[:3, :3])
         made = np.eye(4)
@@ -235,7 +235,7 @@ def _rounded(to_world):
 
 
 def bounds(balls):
-    """(P, 4) -> two (P, 3)."""
+    """Return the bounds, two (P, 3), of balls (P, 4)."""
     return balls[:, :3] - balls[:, 3:], balls[:, :3] + balls[:, 3:]
 
 
@@ -244,7 +244,7 @@ def _areas(balls):
 
 
 def _one_minus_cos(ball, ref):
-    """1 - cos of the half angle under which a point sees the ball, and whether it lies outside."""
+    """Return 1 - cos of the half angle that the ball subtends at a point, and whether the point is outside."""
     f = ref - ball[:3]
     squared, radius2 = dot(f, f), ball[3] * ball[3]
     outside = squared > radius2 * (1 + 4 * np.finfo(ball.dtype).eps)

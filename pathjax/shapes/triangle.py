@@ -21,9 +21,9 @@ from pathjax.shapes.coincident import Faces, precision, unit_normal
 from pathjax.shapes.shape import Primitives, Shape, Table
 from pathjax.system.cores import over_cores
 
-# Formats of the files that meshes come from, as `io.mesh` reads them.
+# File formats of meshes that `io.mesh` reads.
 FORMATS = ("obj", "ply", "stl", "glb", "gltf")
-# Triangles among which to look for a large one, whose plane is that of the mesh if it is flat.
+# Number of triangles among which the largest is chosen; its plane is that of the mesh if the mesh is flat.
 _FIRST = 100
 
 
@@ -33,7 +33,7 @@ class Facets(Primitives):
     normals: np.ndarray | None  # (F, 3, 3)
     uv: np.ndarray | None  # (F, 3, 2)
     attributes: Mapping[str, np.ndarray]  # (F, 3, 3) at the corners
-    entries: Mapping[str, np.ndarray] = field(default_factory=dict)  # (F, 3) of an attribute: which entry a corner has
+    entries: Mapping[str, np.ndarray] = field(default_factory=dict)  # (F, 3) index of each corner's attribute value
 
     one_lamp = True
 
@@ -53,14 +53,14 @@ class Facets(Primitives):
         return np.cross(b - a, c - a) / 2
 
     def faces(self, glass, lamp, dtype):
-        """One face if all triangles lie in one plane."""
+        """Return one face if all triangles lie in one plane, else all triangles as fixed faces."""
         first = self.vertices[:_FIRST]
         largest = first[np.argmax(_areas(first))]
         corner, edge, normal = largest[0], largest[1] - largest[0], unit_normal(largest)
         bent = Faces(self.vertices, None, None, glass, lamp)
         farthest = [np.abs(self.vertices[:, :, axis]).max() for axis in range(3)]
         if np.abs((first - corner) @ normal).max() > 2 * precision(dtype) * (farthest @ np.abs(normal)):
-            return bent  # without a look at all of a large mesh
+            return bent  # early out: a large mesh is not tested in full
         from_corner = self.vertices - corner
         reach = (np.abs(self.vertices) @ np.abs(normal)).max()
         if np.abs(from_corner @ normal).max() > 2 * precision(dtype) * reach:
@@ -78,14 +78,14 @@ class Facets(Primitives):
 @register_dataclass
 @dataclass(frozen=True)
 class Triangles(Table):
-    leaves: jax.Array  # of x of the three vertices, y, z
+    leaves: jax.Array  # x of the three vertices, then y, z
     tree: Tree | None
     vertices: jax.Array  # (P, 3, 3) by row: vertex, axis
     normals: jax.Array | None  # (P, 3, 3) at the vertices; None: no triangle of the scene is smooth
     uv: jax.Array | None  # (P, 3, 2)
-    margins: jax.Array | None  # (P,) of `coincident`, beside their own; None: nothing flat lies in any of these
-    area_cdf: jax.Array | None  # (P,) running share of the area of each mesh that emits; None: none does
-    # (P, 3, 3) by row: vertex, channel; 0 where a mesh has none of that name.
+    margins: jax.Array | None  # (P,) of `coincident`, added to their own; None: no flat shape coincides with any
+    area_cdf: jax.Array | None  # (P,) cumulative share of the area of each mesh that emits; None: no mesh emits
+    # (P, 3, 3) by row: vertex, channel; 0 where a mesh lacks the attribute.
     attributes: Mapping[str, jax.Array | np.ndarray] = field(default_factory=dict)
 
     kind = "triangle"
@@ -122,11 +122,11 @@ class Triangles(Table):
         return made, {cls.kind: built}
 
     def prepare(self, o, d):
-        """Constants of a ray: the shear that turns it into the z axis (Woop, Benthin, Wald 2013, JCGT 2(1)).
+        """Return constants of a ray: the shear that maps it to the z axis (Woop, Benthin, Wald 2013, JCGT 2(1)).
 
         Returns:
-            (3,) int32 axes x, y, z, in a tree (3,) uint32 where they begin in a leaf, and (6,) origin and shear in that
-            order.
+            (3,) int32 axes x, y, z, or with a tree (3,) uint32 offsets of these axes in a leaf; and (6,) origin and
+            shear in that order.
         """
         size = jnp.abs(d)
         z = jnp.where(size[0] > size[1], jnp.where(size[0] > size[2], 0, 2), jnp.where(size[1] > size[2], 1, 2))
@@ -141,14 +141,14 @@ class Triangles(Table):
         return axes, jnp.stack([at(o, x), at(o, y), at(o, z), *shear])
 
     def intersect(self, leaf, prepared, start):
-        """Watertight: edges are inclusive by the rounding error of their edge function. (Contraction to fused
-        multiply-adds leaves the plain functions of two triangles that share an edge with different signs.)
+        """Watertight intersection: edges are inclusive up to the rounding error of their edge function. (Contraction to
+        fused multiply-adds gives the plain edge functions of two triangles that share an edge different signs.)
         """
         axes, ray = prepared
         _, _, width = self.leaves.shape
 
         if self.tree is None:
-            # The numbers of an axis are selected, not gathered, from all nine, which lanes share.
+            # The coordinates of an axis are selected, not gathered, from all nine, which the lanes share.
             block = numbers_of(at(self.leaves, leaf)[:9], ray.dtype).reshape(3, 3, width)
 
         def coordinates(axis):
@@ -175,8 +175,8 @@ class Triangles(Table):
         moment = u * z[0] + v * z[1] + w * z[2]
         t = moment * ray[5] / det
         reach = larger(larger(jnp.abs(z[0]), jnp.abs(z[1])), jnp.abs(z[2]))
-        # Seen edge-on, or tiny and far from the ray, all three errors rule and every edge is inclusive. And a ray that
-        # starts in the plane, or on a neighbour's edge, finds a distance that is rounding alone, below half the errors.
+        # If a triangle is edge-on, or tiny and far from the ray, the errors dominate and every edge is inclusive. A ray
+        # that starts in its plane, or on a neighbour's edge, gets a distance of pure rounding, below half the errors.
         sound = (jnp.abs(det) > error) & (jnp.abs(moment) > reach * (error / 2))
         rows = rows_of(at(self.leaves, leaf))
         return jnp.where((front | back) & sound & (rows != start), t, jnp.inf), rows
@@ -186,7 +186,7 @@ class Triangles(Table):
         return self.vertices.shape[0]
 
     def surface(self, row, o, d, t):
-        """The point comes from barycentrics."""
+        """Compute the surface from the ray's barycentrics."""
         vertices = at(self.vertices, row)
         edge1, edge2 = vertices[1] - vertices[0], vertices[2] - vertices[0]
         b0, b1, b2 = compute_once(_barycentrics(vertices[0], edge1, edge2, o, d))
@@ -211,7 +211,7 @@ class Triangles(Table):
         return 3 * row, jnp.stack(_barycentrics(vertices[0], edge1, edge2, o, d))
 
     def along_u(self, row, surface):
-        """Nowhere, where the mesh squeezes uv to a line; along the first edge, where it has none, as u does."""
+        """Return the direction of u: 0 if the mesh collapses uv to a line; without uv the first edge, where u grows."""
         a, b, c = at(self.vertices, row)
         if self.uv is None:
             return b - a
@@ -223,7 +223,7 @@ class Triangles(Table):
         return self.from_square(row, square_to_triangle(u))
 
     def row_of_lamp(self, lamps, lamp, u_part):
-        """A triangle of the mesh, chosen by area."""
+        """Choose a triangle of the mesh in proportion to its area."""
         first, count = at(lamps.first, lamp), at(lamps.count, lamp)
 
         def halve(_, between):
@@ -263,7 +263,7 @@ class Triangles(Table):
 
 @dataclass(frozen=True)
 class Mesh(Shape):
-    """Triangles without degenerate ones; normals follow the transform, and are unit but where an instance is uneven."""
+    """Triangles, none degenerate; normals follow the transform, and are unit unless an instance scales unevenly."""
 
     vertices: np.ndarray  # (V, 3)
     faces: np.ndarray  # (F, 3) int64
@@ -282,7 +282,7 @@ class Mesh(Shape):
 
     @staticmethod
     def choices(fields: Fields) -> dict[str, object]:
-        """What files of this kind leave open, as `io.mesh.load` takes it."""
+        """Return the options of this file format for `io.mesh.load`."""
         return {"flip_tex_coords": fields.boolean("flip_tex_coords", None)}
 
     @property
@@ -291,7 +291,7 @@ class Mesh(Shape):
 
     @property
     def closed(self):
-        """Whether each edge has a triangle on either side, with vertices that lie in one place taken for one."""
+        """Whether each edge has a triangle on either side, where vertices at the same place count as one."""
         _, place = np.unique(self.vertices, axis=0, return_inverse=True)
         corners = place.reshape(-1)[self.faces]
         edges = np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]])
@@ -308,11 +308,11 @@ class Mesh(Shape):
             vertices = self.vertices @ linear.T + to_world[:3, 3]
             if not np.isfinite(vertices.astype(np.float32)).all():
                 return None
-        if np.linalg.det(linear) < 0:  # which turns faces inside out
+        if np.linalg.det(linear) < 0:  # a mirroring turns faces inside out
             faces = faces[:, ::-1]
         if normals is not None:
             normals = normals @ np.linalg.inv(linear)
-            # One length for all: as in Mitsuba, what is between the vertices is carried, too.
+            # One factor for all: as in Mitsuba, normals interpolated between vertices are transformed too.
             normals = normals / np.linalg.norm(normals, axis=1).max()
         return replace(self, vertices=vertices, faces=faces, normals=normals)
 
@@ -339,7 +339,7 @@ class SerializedMesh(Mesh):
 
 
 class ArrayMesh(Mesh):
-    """A mesh of arrays, of a dictionary."""
+    """A mesh given by arrays in a dictionary."""
 
     @classmethod
     def read(cls, loader, fields: Fields):
@@ -350,18 +350,18 @@ class ArrayMesh(Mesh):
 
 
 def leaf_numbers(vertices):
-    """(P, 3, 3) -> (P, 9), what a leaf keeps of each triangle: x of the vertices, y, z."""
+    """Return the scalars (P, 9) that a leaf stores of vertices (P, 3, 3): x of the three vertices, then y, z."""
     return np.swapaxes(np.asarray(vertices), 1, 2).reshape(-1, 9)
 
 
 def bounds(vertices):
-    """(P, 3, 3) -> two (P, 3)."""
+    """Return the bounds, two (P, 3), of vertices (P, 3, 3)."""
     a, b, c = np.moveaxis(vertices, 1, 0)  # NumPy reduces short axes slowly
     return np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)
 
 
 def _barycentrics(vertex, edge1, edge2, o, d):
-    """Barycentric coordinates of where a ray meets the plane of a triangle, or of a point near it in the triangle."""
+    """Return barycentrics of the point where a ray meets the plane of a triangle, clamped into the triangle."""
     s = o - vertex
     q = cross(s, edge1)
     h = cross(d, edge2)
@@ -372,15 +372,15 @@ def _barycentrics(vertex, edge1, edge2, o, d):
 
 
 def _normal(edge1, edge2):
-    # Edges of length 1 first: the square of a product of tiny ones underflows.
+    # Rescale the edges first: the square of a product of tiny ones underflows.
     return normalize(cross(rescale(edge1), rescale(edge2)))
 
 
 def _point_error(vertices):
-    """(3, 3) -> (3,), bound on the rounding error of an interpolated vertex, and of those of a coplanar triangle."""
+    """Return (3,), a bound on the rounding error of a point interpolated from vertices (3, 3) or on a coplanar one."""
     return (3 * np.finfo(vertices.dtype).eps) * jnp.max(jnp.abs(vertices), 0)
 
 
 def _areas(vertices):
-    """(P, 3, 3) -> (P,)."""
+    """Return the areas (P,) of vertices (P, 3, 3)."""
     return np.linalg.norm(np.cross(vertices[:, 1] - vertices[:, 0], vertices[:, 2] - vertices[:, 0]), axis=-1) / 2

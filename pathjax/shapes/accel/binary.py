@@ -1,13 +1,13 @@
-"""A binary tree over boxes: level by level, all open nodes at once, over the cores.
+"""A binary tree over boxes, built level by level: all open nodes of a level at once, in parallel over the cores.
 
-The primitives stay sorted by centroid along each axis, so a split is an axis and a count whatever the rule, and
-centroids that coincide are no special case. The surface area heuristic is evaluated between any two primitives of a
-small node (Wald and Havran 2006, "On building fast kd-trees for ray tracing, and on doing that in O(N log N)"); of a
-larger one at PLACES places of equal counts, then at as many around the best of these. Nodes of about the same count lie
-side by side in memory, a place of each in a row: running bounds of all of them are then a few operations on whole rows,
-which NumPy vectorises.
+The primitives stay sorted by centroid along each axis, so every rule describes a split by an axis and a count, and
+coinciding centroids need no special case. The surface area heuristic is evaluated between any two primitives of a
+small node (Wald and Havran 2006, "On building fast kd-trees for ray tracing, and on doing that in O(N log N)"); in a
+larger node at PLACES places of equal counts, then at as many around the best of these. Nodes of similar count are
+batched side by side in memory, one place of every node per row, so that the running bounds of all nodes take a few
+operations on whole rows, which NumPy vectorises.
 
-Nothing depends on the number of cores: what is done at once are nodes, or exact maxima of parts.
+The result does not depend on the number of cores: parallel tasks are separate nodes, or exact maxima of parts.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ import numpy as np
 
 from pathjax.system.cores import over_cores
 
-THICKNESS = np.float32(1e-6)  # of the scene, added to every extent: flat and linear boxes have areas to compare too
+THICKNESS = np.float32(1e-6)  # share of the scene's size, added to every extent: flat and linear boxes get areas too
 PLACES = 64  # with twice or half as many, rays visit the same number of nodes within 1 %
 BATCH = 1 << 16  # primitives whose nodes are split together: their arrays stay in the cache
-SPREAD = 1.15  # of counts in a batch, in which all nodes are filled up to the largest
-FEW = 1 << 12  # primitives that are not worth a batch of their own
-LONG_ROW = 1 << 15  # bytes from which on a NumPy operation takes longer than it takes to begin
+SPREAD = 1.15  # ratio of counts in a batch, whose nodes are all padded to the largest
+FEW = 1 << 12  # primitives: fewer do not get a batch of their own
+LONG_ROW = 1 << 15  # bytes above which a NumPy operation takes longer than its overhead
 
 
 def binary_tree(unit, rule, leaf_size):
@@ -31,24 +31,24 @@ def binary_tree(unit, rule, leaf_size):
 
     Args:
         unit: (2, 3, P) float32 from 0 to 1, lower and upper corners of boxes.
-        rule: of `RULES`.
-    Returns, for B nodes of which parents come first:
-        left:   (B,) int64, the first of a node's two children, which are neighbours; 0 at a leaf.
-        start:  (B,) int64, how many primitives come before the node's, depth first.
-        count:  (B,) int64, its primitives.
+        rule: a key of `RULES`.
+    Returns, for B nodes, parents before children:
+        left:   (B,) int64, the first of a node's two children, which are adjacent; 0 at a leaf.
+        start:  (B,) int64, number of primitives before those of the node, depth first.
+        count:  (B,) int64, number of primitives in the node.
         levels: slices of B, from the root down.
         leaf_of: (P,) int64, the leaf that holds each primitive.
     """
     p = unit.shape[2]
-    rows = np.zeros((p, 8), np.float32)  # of 32 bytes, which NumPy gathers faster than 24
+    rows = np.zeros((p, 8), np.float32)  # NumPy gathers rows of 32 bytes faster than rows of 24
     rows[:, :3], rows[:, 3:6] = -unit[0].T, unit[1].T + THICKNESS
     centre = unit[0] + unit[1]
     left, start, count = np.zeros((3, 2 * p), np.int64)
     side, leaf_of = np.zeros(p, bool), np.zeros(p, np.int64)
     count[0], levels = p, [slice(0, 1)]
-    nodes = np.arange(p > leaf_size)  # the open ones of this level
+    nodes = np.arange(p > leaf_size)  # open nodes of this level
     with over_cores(p) as run:
-        order = np.empty((3, p), np.int64)  # (3, n) of the open nodes, by node, then centroid
+        order = np.empty((3, p), np.int64)  # (3, n) primitives of the open nodes, by node, then centroid
         list(run(partial(sorted_by, np.arange(p)), centre.view(np.int32), order))
         while len(nodes):
             size = count[nodes]
@@ -71,17 +71,17 @@ def binary_tree(unit, rule, leaf_size):
 
 
 def sorted_by(values, key, out=None):
-    """`values` (P,) >= 0 by ascending int32 `key` (P,), stable: one fast sort of 64-bit integers."""
+    """Return `values` (P,) >= 0 by ascending int32 `key` (P,), stable, by one fast sort of 64-bit integers."""
     return np.bitwise_and(np.sort(key.astype(np.int64) << 32 | values), 0xFFFFFFFF, out=out)
 
 
-# ---- rules: the axis (M,) to split each of M nodes along, and how many primitives (M,) go to the left ----------------
+# ---- rules: return the axis (M,) along which to split each of M nodes, and the number of primitives (M,) on the left -
 # order: (3, n) as above; rows: (P, 8) the lower corner negated (3), the upper one (3), padding; centre: (3, P);
-# first, count: (M,) where a node begins in `order`, and its primitives.
+# first, count: (M,) begin of a node in `order`, and its number of primitives.
 
 
 def least_cost(order, rows, centre, first, count, leaf_size, run):
-    """The least surface area heuristic."""
+    """Split where the surface area heuristic is least."""
     axis, nl = np.empty((2, len(count)), np.int64)
     choose = partial(_least_cost, order, rows, leaf_size)
     single, many = [], []
@@ -95,7 +95,7 @@ def least_cost(order, rows, centre, first, count, leaf_size, run):
 
 
 def _alike(count):
-    """Batches of nodes of about the same count, of FEW to some BATCH primitives, or more in one node alone."""
+    """Return batches of nodes of similar count, with FEW to about BATCH primitives, or a single node with more."""
     by = np.argsort(count, kind="stable")
     size, total = np.log(count[by]) // np.log(SPREAD), np.cumsum(count[by])
     cuts, before = list(np.flatnonzero(np.diff(total // BATCH)) + 1), 0
@@ -107,8 +107,8 @@ def _alike(count):
 
 
 def _least_cost(order, rows, leaf_size, first, count, run=map):
-    """Splits of a batch of nodes: the best of some, then the best of those between its neighbours."""
-    start = first + order.shape[1] * np.arange(3)[:, None]  # (3, M) of each axis in all of `order`
+    """Split a batch of nodes: find the best of a few places, then the best of those between its neighbours."""
+    start = first + order.shape[1] * np.arange(3)[:, None]  # (3, M) begin of each axis in the flat `order`
     costs = partial(_costs, order.ravel(), rows, leaf_size, start, count, run=run)
     nothing = np.full((6, *start.shape), -np.inf, np.float32)
     keys, ends, left, right = costs(np.zeros_like(count)[None], count[None], nothing, nothing)
@@ -125,17 +125,17 @@ def _least_cost(order, rows, leaf_size, first, count, run=map):
 
 
 def _costs(order, rows, leaf_size, start, count, low, high, before, after, run):
-    """Splits with more than `low` primitives on the left and less than `high`.
+    """Evaluate splits with more than `low` and fewer than `high` primitives on the left.
 
-    A side costs its area times (its primitives + the places in the leaves that they fill at least). Up to PLACES - 1
-    splits are tried, with equal numbers of primitives in between, up to one.
+    The cost of a side is its area times (its primitives + the slots of the fewest leaves that can hold them). Up to
+    PLACES - 1 splits are tried, with the same number of primitives between them, give or take one.
 
     Args:
-        start: (3, M) where the node begins in the flat `order`, by axis; low, high: (1 or 3, M).
-        before, after: (6, 3, M) bounds, as in `rows`, of what comes before `low` and from `high` on.
+        start: (3, M) begin of the node in the flat `order`, by axis; low, high: (1 or 3, M).
+        before, after: (6, 3, M) bounds, as in `rows`, of the primitives before `low` and from `high` on.
     Returns:
-        keys:  (splits, 3, M) int64: the cost above, and below it how uneven the split is, and which way.
-        ends:  (splits + 2, 1 or 3, M) how many primitives each leaves on the left; first `low`, last `high`.
+        keys:  (splits, 3, M) int64: the cost in the upper bits; below it the imbalance of the split, and its side.
+        ends:  (splits + 2, 1 or 3, M) number of primitives on the left; the first is `low`, the last `high`.
         left, right: (6, splits + 2, 3, M) bounds of the sides.
     """
     wide = high - low
@@ -161,34 +161,34 @@ def _costs(order, rows, leaf_size, start, count, low, high, before, after, run):
     weight_l, weight_r = ((n + -(-n // leaf_size) * leaf_size).astype(np.float32) for n in (nl, nr))
     weight_l[nl == high] = np.inf
     cost = area_l * weight_l + area_r * weight_r
-    # The bits of positive floats order as these do. Of costs equal but for rounding, the most even.
+    # Bits of positive floats order as the floats do. Between costs that are equal up to rounding, the most even wins.
     keys = (cost.view(np.int32) & ~7).astype(np.int64) << 32 | (np.abs(nl - nr) << 1 | (nl > nr))
     return keys, ends, left, right
 
 
 def _accumulate(bounds):
-    """Let rows (6, rows, 3, M) become, in place, the bounds of all rows before them too."""
+    """Replace each of the rows (6, rows, 3, M), in place, by the bounds of it and all rows before it."""
     rows = bounds.shape[1]
     if bounds[:, 0].size * bounds.itemsize > LONG_ROW:
         for k in range(1, rows):
             np.maximum(bounds[:, k], bounds[:, k - 1], out=bounds[:, k])
-    else:  # more is computed, by fewer operations
+    else:  # more arithmetic in fewer operations
         for step in 2 ** np.arange((rows - 1).bit_length()):
             bounds[:, step:] = np.maximum(bounds[:, step:], bounds[:, :-step])
 
 
 def half_area(x, y, z):
-    """Half the surface area of a box of these extents."""
+    """Return half the surface area of a box of these extents."""
     return x * (y + z) + y * z
 
 
 def equal_counts(order, rows, centre, first, count, leaf_size, run):
-    """The axis of the largest extent of the centroids, and half of the count."""
+    """Split along the axis of the largest extent of the centroids, at half of the count."""
     return _widest(order, centre, first, count)[0], count // 2
 
 
 def middle(order, rows, centre, first, count, leaf_size, run):
-    """The same axis, and the count below the middle of that extent; half of the count if that would be none or all."""
+    """Split along the same axis at the middle of that extent; at half of the count if one side would be empty."""
     axis, at = _widest(order, centre, first, count)
     low, high = np.zeros_like(count), count
     while (low < high).any():
@@ -199,7 +199,7 @@ def middle(order, rows, centre, first, count, leaf_size, run):
 
 
 def _widest(order, centre, first, count):
-    """The axis of the largest extent of each node's centroids (M,) and the middle of it (M,)."""
+    """Return the axis of the largest extent of each node's centroids (M,) and the middle of the extent (M,)."""
     axes = np.arange(3)[:, None]
     lo, hi = centre[axes, order[:, first]], centre[axes, order[:, first + count - 1]]
     axis = (hi - lo).argmax(0)
@@ -211,7 +211,7 @@ RULES = {"sah": least_cost, "equal": equal_counts, "middle": middle}
 
 # ---- partition ------------------------------------------------------------------------------------------------------
 def partition(order, first, count, axis, nl, side, run):
-    """Let `order` (3, n) become, in place, the order of the 2 M children of M nodes that lie one after the other.
+    """Partition `order` (3, n) of M contiguous nodes, in place, into the order of their 2 M children.
 
     side: (P,) bool, scratch.
     """
@@ -227,7 +227,7 @@ def partition(order, first, count, axis, nl, side, run):
 
 
 def _partition(order, first, count, axis, nl, side, nodes, run=map):
-    """Part neighbouring nodes by their splits; stable."""
+    """Partition contiguous nodes by their splits; stable."""
     begin = first[nodes.start]
     part = order[:, begin : begin + count[nodes].sum()]
     at = np.arange(begin, begin + part.shape[1])

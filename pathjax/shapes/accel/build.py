@@ -1,7 +1,7 @@
-"""Bounding volume hierarchies with eight children to a node, built in NumPy.
+"""Bounding volume hierarchies with eight children per node, built in NumPy.
 
-Three stages: the bounds of the primitives (rounded outwards to float32), a binary tree over them (`binary`), and that
-tree collapsed to eight children a node and laid out for `traverse` (`collapse`).
+Three stages: compute the bounds of the primitives (rounded outwards to float32), build a binary tree over them
+(`binary`), collapse it to eight children per node and lay it out for `traverse` (`collapse`).
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ class Tree:
     bounds:     (N, 2, 3, 8) float32; [node, lo/hi, axis, slot]. An empty slot holds NaN, so no ray hits it.
     child:      (N, 8) int32; > 0 a node, < 0 the leaf `~child`, 0 an empty slot. Rays of direction octant o (bit a set
                 where d[a] < 0) should visit slot k ^ o for k = 0, 1, ... 7.
-    leaf_first: (L,) int32 into `order`.
+    leaf_first: (L,) int32, index into `order`.
     leaf_count: (L,) int32, 1 to `leaf_size`.
     order:      (P,) int32, a permutation of the primitives; ascending within each leaf.
     depth:      levels of nodes, 1 if there is only the root: a path down the tree has at most `depth` nodes and a leaf.
-    sah_cost:   nodes and leaves that a random line through the root's box is expected to meet: their areas' sum over
-                the root's area.
+    sah_cost:   expected number of nodes and leaves that a random line through the root's box meets: the sum of their
+                areas over the root's area.
     """
 
     bounds: np.ndarray
@@ -45,8 +45,8 @@ def build(lo, hi, rule="sah", leaf_size=8, width=8):
     Args:
         lo, hi:    (P, 3) finite, lo <= hi.
         rule:      "sah" least expected cost, "equal" equal counts, "middle" the middle of the centroids' bounds.
-        leaf_size: most primitives in a leaf.
-        width:     most children of a node, 2 to 8.
+        leaf_size: maximum number of primitives in a leaf.
+        width:     maximum number of children of a node, 2 to 8.
     """
     if rule not in RULES:
         raise ValueError(f"BVH rule {rule!r} is not known; use one of {', '.join(RULES)}")
@@ -62,7 +62,7 @@ def primitive_bounds(lo, hi):
 
     Returns:
         box:  (2, 3, P) float32 that encloses [lo, hi].
-        unit: (2, 3, P) float32 from 0 to 1, one scale for all axes: areas neither overflow nor vanish.
+        unit: (2, 3, P) float32 from 0 to 1, with one scale for all axes, so that areas neither overflow nor vanish.
     """
     lo, hi = np.asarray(lo), np.asarray(hi)
     if lo.ndim != 2 or lo.shape[1] != 3 or lo.shape != hi.shape or len(lo) == 0:

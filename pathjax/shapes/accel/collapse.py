@@ -1,4 +1,4 @@
-"""A binary tree collapsed to eight children a node, and laid out for `traverse`.
+"""Collapse of a binary tree to eight children per node, and its layout for `traverse`.
 
 The collapse minimises the expected cost by dynamic programming (Ylitie, Karras, Laine 2017, "Efficient incoherent ray
 traversal on GPUs through compressed wide BVHs", section 3).
@@ -13,7 +13,7 @@ from pathjax.system.cores import over_cores
 
 
 def widen(box, left, start, count, levels, leaf_of, width):
-    """Collapse the binary tree to `width` children a node and lay it out, depth first: the fields of a `Tree`."""
+    """Collapse the binary tree to `width` children per node, lay it out depth first, and return the `Tree` fields."""
     order = sorted_by(np.arange(len(leaf_of)), start[leaf_of])
     leaves = sorted_by(np.arange(len(left)), start)
     leaves = leaves[left[leaves] == 0]
@@ -33,7 +33,7 @@ def widen(box, left, start, count, levels, leaf_of, width):
     scale = extent[:, 0].max() or 1
     area = half_area(*(extent / scale + THICKNESS))
 
-    parent = collapse(left, levels, area, width)                   # -1: vanishes in the node above
+    parent = collapse(left, levels, area, width)                   # -1: merged into the node above
     is_node = (left > 0) & (parent >= 0)
     is_node[0] = True
     wide = np.flatnonzero(is_node)
@@ -62,11 +62,11 @@ def widen(box, left, start, count, levels, leaf_of, width):
 def collapse(left, levels, area, width):
     """Choose the binary nodes that become wide nodes, for the least sum of their areas (Ylitie et al. 2017, 3.1).
 
-    Returns: (B,) int64, the wide node (by its binary number) whose child a node is; -1 for a node that vanishes in the
-    wide node above, and for the root.
+    Returns: (B,) int64, the wide parent (by its binary index) of each node; -1 for the root and for nodes that are
+    merged into the wide node above.
     """
-    cost = np.zeros((width + 1, len(left)))                        # [i]: of the wide nodes below, as i children at most
-    share = np.zeros((width + 1, len(left)), np.int8)              # of them, how many go to the left; [1]: as a node
+    cost = np.zeros((width + 1, len(left)))                        # [i]: area of the wide nodes in up to i children
+    share = np.zeros((width + 1, len(left)), np.int8)              # how many of the i lie on the left; [1]: as a node
     for level in levels[::-1]:
         k = np.flatnonzero(left[level]) + level.start
         x, y = cost[:, left[k]], cost[:, left[k] + 1]
@@ -83,7 +83,7 @@ def collapse(left, levels, area, width):
             cost[i, k] = np.where(worse, cost[i - 1, k], cost[i, k])
             share[i, k] = np.where(worse, 0, share[i, k])
     parent, owner = np.full((2, len(left)), -1)
-    budget = np.zeros(len(left), np.int64)                         # children that a node may become
+    budget = np.zeros(len(left), np.int64)                         # maximum number of children a node is split into
     budget[0] = 1
     for level in levels[:-1]:
         k = np.arange(level.start, level.stop)
@@ -106,8 +106,9 @@ def place_children(parent, offset, n):
     """Choose slots: rays of direction octant s should visit slot s first (Ylitie et al. 2017, section 3.2; greedy).
 
     Args:
-        parent: (C,) node of each child, of n; offset: (3, C) from the middle of the parent to that of the child.
-    Returns: (C,) int64, different within each parent.
+        parent: (C,) parent of each child, one of n nodes.
+        offset: (3, C) from the middle of the parent to that of the child.
+    Returns: (C,) int64, distinct within each parent.
     """
     by = np.argsort(parent, kind="stable")
     up = parent[by]

@@ -1,4 +1,4 @@
-"""Primitives packed for intersection: blocks of numbers, a primitive in each lane, and a tree over many of them."""
+"""Primitives packed for intersection: blocks of scalars with one primitive per lane, and a tree over many blocks."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathjax.core.math import integer_like
 from pathjax.shapes.accel import build as bvh_build
 from pathjax.shapes.accel import traverse as bvh
 
-# Up to here every ray tests all primitives of a kind, one after another; above, a tree pays.
+# Up to this number of primitives of a kind, every ray tests all of them in turn; above, a tree is faster.
 FLAT_LIMIT = 32
 LEAF_WIDTH = 8
 
@@ -19,13 +19,13 @@ def pack(numbers, lo, hi, dtype, rule="sah", first=0, step=1):
     """Pack primitives for intersection.
 
     Args:
-        numbers: (P, K) what the intersection wants to know of each primitive, in any dtype.
+        numbers: (P, K) scalars that `intersect` reads per primitive, in any dtype.
         lo, hi: (P, 3) bounds.
         first, step: primitive i is row first + step i of its table.
     Returns:
         leaves (L, K + 1, W), tree (None for a few primitives, each a leaf of its own), built tree for reports or None.
-        A leaf holds the bits of its numbers, as integers, then its rows: one block, so that a visit misses the cache
-        once, and no array of the scene holds the NaN of the padding, which JAX's debug_nans would find.
+        A leaf holds the bits of its scalars, as integers, then its rows. It is one block, so that a visit misses the
+        cache once. As the padding is integer, no array of the scene holds a NaN that JAX's debug_nans would report.
     """
     count = len(numbers)
     if count <= FLAT_LIMIT:
@@ -48,10 +48,10 @@ def pack(numbers, lo, hi, dtype, rule="sah", first=0, step=1):
 
 
 def numbers_of(block, dtype):
-    """The numbers whose bits are (a part of) a leaf; what stands for its rows is none."""
+    """Return the scalars whose bits are (a part of) a leaf; ignore the last entry, which holds the rows."""
     return lax.bitcast_convert_type(block, dtype)
 
 
 def rows_of(leaf):
-    """Rows (..., W) of the primitives of a leaf (..., K + 1, W), ascending; -1 in empty lanes."""
+    """Return the rows (..., W) of the primitives of a leaf (..., K + 1, W), ascending; -1 in empty lanes."""
     return leaf[..., -1, :].astype(jnp.int32)

@@ -1,4 +1,4 @@
-"""Traversal of the 8-wide hierarchy of `bvh_build`, one ray, in octant order."""
+"""Traversal of the 8-wide hierarchy of `accel.build` by one ray, in octant order."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ WIDTH = 8
 @dataclass(frozen=True)
 class Tree:
     # (N, 7, 8) integers as wide as the reals: bits of the children's lower planes x, y, z and upper planes, NaN in
-    # empty slots; the child: > 0 an inner node, < 0 the leaf ~child. One block, so that a visit misses the cache once.
+    # empty slots; then the child: > 0 an inner node, < 0 the leaf ~child. One block: a visit misses the cache once.
     nodes: jax.Array
     depth: int = field(metadata={"static": True})  # levels of inner nodes: the size of the stack
 
 
 def pack(built, dtype) -> Tree:
-    """The Tree of what `bvh_build` has built."""
+    """Pack the hierarchy that `accel.build` returned."""
     if len(built.child) >> 31 - WIDTH:
         raise ValueError(f"a BVH has fewer than 2^{31 - WIDTH} nodes, not {len(built.child)}")
     planes = built.bounds.reshape(-1, 6, WIDTH).astype(dtype)
@@ -37,25 +37,25 @@ def pack(built, dtype) -> Tree:
 
 
 def prepare(o, d):
-    """Constants of a ray from o (3,) in the unit direction d (3,): (9,) reciprocal of d and slabs, () uint32 octant."""
+    """Return constants of a ray o (3,), d (3,) unit: (9,) reciprocal of d and slab offsets, () uint32 octant."""
     eps = np.finfo(d.dtype).eps
-    # A component of zero becomes one that moves the ray less than rounding does over any distance in range.
+    # Replace a zero component by one that moves the ray by less than rounding does, over any distance in range.
     tiny = np.asarray(1e-18, d.dtype)
     inv = 1 / jnp.where(jnp.abs(d) < tiny, jnp.copysign(tiny, d), d)
     negative = (d < 0).astype(jnp.int32)
-    # Slabs are widened by what o, o / d and the product round (Ize 2013): a few ulps of the coordinates.
+    # Widen slabs by the rounding of o, o / d and the product (Ize 2013): a few ulps of the coordinates.
     start, slack = o * inv, jnp.abs(o * inv) * (4 * eps)
-    # Unsigned as the axes of triangles are: in lanes, all numbers of one type that a ray has are one array.
+    # Unsigned like the axes of triangles: in lanes, all scalars of one type that a ray has share one array.
     octant = (negative[0] + 2 * negative[1] + 4 * negative[2]).astype(jnp.uint32)
     return jnp.concatenate([inv, start + slack, start - slack]), octant
 
 
 def enter(tree: Tree, prepared, t):
-    """() uint32: the first entry of `traverse`; 0 if the ray meets no child of the root at 0 <= s <= t."""
+    """Return the first entry of `traverse`, () uint32; 0 if the ray meets no child of the root at 0 <= s <= t."""
     ray, octant = prepared
     boxes = _box(tree, jnp.int32(0), ray).T
 
-    # Child by child, as lanes do it for many rays at once: eight beside each other were an eighth of all the program.
+    # Child by child, vectorised over lanes: eight children side by side made up an eighth of the whole program.
     def add(slot, entry):
         bit = jnp.left_shift(jnp.uint32(1), slot.astype(jnp.uint32) ^ octant)
         return entry | jnp.where(_meets(at(boxes, slot), ray, t), bit, 0)
@@ -64,8 +64,8 @@ def enter(tree: Tree, prepared, t):
 
 
 class _State(NamedTuple):
-    free: Int[Array, ""]  # the entry of the stack above those in use
-    entry: Int[Array, ""]  # what comes next; 0: the search is done
+    free: Int[Array, ""]  # index of the first unused entry of the stack
+    entry: Int[Array, ""]  # the next entry; 0: the search is done
     child: Int[Array, ""]  # its first child: >= 0 a node, < 0 the leaf ~child
     stack: Int[Array, " levels"]
     t: Float[Array, ""]
@@ -76,16 +76,16 @@ def traverse(tree: Tree, leaf, prepared, entry, t, found, result=lambda t, found
     """Visit the leaves that the ray o + s d, 0 <= s <= t, may hit, near ones first.
 
     Args:
-        leaf: (number of the leaf, t, found) -> (t, found) after testing it; a negative t ends the search.
+        leaf: (index of the leaf, t, found) -> (t, found) after testing it; a negative t ends the search.
         prepared: of `prepare`; entry: of `enter`.
-        t: () the farthest distance of interest; shrinks as hits are found.
+        t: () maximum distance; shrinks as hits are found.
         found: pytree of arrays, carried along.
         result: (t, found) at the end -> results.
 
-    A node's children still to visit are the bits of a mask: bit k is the child in slot k ^ octant, which the builder
-    has chosen so that ascending bits go away from a ray of that octant. An entry is a node's number above its mask; the
-    stack holds those whose masks are not empty, above a 0 that ends the search. Nothing else is kept, since every
-    buffer that a loop carries costs instructions in each of its trips.
+    The children of a node that are still to be visited are bits of a mask: bit k is the child in slot k ^ octant. The
+    builder chooses slots so that ascending bits run front to back for rays of that octant. An entry is a node's index
+    above its mask; the stack holds entries with nonempty masks, above a 0 that ends the search. No other state is kept,
+    since every buffer that a loop carries costs instructions in every iteration.
     """
     ray, octant = prepared
 
@@ -94,7 +94,7 @@ def traverse(tree: Tree, leaf, prepared, entry, t, found, result=lambda t, found
         return at(tree.nodes, entry >> WIDTH, 6, slot).astype(jnp.int32)
 
     def rest_of(entry):
-        """The entry without its first child, and whether any is left."""
+        """Return the entry without its first child, and whether any child is left."""
         rest = entry & (entry - 1)
         return rest, rest & ((1 << WIDTH) - 1) != 0
 
@@ -105,17 +105,17 @@ def traverse(tree: Tree, leaf, prepared, entry, t, found, result=lambda t, found
         stack = jnp.zeros((tree.depth + 2,), jnp.int32)
         root = entry.astype(jnp.int32)
         child = first_child(root)
-        # A search begins by opening a node: if a leaf comes first, by opening the root again.
+        # A search begins by opening a node: if its first child is a leaf, it opens the root again.
         at_node = (child > 0) | (root == 0)
         start = jnp.where(at_node, root, -1 << WIDTH), jnp.where(at_node, child, 0)
         return _State(jnp.int32(1), *start, stack, t, found)
 
     def open_node(state):
         free, entry, child, stack, t, found = state
-        # Of a search that is done no child is met, nothing is pushed, and the 0 at the bottom is popped for ever.
+        # A search that is done meets no child, pushes nothing, and pops the 0 at the bottom for ever.
         below = _hit_children(tree, child, ray, _weights(octant, entry != 0), t)
         rest, some = rest_of(entry)
-        # Push the rest, then what is met below, unless they are empty; then pop.
+        # Push the rest, then the children that are met, unless they are empty; then pop.
         stack = push(stack, rest, free)
         free = free + some.astype(jnp.int32)
         stack = push(stack, jnp.where(below != 0, child << WIDTH | below, 0), free)
@@ -127,7 +127,7 @@ def traverse(tree: Tree, leaf, prepared, entry, t, found, result=lambda t, found
         free, entry, child, stack, t, found = state
         t, found = leaf(~child, t, found)
         rest, some = rest_of(entry)
-        # The rest is pushed and popped again: a branch would be guessed wrong too often.
+        # Push the rest and pop it again: a branch would be mispredicted too often.
         stack = push(stack, rest, free)
         free = free - (~some).astype(jnp.int32)
         entry = jnp.where(t < 0, 0, at(stack, free))
@@ -146,27 +146,27 @@ def traverse(tree: Tree, leaf, prepared, entry, t, found, result=lambda t, found
 
 
 def _weights(octant, is_any=True):
-    """(8,) int32: the bit of each slot in an entry; of none, 0."""
+    """Return the bit of each slot in an entry, (8,) int32; all 0 unless `is_any`."""
     return jnp.left_shift(jnp.int32(is_any), (jnp.arange(WIDTH, dtype=jnp.uint32) ^ octant).astype(jnp.int32))
 
 
 def _hit_children(tree: Tree, node, ray, weights, t):
-    """() int32 mask of the children of a node that a ray meets at 0 <= s <= t."""
+    """Return the mask, () int32, of the children of a node that a ray meets at 0 <= s <= t."""
     return jnp.sum(jnp.where(_meets(_box(tree, node, ray), ray, t), weights, 0), dtype=jnp.int32)
 
 
 def _box(tree: Tree, node, ray):
-    """(7, 8) planes of the children of a node; the last row is not one of them."""
+    """Return the planes (7, 8) of the children of a node; the last row is not a plane and must be ignored."""
     return lax.bitcast_convert_type(at(tree.nodes, node), ray.dtype)
 
 
 def _meets(box, ray, t):
-    """(...) whether a ray meets boxes (7, ...) at 0 <= s <= t."""
+    """Return (...) bool: whether a ray meets boxes (7, ...) at 0 <= s <= t."""
     low = [box[axis] * ray[axis] for axis in range(3)]
     high = [box[3 + axis] * ray[axis] for axis in range(3)]
     near = [smaller(low[axis], high[axis]) - ray[3 + axis] for axis in range(3)]
     far = [larger(low[axis], high[axis]) - ray[6 + axis] for axis in range(3)]
-    # The NaN of an empty slot gets through as the last argument.
+    # NaN of an empty slot propagates as the second argument, and fails the comparison.
     enter = larger(larger(larger(jnp.zeros_like(t), near[2]), near[1]), near[0])
     leave = smaller(smaller(far[0], far[1]), smaller(far[2], t))
     eps = np.finfo(ray.dtype).eps
