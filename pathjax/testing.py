@@ -1,4 +1,4 @@
-"""Checks that every kind must pass: the package's own in its tests, and those that users register, in theirs.
+"""Checks that every kind must pass: the package's kinds in its tests, users' registered kinds in theirs.
 
     from pathjax import testing
     testing.check_bsdf(OrenNayar, sigma=0.3)
@@ -6,8 +6,8 @@
     testing.check_emitter(Sunset, radiance=3.0)
     testing.check_phase(Rayleigh)
 
-A check that fails raises AssertionError, which says what was found and what should have been. Those that are
-statistical fail for a right bsdf with the probability `false_alarm` each; seeds are fixed.
+A check that fails raises an AssertionError with the value found and the expected one. Each statistical check fails for
+a correct bsdf with the probability `false_alarm`; seeds are fixed.
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ from pathjax.kinds import Parameters, Row, Table
 from pathjax.media import Phase
 from pathjax.textures import Texture, Textures
 
-# Directions that see grazing and steep light, and an azimuth that no symmetry favours.
+# Directions of grazing and steep light; `directions` adds an azimuth without symmetry.
 COSINES = (1.0, 0.7, 0.2)
-# Cells of the sphere, in the angle from the pole and in the azimuth, and points of the midpoint rule in each of either.
+# Cells of the sphere, in the polar angle and the azimuth, and points of the midpoint rule per cell in each of the two.
 CELLS, POINTS = (20, 24), 12
-# Cells in which fewer samples are expected are put together: the chi-square distribution is an approximation.
+# Cells with fewer expected samples are merged: the chi-square distribution is an approximation.
 LEAST_EXPECTED = 10
-# Step of differences: float32 keeps five digits of them, and their error is of second order.
+# Step of finite differences: float32 keeps five digits of them, and their error is of second order.
 STEP = 0.01
-# All that kinds of the package ask of a surface: where textures are looked up.
-FEW = 2000  # samples of checks of each one by itself, which share what is compiled
+FEW = 2000  # samples of checks that test each sample; they share compiled functions
+# The only field of a surface that kinds of the package read: where textures are looked up.
 _SURFACE = SimpleNamespace(uv=jnp.full(2, 0.5, jnp.float32))
 
 
@@ -45,12 +45,12 @@ _SURFACE = SimpleNamespace(uv=jnp.full(2, 0.5, jnp.float32))
 
 
 def check_bsdf(kind: type[BSDF], samples: int = 200_000, false_alarm: float = 1e-4, reciprocal: bool = True, **values):
-    """All checks that apply to a kind of bsdf, of constant parameters.
+    """Run all checks that apply to a kind of bsdf with constant parameters.
 
     Args:
-        samples: of each statistical check.
-        reciprocal: whether its values should be the same both ways.
-        values: of its parameters, the others have their defaults.
+        samples: number of samples of each statistical check.
+        reciprocal: whether f(wi, wo) should equal f(wo, wi).
+        values: parameters that differ from their defaults.
     Raises:
         AssertionError: a check failed.
     """
@@ -69,42 +69,42 @@ def check_bsdf(kind: type[BSDF], samples: int = 200_000, false_alarm: float = 1e
 
 
 def material(kind: type[BSDF], **values) -> Materials:
-    """Materials of one shape, both sides of which have a bsdf of this kind; parameters that are not given default."""
+    """Return materials of one shape with a bsdf of this kind on both sides; other parameters have their defaults."""
     return jax.device_put(bsdfs.build([kind.instance("it", **values)], np.float32, (), Parameters()))
 
 
 def directions(kind: type[BSDF]) -> list[np.ndarray]:
-    """Unit wi (3,), from both sides where the kind tells them apart."""
+    """Return unit directions wi (3,), on both sides if the kind distinguishes them."""
     cosines = [*COSINES, *(-z for z in COSINES)] if kind.sided else COSINES
     return [np.array([math.sqrt(1 - z * z) * 0.6, math.sqrt(1 - z * z) * 0.8, z], np.float32) for z in cosines]
 
 
 @jax.jit
 def sample(materials: Materials, wi, u):
-    """Samples of the first bsdf for each of u (N, 2 or 3)."""
+    """Sample the first bsdf for each of u (N, 2 or 3)."""
     return jax.vmap(lambda u: bsdfs.sample(materials, jnp.int32(0), jnp.int32(0), _SURFACE, wi, u))(u)
 
 
 @jax.jit
 def evaluate(materials: Materials, wi, wo):
-    """Values (N, 3) and densities (N,) of the first bsdf for each of wo (N, 3)."""
+    """Return values (N, 3) and densities (N,) of the first bsdf for each of wo (N, 3)."""
     return jax.vmap(lambda wo: bsdfs.evaluate(materials, jnp.int32(0), jnp.int32(0), _SURFACE, wi, wo))(wo)
 
 
 @jax.jit
 def sample_tangent(materials: Materials, tangent: Materials, wi, u):
-    """How the samples change with the materials."""
+    """Return the tangent of the samples for a tangent of the materials."""
     return jax.jvp(lambda m: sample(m, wi, u), (materials,), (tangent,))[1]
 
 
 def random_numbers(materials: Materials, count: int, seed: int):
-    """(count, 2), or (count, 3) where the bsdf asks for them, in [0, 1)."""
+    """Return uniform numbers in [0, 1): (count, 2), or (count, 3) if the bsdf needs three."""
     width = 3 if bsdfs.occurs(materials, "lobes") else 2
     return jnp.asarray(np.random.default_rng(seed).integers(0, 1 << 24, (count, width)) * 2.0**-24, jnp.float32)
 
 
 def check_range(materials: Materials, wi):
-    """Values, densities, weights and their derivatives are finite and not negative, at the ends of all ranges too."""
+    """Check that values, pdfs, weights are finite and >= 0, and derivatives finite, also at the ends of all ranges."""
     ends = np.array([0, 2**-24, 0.5, 1 - 2**-24], np.float32)
     width = random_numbers(materials, 1, 0).shape[1]
     u = jnp.asarray(np.resize(np.stack(np.meshgrid(*[ends] * width), -1), (FEW, width)))
@@ -121,13 +121,13 @@ def check_range(materials: Materials, wi):
 
 
 def check_weights(materials: Materials, wi):
-    """Sampled directions are unit, and weight times density is the value that `evaluate` has there."""
+    """Check that sampled directions are unit, and that weight times density is the value of `evaluate`."""
     drawn = sample(materials, wi, random_numbers(materials, FEW, 1))
     length = np.linalg.norm(drawn.wo, axis=1)
     assert np.allclose(length, 1, atol=1e-5), f"a direction has length {length[np.argmax(abs(length - 1))]}"
     kept = ~np.asarray(drawn.delta) & (np.asarray(drawn.pdf) > 0)
     f, pdf = evaluate(materials, wi, drawn.wo)
-    # Rounding of a cosine near 0 is all that the two may differ by.
+    # The two may differ only by the rounding of a cosine near 0.
     for what, ours, theirs in (("pdf", drawn.pdf, pdf), ("weight * pdf", drawn.weight * drawn.pdf[:, None], f)):
         ours, theirs = np.asarray(ours)[kept], np.asarray(theirs)[kept]
         wrong = ~np.isclose(ours, theirs, rtol=1e-3, atol=1e-5)
@@ -135,7 +135,7 @@ def check_weights(materials: Materials, wi):
 
 
 def check_chi_square(materials: Materials, wi, samples: int, false_alarm: float, seed: int = 2):
-    """Directions are drawn with the density that `evaluate` states."""
+    """Check that directions are drawn with the density that `evaluate` returns."""
     drawn = sample(materials, wi, random_numbers(materials, samples, seed))
     kept = ~np.asarray(drawn.delta) & (np.asarray(drawn.pdf) > 0)
     _, pdf = _on_sphere(materials, wi)
@@ -143,7 +143,7 @@ def check_chi_square(materials: Materials, wi, samples: int, false_alarm: float,
 
 
 def _chi_square(directions, samples: int, shares, false_alarm: float, where: str):
-    """Whether directions (N, 3), the others of `samples` left out, fall into cells by their shares at the midpoints."""
+    """Check that directions (N, 3), those kept of `samples`, fall into cells by their `shares` at the midpoints."""
     from scipy import stats
 
     directions = np.asarray(directions, np.float64)
@@ -151,41 +151,41 @@ def _chi_square(directions, samples: int, shares, false_alarm: float, where: str
     polar = np.arccos(directions[:, 2].clip(-1, 1)) / np.pi
     seen = np.histogram2d(polar, azimuth, CELLS, [[0, 1], [0, 1]])[0].ravel()
     expected = samples * shares.reshape(CELLS[0], POINTS, CELLS[1], POINTS).sum((1, 3)).ravel()
-    # What is not drawn from the density (Dirac lobes, no sample) is a cell of its own.
+    # Samples that are not drawn from the density (Dirac lobes, no sample) form a cell of their own.
     seen, expected = np.append(seen, samples - seen.sum()), np.append(expected, samples - expected.sum())
     few = expected < LEAST_EXPECTED
     seen = np.append(seen[~few], seen[few].sum())
     expected = np.append(expected[~few], max(expected[few].sum(), 0))
     used = expected > LEAST_EXPECTED
     statistic = ((seen - expected)[used] ** 2 / expected[used]).sum()
-    # With one cell alone all samples fall into it.
+    # With a single cell, all samples fall into it.
     chance = stats.chi2.sf(statistic, used.sum() - 1) if used.sum() > 1 else 1.0
     assert chance > false_alarm, f"samples do not follow the stated density at {where}: p = {chance:.2g}"
     assert seen[~used].sum() <= 5 * LEAST_EXPECTED, f"{seen[~used].sum():.0f} samples lie where the density is 0"
 
 
 def check_furnace(materials: Materials, wi, samples: int, false_alarm: float, seed: int = 3):
-    """No more light leaves than arrives, and as much as `evaluate` says where it has all of it."""
+    """Check that no more light leaves than arrives, and as much as `evaluate` integrates to if it covers all lobes."""
     kind = materials.tables[0].kind
     drawn = sample(materials, wi, random_numbers(materials, samples, seed))
-    # What crosses an interface is measured in power, which does not know the IOR.
+    # Light that crosses an interface is measured in power, which does not depend on the IOR.
     share = np.asarray(drawn.weight, np.float64) / np.asarray(drawn.passive, np.float64)[:, None]
     mean, error = share.mean(0), share.std(0) / math.sqrt(samples)
     limit = _sigmas(false_alarm) * error + 1e-5  # rounding of weights of 1
     assert (mean <= 1 + limit).all(), f"{mean.max():.5f} of the light is scattered at wi = {wi}"
     if kind.smooth and not kind.delta:
         f, _ = _on_sphere(materials, wi)
-        # In terms of radiance, as both have it.
+        # In terms of radiance, like both weight and f.
         weight = np.asarray(drawn.weight, np.float64)
         mean, error = weight.mean(0), weight.std(0) / math.sqrt(samples)
-        limit = _sigmas(false_alarm) * error + 1e-3 * f.sum(0) + 1e-5  # the midpoint rule; rounding
+        limit = _sigmas(false_alarm) * error + 1e-3 * f.sum(0) + 1e-5  # error of the midpoint rule; rounding
         assert (abs(mean - f.sum(0)) <= limit).all(), (
             f"samples scatter {mean} of the light, evaluate {f.sum(0)}, at wi = {wi}"
         )
 
 
 def check_reciprocity(materials: Materials, seed: int = 4):
-    """f(wi, wo) = f(wo, wi)."""
+    """Check that f(wi, wo) = f(wo, wi)."""
     rng = np.random.default_rng(seed)
     pairs = rng.normal(size=(2, 500, 3))
     pairs[..., 2] = abs(pairs[..., 2]) + 0.05
@@ -200,7 +200,7 @@ def check_reciprocity(materials: Materials, seed: int = 4):
 
 
 def check_detached(materials: Materials, wi):
-    """Directions and densities carry no derivative in parameters: the weights do, for samples drawn at their values."""
+    """Check that directions and densities carry no derivative in parameters; only the weights do."""
     u = random_numbers(materials, FEW, 5)
     for name, tangent in _material_tangents(materials, but_moving=True).items():
         drawn = sample_tangent(materials, tangent, wi, u)
@@ -211,7 +211,7 @@ def check_detached(materials: Materials, wi):
 
 
 def check_derivatives(materials: Materials, wi, samples: int, false_alarm: float, seed: int = 6):
-    """The mean derivative of the weights is that of the scattered light, by differences of `evaluate`."""
+    """Check that the mean derivative of the weights is that of the scattered light, by differences of `evaluate`."""
     u = random_numbers(materials, samples, seed)
     for name, tangent in _material_tangents(materials, but_moving=True).items():
         moved = sample_tangent(materials, tangent, wi, u).weight
@@ -238,11 +238,11 @@ def _material_tangents(materials: Materials, but_moving: bool = False) -> dict[s
 
 
 def check_texture(kind: type[Texture], **values):
-    """Colours and their derivatives, in parameters and in uv, are finite; those in parameters are right; and the stated
-    span holds.
+    """Check that colours and their derivatives in parameters and uv are finite, that derivatives in parameters are
+    correct, and that colours lie in the stated span.
 
     Args:
-        values: of its parameters, the others have their defaults.
+        values: parameters that differ from their defaults.
     Raises:
         AssertionError: a check failed.
     """
@@ -281,11 +281,11 @@ def check_texture(kind: type[Texture], **values):
 
 
 def check_emitter(kind: type[Emitter], samples: int = 200_000, false_alarm: float = 1e-4, **values):
-    """What a kind of emitter draws has the density that it states, and what it emits is finite and not negative.
+    """Check that a kind of emitter samples its stated density, and that its emission is finite and not negative.
 
     Args:
-        samples: of the chi-square test of a background.
-        values: of its parameters, the others have their defaults.
+        samples: number of samples of the chi-square test of a background.
+        values: parameters that differ from their defaults.
     Raises:
         AssertionError: a check failed.
     """
@@ -325,11 +325,11 @@ def _check_light(light, density):
 
 
 def check_phase(kind: type[Phase], samples: int = 200_000, false_alarm: float = 1e-4, **values):
-    """A kind of phase function draws directions by its density, of which all derivatives integrate to 0.
+    """Check that a phase function samples its density, and that all derivatives of the density integrate to 0.
 
     Args:
-        samples: of the chi-square test.
-        values: of its parameters, the others have their defaults.
+        samples: number of samples of the chi-square test.
+        values: parameters that differ from their defaults.
     Raises:
         AssertionError: a check failed.
     """
@@ -352,7 +352,7 @@ def check_phase(kind: type[Phase], samples: int = 200_000, false_alarm: float = 
         pdf = np.asarray(density(table, what), np.float64)
         assert np.isfinite(pdf).all() and (pdf >= 0).all(), f"`evaluate` is {np.min(pdf)} somewhere"
     _chi_square(wo[:samples], samples, pdf * share, false_alarm, kind.__name__)
-    middles, share = _midpoints(2)  # of a narrow lobe the derivative is narrower than the density
+    middles, share = _midpoints(2)  # the derivative of a narrow lobe is narrower than its density
     for name, tangent in _tangents(table).items():
         _, moved = jax.jvp(drawn, (table,), (tangent,))
         assert not np.asarray(moved).any(), f"directions carry a derivative in {name}; put lax.stop_gradient around it"
@@ -361,11 +361,11 @@ def check_phase(kind: type[Phase], samples: int = 200_000, false_alarm: float = 
         assert abs(total) <= 1e-3 * size, f"the derivative of the density in {name} integrates to {total}, not to 0"
 
 
-# ---- what they share ------------------------------------------------------------------------------------------------
+# ---- shared helpers -------------------------------------------------------------------------------------------------
 
 
 def _midpoints(finer: int = 1):
-    """Directions (N, 3) at the midpoints of the cells' parts, (finer POINTS)^2 a cell, and the solid angle of each."""
+    """Return directions (N, 3) at midpoints of (finer POINTS)^2 parts per cell, and the solid angle of each part."""
     rows, columns = (cells * finer * POINTS for cells in CELLS)
     steps = np.pi / rows, 2 * np.pi / columns
     theta, phi = ((np.arange(n) + 0.5) * step for n, step in zip((rows, columns), steps, strict=True))
@@ -376,14 +376,14 @@ def _midpoints(finer: int = 1):
 
 
 def _on_sphere(materials, wi):
-    """Values (N, 3) and densities (N,) times solid angle, at the midpoints."""
+    """Return values (N, 3) and densities (N,) at the midpoints, times the solid angle."""
     wo, share = _midpoints()
     f, pdf = evaluate(materials, wi, wo)
     return np.asarray(f, np.float64) * share[:, None], np.asarray(pdf, np.float64) * share
 
 
 def _tangents(table: Table, but_moving: bool = False) -> dict[str, Table]:
-    """By name, a unit change of each parameter."""
+    """Return a unit tangent of each parameter, by name."""
     zero, found = jax.tree.map(_zero, table), {}
     for name, declared in table.kind.declared.items():
         column = table.column(name)
@@ -402,7 +402,7 @@ def _plus(tree, share, tangent):
 
 
 def _sigmas(false_alarm: float) -> float:
-    """Standard deviations that a normal number exceeds, to either side, with this probability."""
+    """Return the number of standard deviations that a normal variate exceeds, to either side, with this probability."""
     from scipy import special
 
     return float(special.ndtri(1 - false_alarm / 2))
