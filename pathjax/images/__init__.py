@@ -1,7 +1,7 @@
-"""Image files, and how images compare.
+"""Image files, and comparison of images.
 
-Images are (H, W, 3) linear RGB with the primaries of Rec. 709, the top row first. OpenEXR holds what is measured, PNG
-what is looked at. A file that cannot be read or written is an `InputError` that names it.
+Images are (H, W, 3) linear RGB with the primaries of Rec. 709, the top row first. OpenEXR is for measurement, PNG for
+viewing. A file that cannot be read or written raises an `InputError` that names it.
 """
 
 from pathjax.images.comparison import Comparison, compare

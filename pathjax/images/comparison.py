@@ -1,4 +1,4 @@
-"""How an image file differs from a reference: measures, z-scores where standard errors are known, a picture."""
+"""Comparison of an image file with a reference: metrics, z-scores if standard errors are known, a difference image."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ from pathjax.images.picture import side_by_side, signed_colors
 from pathjax.images.read import read_rgb
 
 ERROR_CHANNELS = "error.R", "error.G", "error.B"
-# z-scores of this size are shown in full colour.
+# z-scores of this magnitude are shown in full colour.
 _FULL_Z = 5
 
 
 class Comparison(NamedTuple):
     image: np.ndarray  # (H, W, 3)
     reference: np.ndarray  # (H, W, 3)
-    compared: np.ndarray  # (H, W) bool: finite in all that was read
-    hdr: bool  # neither is PNG or JPEG
+    compared: np.ndarray  # (H, W) bool: finite in both images and in their errors
+    hdr: bool  # both files are OpenEXR or Radiance HDR
     mse: float
     rel_mse: float
-    relative_error: float  # nan where the reference has no level
+    relative_error: float  # nan if the reference has no level
     psnr: float  # dB
-    peak: float  # of the PSNR: 1 where one is PNG or JPEG, else the reference's maximum
+    peak: float  # of the PSNR: the reference's maximum if `hdr`, else 1
     flip: float | None  # mean; None without `flip-evaluator`
     z: np.ndarray | None  # (H, W, 3), nan where not compared; None without standard errors
     p: float | None  # Sidak's, over all pixels and channels
-    exact: str | None  # the file that was taken as exact, for it holds no standard errors
+    exact: str | None  # file that was taken as exact, because it holds no standard errors
 
 
 def compare(image_file: str, reference_file: str, errors: bool = False) -> Comparison:
@@ -40,7 +40,7 @@ def compare(image_file: str, reference_file: str, errors: bool = False) -> Compa
     Args:
         errors: weigh the differences by standard errors, which one or both hold as channels error.R, error.G, error.B.
     Raises:
-        InputError: a file that cannot be read, two sizes, no standard errors where they are asked for, nothing finite.
+        InputError: a file cannot be read, sizes differ, requested standard errors are missing, or no pixel is finite.
     """
     files = image_file, reference_file
     image, reference = (read_rgb(file) for file in files)
@@ -69,7 +69,7 @@ def compare(image_file: str, reference_file: str, errors: bool = False) -> Compa
 
 
 def _read_errors(files, shape) -> list[np.ndarray | None]:
-    """(H, W, 3) of each file, None where it holds none."""
+    """Return the standard errors (H, W, 3) of each file, None if it holds none."""
     errors, held = [], []
     for file in files:
         channels = read_exr(file)[0] if file_format(file) == "OpenEXR" else {}
@@ -88,7 +88,7 @@ def _read_errors(files, shape) -> list[np.ndarray | None]:
 
 
 def facts(comparison: Comparison) -> dict:
-    """What `json_text` writes of a comparison."""
+    """Return a comparison as a dictionary for `json_text`."""
     c = comparison
     height, width = c.compared.shape
     values = {
@@ -133,10 +133,10 @@ def text(comparison: Comparison) -> str:
 
 
 def picture(comparison: Comparison) -> tuple[np.ndarray, float]:
-    """(H, W', 3) linear RGB: image, reference, difference, and z where known; and the difference of full colour.
+    """Return (H, W', 3) linear RGB: image, reference, difference, and z if known; and the difference of full colour.
 
-    Differences are means over the channels, z the farthest from 0 of the three; both red where the image is brighter,
-    blue where it is darker, black where they were not compared; z in full colour at +-5.
+    Differences are means over the channels, z is the farthest from 0 of the three. Both are red where the image is
+    brighter, blue where it is darker, black where not compared; z has full colour at +-5.
     """
     c = comparison
     with np.errstate(invalid="ignore"):

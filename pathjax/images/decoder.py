@@ -1,4 +1,4 @@
-"""Image files as OpenImageIO reads them: their format, size and stored numbers; what goes wrong is an InputError."""
+"""Reading of image files by OpenImageIO: format, size and stored values; every failure is an InputError."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ _FIRST_BYTES = {
     "JPEG": b"\xff\xd8\xff",
     "BMP": b"BM",
 }
-# Formats of linear numbers, which are measured; the others are looked at.
+# Formats of linear values, for measurement; the others are for viewing.
 LINEAR = ("OpenEXR", "Radiance HDR")
 
 
 def file_format(path: str | Path) -> str:
-    """Return "OpenEXR", "Radiance HDR", "PNG", "JPEG" or "BMP", by the file's first bytes, whatever its name says.
+    """Return "OpenEXR", "Radiance HDR", "PNG", "JPEG" or "BMP", by the file's first bytes, regardless of its name.
 
-    What begins like none of them is "TGA", which has no mark of its own, if it is named so.
+    A file that begins like none of them is "TGA", a format without magic bytes, if its name ends in .tga.
 
     Raises:
-        InputError: no such file, no right to read it, or another format.
+        InputError: the file does not exist, cannot be read, or has another format.
     """
     if not Path(path).is_file():
         raise InputError(f"{path}: {'not a file' if Path(path).exists() else 'no such file'}")
@@ -52,16 +52,16 @@ class Unreadable(Exception):
 
 @contextmanager
 def opened(path: str | Path) -> Iterator:
-    """The file as OpenImageIO has it; whatever goes wrong with it is an InputError that names it."""
+    """Open a file by OpenImageIO; any failure, also in the `with` block, becomes an InputError that names the file."""
     import OpenImageIO
 
     found = file_format(path)
     how = OpenImageIO.ImageSpec()
-    how.attribute("oiio:UnassociatedAlpha", 1)  # else colours of PNG would be multiplied by it
+    how.attribute("oiio:UnassociatedAlpha", 1)  # else colours of PNG would be multiplied by alpha
     with open(path, "rb") as file:
         try:
             name = str(path)
-            if name.encode("utf-8", "ignore").decode() != name:  # OpenImageIO takes no other bytes
+            if name.encode("utf-8", "ignore").decode() != name:  # OpenImageIO accepts only UTF-8 names
                 name = f"/dev/fd/{file.fileno()}"
             image = OpenImageIO.ImageInput.open(name, how)
             reason = OpenImageIO.geterror()
@@ -69,15 +69,15 @@ def opened(path: str | Path) -> Iterator:
                 remedy = "write all channels at full size" if "ubsampled" in reason else "it is damaged, write it anew"
                 raise Unreadable(f"{reason}; {remedy}")
             yield image
-        except Exception as error:  # also UnicodeDecodeError and others, as the file's bytes have it
+        except Exception as error:  # also UnicodeDecodeError and others, depending on the file
             raise InputError(f"{path}: cannot be read as {found}: {' '.join(str(error).split())}") from None
 
 
 def read_pixels(image, part: int, first: int, end: int, number) -> np.ndarray:
-    """(h, w, end - first) of one part as `number`."""
+    """Read the channels first to end - 1 of one part as type `number`: (h, w, end - first)."""
     pixels = image.read_image(part, 0, first, end, number)
     reason = image.geterror()
-    if pixels is None or reason:  # a JPEG that is cut off gives both
+    if pixels is None or reason:  # a truncated JPEG returns pixels and a reason
         raise Unreadable(f"{reason}; it is damaged, write it anew")
     return pixels
 

@@ -1,4 +1,4 @@
-"""OpenEXR, which is measured: linear numbers in named channels, in one part or several."""
+"""OpenEXR, for measurement: linear values in named channels, in one part or several."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ def write_exr(path: str | Path, channels: Mapping[str, np.ndarray], header: Mapp
     """Write channels as 32-bit floats with ZIP compression; the file appears whole or not at all.
 
     Args:
-        channels: name to (H, W); a viewer shows those named R, G, B.
-        header: attributes of the file; an int must fit 32 bits; what UTF-8 cannot hold of a text is escaped.
+        channels: name to (H, W); viewers show those named R, G, B.
+        header: attributes of the file; an int must fit 32 bits; characters that UTF-8 cannot encode are escaped.
     Raises:
-        InputError: no such folder, no right to write, or shapes that differ.
+        InputError: the folder does not exist or is not writable, shapes differ, or an int does not fit.
     """
     import OpenEXR
 
-    # OpenEXR writes the memory behind a strided view as if it were contiguous: another image, without an error.
+    # OpenEXR writes the memory behind a strided view as if it were contiguous: a wrong image, without an error.
     pixels = {name: np.ascontiguousarray(values, dtype=np.float32) for name, values in channels.items()}
     shapes = {values.shape for values in pixels.values()}
     if len(shapes) != 1 or any(len(shape) != 2 or 0 in shape for shape in shapes):
@@ -43,14 +43,14 @@ def write_exr(path: str | Path, channels: Mapping[str, np.ndarray], header: Mapp
     header = {name: encodable(value) if isinstance(value, str) else value for name, value in header.items()}
     fixed = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
 
-    encoded = io.BytesIO()  # OpenEXR itself writes on when the disk has no room for the last bytes
+    encoded = io.BytesIO()  # OpenEXR itself reports no error if the disk has no room for the last bytes
     with OpenEXR.File({**header, **fixed}, pixels) as file:
         file.write(encoded)
     write_whole(Path(path), lambda file: file.write(encoded.getbuffer()))
 
 
 def storage(path: str | Path) -> tuple[str, bool]:
-    """Compression of an EXR that `read_rgb` has read, by OpenEXR's name, and whether it holds 16-bit floats."""
+    """Return OpenEXR's name of the compression of a file that `read_rgb` can read, and whether it has 16-bit floats."""
     with opened(path) as image:
         parts = _parts(image)
         part, _, indices = _find_colors(parts)
@@ -59,13 +59,13 @@ def storage(path: str | Path) -> tuple[str, bool]:
 
 
 def read_exr(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, str | int | float]]:
-    """All channels as (H, W) float32 by name, and those attributes of the header that are text or numbers.
+    """Return all channels as (H, W) float32 by name, and the attributes of the header that are text or numbers.
 
-    The channels cover the display window and are 0 outside the data window. In a file of several parts the part's name
-    stands before the channel's, and the header is that of the first part.
+    The channels cover the display window and are 0 outside the data window. In a file of several parts, channel names
+    are prefixed by the part's name, and the header is that of the first part.
 
     Raises:
-        InputError: no such file, or not an OpenEXR file that can be read.
+        InputError: the file does not exist, or is not a readable OpenEXR file.
     """
     if (found := file_format(path)) != "OpenEXR":
         raise InputError(f"{path}: is {found}, not OpenEXR")
@@ -92,16 +92,16 @@ def read_colors(path: str | Path) -> np.ndarray:
         numbers = {_number(parts[part], i) for i in indices}
     if matrix is None:
         return pixels if len(indices) == 3 else np.repeat(pixels, 3, axis=-1)
-    # Red, green or blue that is no more than the rounding of the stored numbers leaves of it is not there.
+    # Set red, green or blue to 0 if it is within the rounding error of the stored values.
     rounding = np.finfo(np.float16).eps if "half" in numbers else _MATRIX_ROUNDING
-    with np.errstate(invalid="ignore"):  # infinities of different signs
+    with np.errstate(invalid="ignore"):  # infinities of opposite signs
         rgb = pixels @ matrix.T
         rgb[np.abs(rgb) < rounding * (np.abs(pixels) @ np.abs(matrix).T)] = 0
     return rgb.astype(np.float32)
 
 
 def _find_colors(parts) -> tuple[int, str, list[int]]:
-    """The part that holds the image, "RGB", "XYZ" or "Y", and the places of these channels in it."""
+    """Return the part that holds the image, "RGB", "XYZ" or "Y", and the indices of these channels in the part."""
     layers: dict[tuple[int, str], dict[str, int]] = {}
     for part, spec in enumerate(parts):
         for i, name in enumerate(spec.channelnames):
@@ -136,7 +136,7 @@ def _full_name(parts, part: int, name: str) -> str:
 
 
 def _primaries(spec) -> np.ndarray:
-    """(4, 2), the file's chromaticities; those of Rec. 709 if it states none."""
+    """Return the file's chromaticities (4, 2); those of Rec. 709 if it states none."""
     stated = spec.getattribute("chromaticities")
     space = spec.getattribute("colorInteropID") or "unknown"
     linear = space == "lin_rec709_scene" or space.startswith("lin_") and stated is not None
@@ -146,7 +146,7 @@ def _primaries(spec) -> np.ndarray:
 
 
 def _to_rec709(primaries) -> np.ndarray:
-    """(3, 3) from linear RGB of these primaries to Rec. 709: the same light, so white is not adapted (as Mitsuba)."""
+    """Return the matrix (3, 3) from linear RGB of these primaries to Rec. 709; as in Mitsuba, white is not adapted."""
     try:
         with np.errstate(all="ignore"):
             matrix = np.linalg.solve(_to_xyz(_REC709), _to_xyz(primaries))
@@ -158,14 +158,14 @@ def _to_rec709(primaries) -> np.ndarray:
 
 
 def _to_xyz(primaries) -> np.ndarray:
-    """(3, 3) from linear RGB to CIE XYZ (SMPTE RP 177)."""
+    """Return the matrix (3, 3) from linear RGB to CIE XYZ (SMPTE RP 177)."""
     x, y = np.transpose(primaries)
     xyz = np.stack([x, y, 1 - x - y])
     return xyz[:, :3] * np.linalg.solve(xyz[:, :3], xyz[:, 3] / y[3])
 
 
 def _parts(image) -> list:
-    """The headers of all parts."""
+    """Return the headers of all parts."""
     parts = [image.spec(part, 0) for part in range(image.spec().getattribute("oiio:subimages") or 1)]
     for spec in parts:
         require_size(spec)
@@ -173,11 +173,11 @@ def _parts(image) -> list:
 
 
 def _read_channels(image, part: int, spec, indices: Sequence[int]) -> np.ndarray:
-    """(H, W, len(indices)) float32 over the display window, from the largest level of a pyramid."""
+    """Read (H, W, len(indices)) float32 over the display window, from the largest level of a pyramid."""
     if spec.deep:
         raise Unreadable("it holds deep data, many samples in a pixel; flatten it")
     first, end = min(indices), max(indices) + 1
-    # One read for each kind of number: read as another, an integer would be divided by the largest one.
+    # One read per stored type: converted to another type, an integer would be divided by its maximum.
     kinds = {_number(spec, i) for i in indices}
     stored = {kind: read_pixels(image, part, first, end, kind) for kind in kinds}
     pixels = np.empty((spec.height, spec.width, len(indices)), np.float32)
@@ -194,5 +194,5 @@ def _read_channels(image, part: int, spec, indices: Sequence[int]) -> np.ndarray
 
 
 def _number(spec, channel: int) -> str:
-    """ "half", "float" or "uint"."""
+    """Return the stored type of a channel: "half", "float" or "uint"."""
     return str(spec.channelformat(channel))

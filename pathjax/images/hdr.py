@@ -1,4 +1,4 @@
-"""Radiance's pictures (Ward 1991, "Real pixels"): linear numbers whose three channels share an exponent."""
+"""Radiance HDR images (Ward 1991, "Real pixels"): linear values whose three channels share an exponent."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ import numpy as np
 
 from pathjax.images.decoder import Unreadable, opened, read_pixels, require_size
 
-# As OpenImageIO tells the ways that rows may run: `-Y height +X width`, from the top and the left.
+# OpenImageIO's code for the row order `-Y height +X width`, from the top and the left.
 _UPRIGHT = 1
 
 
 def read_colors(path: str | Path) -> np.ndarray:
-    """(H, W, 3) float32 linear RGB as it is stored: a stated exposure is not divided out, as Mitsuba has it.
+    """Read (H, W, 3) float32 linear RGB as stored: as in Mitsuba, a stated exposure is not divided out.
 
     Raises:
         InputError: as `read_rgb`.

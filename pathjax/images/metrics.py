@@ -1,4 +1,4 @@
-"""Measures of how an image differs from a reference, of arrays (..., 3) of any shape but for `flip`."""
+"""Metrics of an image against a reference, for arrays (..., 3) of any shape except in `flip`."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ import math
 
 import numpy as np
 
-# Added to the squared reference in relative errors, so that black pixels do not rule them.
+# Added to the squared reference in relative errors, so that black pixels do not dominate them.
 RELATIVE_FLOOR = 0.01
-# The brightest of the lit pixels, lamps and skies in view, do not count in the level of an image; the others do.
+# Share of the lit pixels that count in the level of an image; the brightest, visible lamps and skies, do not.
 LEVEL_SHARE = 0.75
-# Values are equal if they differ by this share or less: float32 leaves as much in the mean of a pixel's samples.
+# Relative difference up to which values are equal: the rounding error of the mean of a pixel's samples in float32.
 ROUNDING = 1e-5
-# FLIP ends the process if its reference is darker than this everywhere.
+# FLIP terminates the process if its reference is darker than this everywhere.
 _FLIP_LEAST_LUMINANCE = 2e-7
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 
@@ -22,25 +22,25 @@ def mse(image, reference) -> float:
 
 
 def rel_mse(image, reference) -> float:
-    """mean((I - R)^2 / (R^2 + 0.01)); nan if the image holds one."""
+    """Return mean((I - R)^2 / (R^2 + 0.01)); nan if the image holds a nan."""
     reference = np.asarray(reference, float)
     return float(np.mean((np.asarray(image, float) - reference) ** 2 / (reference**2 + RELATIVE_FLOOR)))
 
 
 def relative_error(image, reference) -> float:
-    """sqrt(relMSE) of images exposed so that the reference has the level 1: the same in any unit of radiance.
+    """Return sqrt(relMSE) of images exposed so that the reference has level 1, independent of the unit of radiance.
 
-    So sqrt(mean((I - R)^2 / (R^2 + 0.01 L^2))), where L is `level` of R. nan where that is not known.
+    This is sqrt(mean((I - R)^2 / (R^2 + 0.01 L^2))), where L is `level` of R; nan if L is nan.
     """
     exposure = 1 / level(reference)
     return math.sqrt(rel_mse(exposure * np.asarray(image, float), exposure * np.asarray(reference, float)))
 
 
 def level(image) -> float:
-    """How bright an image (..., 3) is: the mean of its lit pixels and their channels, but for the brightest quarter.
+    """Return the brightness of an image (..., 3): the mean of its lit pixels and channels, less the brightest quarter.
 
-    So neither what is black counts nor a lamp in view, however bright. Pixels that are not finite are left out. nan
-    where nothing is lit, or the level is below 1e-31: what single paths add to it then underflows in float32.
+    So neither black pixels nor a visible lamp count, however bright. Pixels that are not finite are left out. nan if
+    no pixel is lit, or if the level is below 1e-31, where contributions of single paths underflow in float32.
     """
     brightness = mean_of_channels(np.asarray(image, float))
     lit = brightness[np.isfinite(brightness) & (brightness > 0)]
@@ -53,23 +53,23 @@ def level(image) -> float:
 
 
 def mean_of_channels(x: np.ndarray) -> np.ndarray:
-    """(...) of (..., 3): `x.mean(-1)`, but faster."""
+    """Return `x.mean(-1)`, faster: (..., 3) to (...)."""
     return sum(np.moveaxis(x, -1, 0)) / x.shape[-1]
 
 
 def psnr(image, reference, peak: float) -> float:
-    """10 log10(peak^2 / MSE) in dB; infinite for equal images."""
+    """Return 10 log10(peak^2 / MSE) in dB; infinite for equal images."""
     error = mse(image, reference)
     with np.errstate(divide="ignore"):
         return math.inf if error == 0 else float(10 * np.log10(peak**2 / error))
 
 
 def flip(image, reference, hdr: bool) -> np.ndarray | None:
-    """FLIP map (H, W) in [0, 1] of finite images, seen at 67 pixels per degree; None without `flip-evaluator`.
+    """Return the FLIP map (H, W) in [0, 1] of finite images, at 67 pixels per degree; None without `flip-evaluator`.
 
     Args:
-        hdr: HDR-FLIP, over the exposures that suit the reference (Andersson et al. 2021), of values clipped at 0;
-            else LDR-FLIP (Andersson et al. 2020), of values clipped to [0, 1].
+        hdr: HDR-FLIP of values clipped at 0, over exposures that suit the reference (Andersson et al. 2021);
+            else LDR-FLIP of values clipped to [0, 1] (Andersson et al. 2020).
     """
     try:
         import flip_evaluator
@@ -77,7 +77,7 @@ def flip(image, reference, hdr: bool) -> np.ndarray | None:
         return None
     top, exposures = 1.0, {}
     if hdr:
-        # FLIP exposes the reference well in any unit of radiance, if the program does not take it for black.
+        # FLIP finds exposures for any unit of radiance, unless it takes the reference for black: hence this scaling.
         top, brightest = float(np.finfo(np.float32).max), np.max(np.asarray(reference, float) @ _LUMINANCE)
         _, exponent = np.frexp(np.nanmax([brightest, level(image)]))
         image, reference = (np.ldexp(np.asarray(x, float), -exponent) for x in (image, reference))
@@ -91,9 +91,9 @@ def flip(image, reference, hdr: bool) -> np.ndarray | None:
 
 
 def z_scores(image, reference, image_error, reference_error) -> np.ndarray:
-    """Differences over their standard errors, in float64.
+    """Return differences over their standard errors, in float64.
 
-    Values that are equal up to float32's rounding: 0. Different values without error: infinite.
+    0 for values that are equal up to float32's rounding; infinite for different values without error.
     """
     image, reference = np.asarray(image, float), np.asarray(reference, float)
     difference = image - reference
@@ -103,9 +103,9 @@ def z_scores(image, reference, image_error, reference_error) -> np.ndarray:
 
 
 def sidak_p(z) -> float:
-    """Chance that some one of as many independent standard normal numbers is as far from 0 as the farthest of `z`.
+    """Return the probability that any of z.size independent standard normals is as far from 0 as the farthest of `z`.
 
-    Standard errors that are themselves estimated from few passes spread z more widely than that, and p comes out low.
+    Standard errors that are themselves estimated from few passes spread z more widely, so that p is too low.
     """
     from scipy.special import log_ndtr
 

@@ -1,4 +1,4 @@
-"""PNG, JPEG and their like, which are looked at: 8 or 16 bits of sRGB."""
+"""PNG, JPEG and similar formats, for viewing: 8 or 16 bits of sRGB."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from pathjax.system.files import write_whole
 
 
 def srgb_to_linear(encoded: np.ndarray) -> np.ndarray:
-    """IEC 61966-2-1: encoded values in [0, 1] to linear light, any shape."""
+    """Convert encoded values in [0, 1] to linear light, any shape (IEC 61966-2-1)."""
     encoded = np.asarray(encoded)
     return np.where(encoded <= 0.04045, encoded / 12.92, ((np.maximum(encoded, 0.04045) + 0.055) / 1.055) ** 2.4)
 
 
 def linear_to_srgb(linear: np.ndarray) -> np.ndarray:
-    """The inverse of `srgb_to_linear`."""
+    """Invert `srgb_to_linear`."""
     linear = np.asarray(linear)
     return np.where(linear <= 0.0031308, linear * 12.92, 1.055 * np.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055)
 
@@ -36,7 +36,7 @@ def write_png(path: str | Path, rgb: np.ndarray) -> None:
 
 
 def write_stored(path: str | Path, stored: np.ndarray) -> None:
-    """Write (H, W, 3) uint8 as they are."""
+    """Write (H, W, 3) uint8 values unchanged."""
     from PIL import Image
 
     image = Image.fromarray(np.ascontiguousarray(stored, np.uint8))
@@ -44,9 +44,9 @@ def write_stored(path: str | Path, stored: np.ndarray) -> None:
 
 
 def read_stored(path: str | Path) -> np.ndarray:
-    """(H, W, 3) uint8 or uint16 of a PNG, JPEG, BMP or TGA as they are stored, before the curve of sRGB.
+    """Read the stored values (H, W, 3) uint8 or uint16 of a PNG, JPEG, BMP or TGA, without the sRGB conversion.
 
-    Grey is repeated, alpha left out; fewer than 8 bits are spread over 0 to 255, and palettes are looked up.
+    Grey is repeated, alpha dropped; values of fewer than 8 bits are scaled to 0 to 255, and palettes are looked up.
 
     Raises:
         InputError: as `read_rgb`.
@@ -62,13 +62,13 @@ def read_stored(path: str | Path) -> np.ndarray:
 
 
 def storage(path: str | Path) -> tuple[int, np.ndarray]:
-    """Levels above black of a PNG that `read_rgb` has read (255 for 8 bits), and (H, W) bool: which pixels are opaque.
+    """Return the maximum stored value (255 for 8 bits) of a PNG that `read_rgb` can read; (H, W) bool: opaque pixels.
 
     Raises:
-        InputError: a palette, which holds the nearest of few colours.
+        InputError: the PNG has a palette, which holds the nearest of few colours.
     """
     with open(path, "rb") as file:
-        bits, color_type = file.read(26)[24:]  # of the header, which comes first
+        bits, color_type = file.read(26)[24:]  # the header comes first
     if color_type == 3:
         raise InputError(f"{path}: a palette holds the nearest of few colours; write the image as RGB")
     with opened(path) as image:

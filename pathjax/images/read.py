@@ -1,4 +1,4 @@
-"""Images of any format as linear RGB."""
+"""Reading images of any format as linear RGB."""
 
 from __future__ import annotations
 
@@ -11,21 +11,20 @@ from pathjax.images.decoder import file_format
 
 
 def read_rgb(path: str | Path, raw: bool = False) -> np.ndarray:
-    """(H, W, 3) float32 linear RGB with the primaries of Rec. 709, the top row first, from OpenEXR, Radiance
-    HDR, PNG, JPEG, BMP or TGA.
+    """Read OpenEXR, Radiance HDR, PNG, JPEG, BMP or TGA as (H, W, 3) float32 linear RGB with the primaries of Rec. 709.
 
-    Grey is repeated and alpha left out, as in Mitsuba: colours of OpenEXR are multiplied by alpha already, as light
-    that reached the camera is; those of others are taken as they stand. All but OpenEXR and HDR are sRGB, also with 16
-    bits; their gamma, ICC profile and EXIF orientation are not applied, and of an animation its still image is read.
+    The top row comes first. As in Mitsuba, grey is repeated and alpha dropped: colours of OpenEXR are already
+    multiplied by alpha, like light that reached the camera; colours of other formats are used unchanged. All but
+    OpenEXR and HDR are sRGB, also with 16 bits; their gamma, ICC profile and EXIF orientation are not applied. The
+    still image of an animation is read.
 
-    From OpenEXR come R, G, B, or X, Y, Z, or Y; or R, G, B of a layer if there is one alone. X, Y, Z are converted, and
-    so are primaries that the file states; white is not adapted. The image is the display window, 0 outside the data
-    window.
+    OpenEXR must have channels R, G, B, or X, Y, Z, or Y, or R, G, B in exactly one layer. X, Y, Z and stated primaries
+    are converted without white adaptation. The image is the display window, 0 outside the data window.
 
     Args:
-        raw: plain numbers (stored / maximum) are meant, not sRGB. OpenEXR and HDR are linear in any case.
+        raw: return plain values (stored / maximum) instead of decoding sRGB. OpenEXR and HDR are always linear.
     Raises:
-        InputError: no such file, another format, a damaged file, or one that does not tell which colours are meant.
+        InputError: the file does not exist, has another format, is damaged, or has ambiguous colours.
     """
     readers = {"OpenEXR": exr.read_colors, "Radiance HDR": hdr.read_colors}
     if reader := readers.get(file_format(path)):
@@ -34,7 +33,7 @@ def read_rgb(path: str | Path, raw: bool = False) -> np.ndarray:
 
 
 def decoded(stored: np.ndarray, raw: bool) -> np.ndarray:
-    """float32 in [0, 1] of uint8 or uint16 that PNG, JPEG and their like store: linear light, or raw, the numbers."""
+    """Convert uint8 or uint16 of PNG, JPEG and the like to float32 in [0, 1]: linear light, or plain values if raw."""
     maximum = np.iinfo(stored.dtype).max
     levels = np.arange(maximum + 1) / maximum
     return (levels if raw else png.srgb_to_linear(levels)).astype(np.float32)[stored]
