@@ -1,1 +1,1 @@
-"""Speed against error, beside a peer in the same run."""
+"""Benchmarks: speed against error, with a peer in the same run."""

@@ -1,6 +1,6 @@
-"""`pathjax bench`: speed against error beside a peer, and what strategies, sampler and precision are worth.
+"""`pathjax bench`: speed against error beside a peer, and comparisons of strategies, sampler and precision.
 
-Efficiency is 1 / (relMSE x seconds), relMSE against a converged reference of pathjax's own with other seeds.
+Efficiency is 1 / (relMSE x seconds), with relMSE against a converged reference by pathjax itself with other seeds.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ from pathjax.system.output import Output, say
 
 
 def prepare(folder: Path | None) -> None:
-    """Make the folder of a report, if there is to be one.
+    """Create the folder of a report; None: there is no report.
 
     Raises:
-        InputError: it cannot be made, or not written into.
+        InputError: the folder cannot be created or written into.
     """
     if folder is not None and not folder.parent.is_dir():
         raise InputError(f"{folder}: there is no folder {folder.parent}; make it first")
@@ -49,16 +49,16 @@ def prepare(folder: Path | None) -> None:
 def run(
     files: list[str], defines: dict[str, str], plan: Plan, folder: Path | None, output: Output, resume: bool = False
 ) -> tuple[dict, bool]:
-    """Measure scenes one after another; after each one the report of all is in the folder, if there is one.
+    """Measure scenes one after another, and write the report of all so far into the folder, if any, after each scene.
 
-    Several processes share the renders; the first one alone has a folder and a peer, and its report is whole.
+    Several processes share the renders; only the first one has a folder and a peer, and only its report is complete.
 
     Args:
-        folder: `prepare`d; resume: go on after the scenes of the report that is there.
+        folder: folder after `prepare`; resume: continue after the scenes of the report in it.
     Returns:
-        The report, and whether all was measured. What ends it early, Ctrl-C too, costs no scene that is done.
+        The report, and whether everything was measured. Finished scenes survive an early end, also by Ctrl-C.
     Raises:
-        InputError: a scene, the report to go on with or the peer is not as it must be; nothing was measured.
+        InputError: a scene, the report to resume or the peer is invalid; nothing was measured.
     """
     report = {
         "machine": machine(),
@@ -76,7 +76,7 @@ def run(
     missing = distributed.of_first(np.array([file not in done for file in files]))
     todo = [scene for scene, misses in zip(_plot_names(files), missing, strict=True) if misses]
     for _, file in todo:
-        pathjax.load_scene(file, parameters=defines)  # a wrong one is refused before an hour of work on the others
+        pathjax.load_scene(file, parameters=defines)  # refuse a wrong one before an hour of work on the others
     if plan.against == "mitsuba" and todo:
         _find_mitsuba(todo[0][1], defines)
     with Interrupts() as interrupts:
@@ -102,7 +102,7 @@ def run(
 
 
 def _write(report: dict, folder: Path, name: str, output: Output) -> None:
-    """Plot the last scene, and write the report of all."""
+    """Plot the last scene, and write the report of all scenes."""
     scene = report["scenes"][-1]
     if plot.available() and plot.has_noise(scene):
         place = output.file(folder / name, lambda path: plot.write(scene, path))
@@ -112,7 +112,7 @@ def _write(report: dict, folder: Path, name: str, output: Output) -> None:
 
 
 def _begun(file: Path, report: dict) -> dict:
-    """The report of a file, which must have been measured as `report` would be."""
+    """Return the report in a file, which must have the machine, plan and other settings of `report`."""
     try:
         begun = json.loads(file.read_text(encoding="utf-8"))
         other = [key for key, value in report.items() if key not in ("scenes", "summary") and begun[key] != value]
@@ -131,11 +131,11 @@ def _find_mitsuba(scene: str, defines: dict) -> None:
     except peers.PeerMissing as error:
         raise InputError(f"--against mitsuba: {error}") from None
     except (peers.RequestError, peers.PeerFailed):
-        pass  # of this scene; the report tells
+        pass  # a failure of this scene only, which goes into the report
 
 
 def _plot_names(files: list[str]):
-    """(name of its plot, file) of every scene."""
+    """Yield (name of the plot, file) of every scene."""
     stems = [Path(file).stem for file in files]
     for number, (stem, file) in enumerate(zip(stems, files, strict=True), 1):
         yield f"{stem}.png" if stems.count(stem) == 1 else f"{stem}-{number}.png", file

@@ -1,4 +1,4 @@
-"""The figures of the report: errors without the reference's own, efficiencies, slopes."""
+"""Figures of the report: errors less that of the reference, efficiencies, slopes."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from pathjax.images.metrics import RELATIVE_FLOOR, ROUNDING, rel_mse
 
-# What rounding alone leaves; a render at or below has no noise.
+# relMSE of rounding alone; a render with no more has no noise.
 NO_NOISE = ROUNDING**2
 
 
@@ -23,7 +23,7 @@ class Reference(NamedTuple):
 
     @property
     def noise(self) -> float:
-        """Its own expected relMSE."""
+        """Expected relMSE of the reference itself."""
         return float(np.mean(self.variance / self._scale))
 
     @property
@@ -31,14 +31,14 @@ class Reference(NamedTuple):
         return self.image**2 + RELATIVE_FLOOR
 
     def errors(self, images) -> list[float]:
-        """relMSE of each image, expected to be too high by `noise`, up to higher orders of the reference's error."""
+        """Return the relMSE of each image, biased up by `noise`, to leading order in the reference's error."""
         return [rel_mse(image, self.image) for image in images]
 
     def bias(self, images) -> dict:
-        """relMSE that the images have in common, noise of their mean and the reference's gone, and its standard error.
+        """Return the relMSE common to all images, less the noise of their mean and the reference; its standard error.
 
-        An unbiased estimate, so it may be negative. Its mean is 0 where independent images have the reference's mean.
-        nan of one image.
+        The estimate is unbiased, so it may be negative. Its mean is 0 if independent images have the reference's mean.
+        nan for a single image.
         """
         mean, variance, count = moments(images)
         if count < 2:
@@ -49,7 +49,10 @@ class Reference(NamedTuple):
 
 
 def moments(images) -> tuple[np.ndarray, np.ndarray, int]:
-    """Mean, estimated variance of that mean (0 of one image), and count of images; Welford's, one in memory."""
+    """Return mean, estimated variance of the mean (0 for one image) and count of images, by Welford's algorithm.
+
+    Only one image is in memory at a time.
+    """
     count, mean, squares = 0, 0.0, 0.0
     for image in (np.asarray(image, float) for image in images):
         count += 1
@@ -60,19 +63,20 @@ def moments(images) -> tuple[np.ndarray, np.ndarray, int]:
 
 
 def reference_of(images, spp_each: int) -> Reference:
-    """Reference from at least two independent images of `spp_each` samples."""
+    """Compute a reference from at least two independent images of `spp_each` samples."""
     mean, variance, count = moments(images)
     return Reference(mean, variance, count * spp_each)
 
 
 def row(asked_spp: int, spp: int, seconds, errors, noise: float, paths: int, cpu_seconds=None) -> dict:
-    """Time, error and efficiency of several renders that differ in their seeds.
+    """Return time, error and efficiency of several renders with different seeds.
 
     Args:
-        seconds: that each took; cpu_seconds: of all processors, which others' work on the machine lengthens little.
-        errors: relMSE of each to the reference; noise: that of the reference.
-        paths: of a render of one sample a pixel.
-    The error of images that are not finite is not either; the efficiency is None where there is no noise.
+        seconds: time of each render.
+        cpu_seconds: CPU time of each over all processors, which other load on the machine lengthens little.
+        errors: relMSE of each render to the reference; noise: relMSE of the reference.
+        paths: number of paths of a render with one sample per pixel.
+    The error of non-finite images is not finite; the efficiency is None without noise.
     """
     run, measured = statistics.median(seconds), statistics.fmean(errors)
     error = measured - noise
@@ -93,7 +97,7 @@ def row(asked_spp: int, spp: int, seconds, errors, noise: float, paths: int, cpu
 
 
 def deviation(image, exact) -> dict:
-    """How images differ from exact ones: relMSE, and the largest |I - E| / sqrt(E^2 + 0.01)."""
+    """Return the deviation of images from exact ones: relMSE, and the largest |I - E| / sqrt(E^2 + 0.01)."""
     image, exact = np.asarray(image, float), np.asarray(exact, float)
     relative = np.abs(image - exact) / np.sqrt(exact**2 + RELATIVE_FLOOR)
     return {"rel_mse": rel_mse(image, exact), "largest_deviation": float(relative.max())}
@@ -117,6 +121,6 @@ def slopes(rows) -> dict:
 
 
 def best(rows, asked_spp: int) -> dict | None:
-    """The most efficient of the rows that answer `asked_spp`."""
+    """Return the most efficient row with this `asked_spp`; None if none has noise."""
     candidates = [row for row in rows if row["asked_spp"] == asked_spp and row["efficiency"]]
     return max(candidates, key=lambda row: row["efficiency"], default=None)

@@ -1,7 +1,7 @@
-"""What `pathjax bench` measures of one scene.
+"""Measurements of `pathjax bench` for one scene.
 
 Half of the timed renders are made before the peer runs and half after, so that a machine that slows down slows both.
-All but the times is the same in every run.
+Everything but the times is the same in every run.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ from pathjax.scene.parameters import nameless
 from pathjax.scene.scene import Scene
 from pathjax.sensors import film
 
-# Independent images whose mean is the reference, so that their spread tells its error.
+# Number of independent images whose mean is the reference; their spread estimates its error.
 BATCHES = 16
-# Images of one sample a pixel, whose error is that of independent numbers.
+# Number of images with one sample per pixel, whose error is that of independent random numbers.
 SINGLES = 64
 # No timed render has these seeds.
 REFERENCE_SEED, SINGLES_SEED = 1 << 20, 1 << 21
@@ -37,10 +37,10 @@ REFERENCE_SEED, SINGLES_SEED = 1 << 20, 1 << 21
 
 class Plan(NamedTuple):
     spps: list[int]  # ascending
-    repeat: int  # timed renders of each kind
-    reference_spp: int  # at least
-    against: str | None  # "mitsuba"
-    quick: bool  # speed against error alone
+    repeat: int  # number of timed renders of each kind
+    reference_spp: int  # minimum spp of the reference
+    against: str | None  # "mitsuba"; None: no peer
+    quick: bool  # measure only speed against error
     say: Callable[[str], None]
 
 
@@ -49,7 +49,7 @@ class Subject(NamedTuple):
     defines: dict[str, str]
     scene: Scene
     reference: Reference
-    paths: int  # of a render of one sample a pixel
+    paths: int  # number of paths of a render with one sample per pixel
 
     def row(self, asked_spp, spp, seconds, images, cpu_seconds=None) -> dict:
         errors = self.reference.errors(images)
@@ -58,7 +58,7 @@ class Subject(NamedTuple):
 
 
 def measure(file: str, defines: dict[str, str], plan: Plan) -> dict:
-    """Everything about one scene, as `json_text` writes it."""
+    """Measure one scene, and return its entry of the report for `json_text`."""
     say = plan.say
     scene = pathjax.load_scene(file, parameters=defines)
     height, width = film.image_shape(scene.film)
@@ -106,7 +106,7 @@ def measure(file: str, defines: dict[str, str], plan: Plan) -> dict:
 
 
 def _more(subject: Subject, rows, plan: Plan, failures) -> dict:
-    """What `--quick` leaves out."""
+    """Return the measurements that `--quick` leaves out."""
     say, file = plan.say, subject.file
     say(f"{file}: independent numbers")
     sampler = _sampler(subject, rows)
@@ -114,7 +114,7 @@ def _more(subject: Subject, rows, plan: Plan, failures) -> dict:
     strategies = _strategies(subject, plan)
     say(f"{file}: derivatives")
     more = {"sampler": sampler, "strategies": strategies, "derivatives": _derivatives(subject.scene, plan)}
-    if distributed.index() > 0:  # the rest is not shared
+    if distributed.index() > 0:  # only the first process does the rest
         return more
     say(f"{file}: float32 and float64")
     precision, memory = _precision(subject, plan, failures)
@@ -129,7 +129,7 @@ def _more(subject: Subject, rows, plan: Plan, failures) -> dict:
 
 
 def _compile(scene: Scene) -> float:
-    """Seconds of the first render beyond those of the second, whatever was compiled before."""
+    """Return the seconds by which a first render takes longer than a second, with empty compilation caches."""
     jax.clear_caches()
     seconds = []
     for _ in range(2):
@@ -147,7 +147,7 @@ def _reference(scene: Scene, spp: int) -> Reference:
 
 
 def _timed(scene: Scene, kinds: dict, seeds) -> dict:
-    """Seconds, images and CPU seconds of every kind {name: (spp, strategy)}, one of each seed. Kinds take turns."""
+    """Return seconds, images and CPU seconds of every kind {name: (spp, strategy)}, one per seed; kinds alternate."""
     done = {name: ([], [], []) for name in kinds}
     for seed in seeds:
         for name, (spp, strategy) in kinds.items():
@@ -161,7 +161,7 @@ def _timed(scene: Scene, kinds: dict, seeds) -> dict:
 
 
 def _mitsuba(subject: Subject, sampler: str, plan: Plan, failures) -> list[dict]:
-    """Rows of one of Mitsuba's samplers; none, and a word among the failures, where it cannot render the scene."""
+    """Return the rows of one of Mitsuba's samplers; if it cannot render, return none and append to `failures` why."""
     seeds = list(range(1, plan.repeat + 1))
     runs = [{"sampler": sampler, "spp": spp, "seeds": seeds} for spp in plan.spps]
     try:
@@ -178,9 +178,9 @@ def _mitsuba(subject: Subject, sampler: str, plan: Plan, failures) -> list[dict]
 
 
 def _sampler(subject: Subject, rows) -> dict:
-    """pathjax's numbers beside independent ones, whose error at N samples is that of single samples over N.
+    """Compare pathjax's sampler with independent numbers, whose relMSE at N samples is that of single samples over N.
 
-    One sample alone is drawn from independent uniform numbers, whatever correlates it with the next.
+    A single sample uses independent uniform numbers, however it is correlated with the next sample.
     """
     scene, reference = subject.scene, subject.reference
     images = (pathjax.render(scene, 1, SINGLES_SEED + k) for k in range(SINGLES))
@@ -218,9 +218,9 @@ def _strategies(subject: Subject, plan: Plan) -> list[dict]:
 
 
 def _derivatives(scene: Scene, plan: Plan) -> dict | None:
-    """CPU seconds of J v and J^T v in all parameters that the recorded sweep finds, and of the image; in turns.
+    """Return CPU seconds of J v, J^T v and the image, alternating, in all parameters that the recorded sweep handles.
 
-    None where there is no such parameter.
+    None if there is no such parameter.
     """
     spp, parameters = _middle(plan.spps), scene.described.parameters
     wanted = {name: each for name, each in parameters.items() if matrix_free.is_swept(scene, each)}
@@ -240,13 +240,13 @@ def _derivatives(scene: Scene, plan: Plan) -> dict | None:
             started = time.process_time()
             jax.block_until_ready(call(seed))
             seconds[name].append(distributed.total(time.process_time() - started))
-    # The first of each compiles.
+    # The first call of each compiles.
     numbers = sum(math.prod(each.shape) for each in wanted.values())
     return {"spp": spp, "numbers": numbers, "cpu_seconds": {name: each[1:] for name, each in seconds.items()}}
 
 
 def _precision(subject: Subject, plan: Plan, failures) -> tuple[dict | None, int | None]:
-    """Same seeds in float32 and float64, and the peak memory of the former; None where that process failed."""
+    """Compare the same seeds in float32 and float64, and return peak memory in float32; None if a process failed."""
     spp, seeds = _middle(plan.spps), list(range(plan.repeat))
     request = {"scene": subject.file, "parameters": subject.defines, "spp": spp, "seeds": seeds}
     done = {}

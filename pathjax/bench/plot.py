@@ -1,4 +1,4 @@
-"""Error against time, as a PNG. Needs matplotlib, of the `bench` extra."""
+"""Plots of error against time, as PNG. Needs matplotlib, from the `bench` extra."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ def available() -> bool:
 
 
 def has_noise(scene: dict) -> bool:
-    """Whether there is something to plot: errors of a scene of the report that has noise."""
+    """Return whether a scene of the report has noise, so that there are errors to plot."""
     return any(_points(rows) for rows in (scene["pathjax"], scene["mitsuba"]))
 
 
 def write(scene: dict, path: Path) -> None:
-    """Plot a scene of the report, of which something must have noise."""
+    """Plot a scene of the report; some of its rows must have noise."""
     lines = {"pathjax": (scene["pathjax"], _OURS)}
     for sampler in scene["slopes"]["mitsuba"]:
         lines[f"Mitsuba {sampler}"] = [row for row in scene["mitsuba"] if row["sampler"] == sampler], _PEERS[sampler]
@@ -41,10 +41,10 @@ def write(scene: dict, path: Path) -> None:
 
 
 def write_panels(panels: list[tuple[str, dict]], path: Path, columns: int = 1) -> None:
-    """Plots of error against time beside each other.
+    """Plot panels of error against time side by side.
 
     Args:
-        panels: (title, name -> (rows of `figures.row`, look: keywords of matplotlib's `plot`)) of each.
+        panels: one (title, name -> (rows of `figures.row`, look: keywords of matplotlib's `plot`)) per panel.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -85,7 +85,7 @@ def _points(rows) -> list[tuple[float, float]]:
 
 
 def _guide(axes) -> None:
-    """Lines of equal efficiency, powers of ten, within the axes as they are."""
+    """Draw lines of equal efficiency, at powers of ten, without changing the limits of the axes."""
     (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()
     axes.set(xlim=(left, right), ylim=(low, high))
     first = math.ceil(math.log10(1 / (high**2 * right)))

@@ -1,4 +1,4 @@
-"""Closest hits per second on one core, and Embree's on the same triangles."""
+"""Closest hits per second on one core, and those of Embree on the same triangles."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ RAYS = 1 << 18
 
 
 def rates(scene, repeat: int) -> tuple[dict, dict | None]:
-    """Measure rays from the camera, and rays from where those hit, in uniform directions.
+    """Measure rays from the camera, and rays from their hits in uniform directions.
 
     Returns:
-        Mray/s on all shapes, by kind of ray; and on the triangles alone beside Embree, None if there are none.
+        Mray/s on all shapes, by kind of ray; and on the triangles alone beside Embree, None without triangles.
     """
     kinds = {"camera": _camera_rays(scene)}
     kinds["scattered"] = _scattered_rays(scene.geometry, *kinds["camera"])

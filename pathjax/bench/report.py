@@ -60,7 +60,7 @@ def _scene(scene: dict) -> list[str]:
 
 
 def _summary(summary: dict) -> list[str]:
-    """The table of all scenes; with ratios only beside a peer."""
+    """Return the table of all scenes, with ratios only if there is a peer."""
     rows, wall, cpu = summary["rows"], summary["wall"], summary["cpu"]
     head = [f"at {summary['spp']} spp", "run s", "relMSE", "compiled s"]
     cells = [
@@ -170,7 +170,7 @@ def _rays(closest_hits: dict, beside: dict | None) -> list[str]:
 
 
 def _table(head: list[str], rows: list[list]) -> list[str]:
-    """The lines of a Markdown table, and an empty line after it."""
+    """Return the lines of a Markdown table, and an empty line after it."""
     return [*(f"| {' | '.join(map(str, cells))} |" for cells in (head, ["---"] * len(head), *rows)), ""]
 
 
@@ -195,7 +195,7 @@ def _versus(row: dict) -> str:
 
 
 def _relative(value: float, standard_error: float) -> str:
-    """The value, with its standard error in percent."""
+    """Format a value with its standard error in percent."""
     known = value > 0 and math.isfinite(standard_error)
     return _number(value) + (f" ± {standard_error / value:.0%}" if known else "")
 

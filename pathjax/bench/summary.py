@@ -1,4 +1,4 @@
-"""What a bench of many scenes comes to: a row for each, the geometric mean of efficiency ratios, and the worst."""
+"""Summary of a bench of many scenes: a row for each, the geometric mean of the efficiency ratios, and the worst."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ USUAL_SPP = 64
 
 
 def summary(scenes: list[dict]) -> dict:
-    """Sum up scenes as `measure` returns them, all with the same spp, at 64 spp or else the middle of theirs.
+    """Summarise scenes returned by `measure`, all with the same spps, at 64 spp or else the middle one.
 
-    Ratios are the best peer's over pathjax's, and of efficiency pathjax's over the best peer's: above 1 pathjax is
-    ahead. None where there is no peer or no noise.
+    Ratios of time and relMSE are the best peer's over pathjax's, those of efficiency pathjax's over the best peer's:
+    above 1 pathjax is ahead. None without a peer or without noise.
     """
     spps = [row["asked_spp"] for row in scenes[0]["pathjax"]]
     spp = USUAL_SPP if USUAL_SPP in spps else spps[len(spps) // 2]
@@ -37,17 +37,17 @@ def _row(scene: dict, spp: int) -> dict:
     cpu_time = best["cpu_seconds"] / ours["cpu_seconds"]
     return row | {
         "efficiency_ratio": error * time,
-        "cpu_ratio": error * cpu_time,  # the same by CPU seconds
+        "cpu_ratio": error * cpu_time,  # efficiency ratio by CPU seconds
         "time_ratio": time,
         "rel_mse_ratio": error,
-        # standard error of the ratios over them, as far as it is of the two errors
+        # relative standard error of the ratios, from that of the two errors only
         "relative_error": math.hypot(*(each["rel_mse_standard_error"] / each["rel_mse"] for each in (ours, best))),
         "best_peer": best["sampler"],
     }
 
 
 def _over_all(rows: list[dict], key: str) -> dict | None:
-    """Geometric mean and worst of what is known."""
+    """Return the geometric mean and the worst of the known values."""
     known = {row["scene"]: row[key] for row in rows if row[key]}
     if not known:
         return None

@@ -1,7 +1,7 @@
-"""The twelve scenes of `pathjax bench` without a scene: five that are shipped, and seven that are made here.
+"""The twelve scenes of `pathjax bench` without a scene argument: five shipped ones, and seven generated here.
 
-What is made depends on this file and trimesh's icosphere alone, so the same scenes are measured everywhere.
-nine_spheres.xml is shipped and not among them: Mitsuba's float32 makes it up to 10 % too dark, which would count as
+Generated scenes depend only on this file and trimesh's icosphere, so the same scenes are measured everywhere.
+The shipped nine_spheres.xml is not among them: Mitsuba's float32 makes it up to 10 % too dark, which would count as
 error.
 """
 
@@ -20,7 +20,7 @@ from pathjax.shapes import Mesh
 from pathjax.system.files import write_text
 
 SHIPPED = "cornell_box", "glass_and_mirror", "glass_ball", "mesh", "triangle_box"
-# Sampling of all twelve, unless users ask for others.
+# Sampling of all twelve, unless users choose other values.
 RES, SPPS, REFERENCE_SPP = 128, [64], 2048
 
 _HEAD = """\
@@ -44,12 +44,13 @@ _HEAD = """\
 
 
 def twelve(folder: Path, bunny: Path | None = None) -> list[Path]:
-    """The files of the twelve scenes, of which seven are written into `folder`.
+    """Return the files of the twelve scenes, after writing seven of them into `folder`.
 
     Args:
-        bunny: a mesh, upright along y, for the box that else holds one of about as many triangles.
+        bunny: a mesh, upright along y, for the box, in place of the generated one of about as many triangles.
     Raises:
-        InputError: the shipped scenes are not where the command runs, nor beside the package; or no such mesh.
+        InputError: the shipped scenes are neither in the working directory nor beside the package, or the mesh is
+            unusable.
     """
     shipped = _shipped()
     makers: dict[str, Callable[[Path], str]] = {
@@ -72,7 +73,7 @@ def twelve(folder: Path, bunny: Path | None = None) -> list[Path]:
 
 
 def _shipped() -> Path:
-    """The folder of the scenes that are shipped."""
+    """Return the folder of the shipped scenes."""
     places = [Path("scenes"), Path(__file__).resolve().parents[2] / "scenes"]
     for place in places:
         if all((place / f"{name}.xml").is_file() for name in SHIPPED):
@@ -97,7 +98,7 @@ def million(folder: Path, level: int = 8) -> str:
 
 
 def scan(folder: Path, file: Path) -> str:
-    """A mesh of the user's in the Cornell box."""
+    """A user's mesh in the Cornell box."""
     kind = file.suffix[1:].lower()
     if kind not in ("obj", "ply", "stl"):
         raise InputError(f"{file}: a mesh for the box is an .obj, .ply or .stl file")
@@ -106,7 +107,7 @@ def scan(folder: Path, file: Path) -> str:
 
 
 def sky(folder: Path) -> str:
-    """Textured shapes under a picture of the sky."""
+    """Textured shapes under a sky environment map."""
     _write_sky(folder / "sky.exr")
     _write_clouds(folder / "ground.png", [0.2, 0.3, 0.1], [0.6, 0.5, 0.35], seed=1)
     _write_clouds(folder / "stone.png", [0.15, 0.1, 0.1], [0.8, 0.7, 0.6], seed=2)
@@ -127,7 +128,7 @@ def sky(folder: Path) -> str:
 
 
 def lights(folder: Path) -> str:
-    """A hall with many small lamps, some of them near to walls."""
+    """A hall with many small lamps, some of them close to walls."""
     rng = np.random.default_rng(0)
     body = [
         _bsdf("paper", "diffuse", _rgb("reflectance", (0.7, 0.68, 0.62))),
@@ -146,7 +147,7 @@ def lights(folder: Path) -> str:
 
 
 def rough(folder: Path) -> str:
-    """Rough metals and plastics before a bright and a large lamp."""
+    """Rough metals and plastics under a bright lamp and a large one."""
     metals = {"gold": ("Au", 0.1), "copper": ("Cu", 0.3), "aluminium": ("Al", 0.03)}
     plastics = {"red": ((0.5, 0.05, 0.04), 0.1), "blue": ((0.05, 0.12, 0.45), 0.3)}
     ggx = '<string name="distribution" value="ggx"/>'
@@ -185,10 +186,10 @@ def caustics(folder: Path) -> str:
 
 
 def window(folder: Path) -> str:
-    """A room that is lit by the sky alone, through the window by which it is seen."""
+    """A room lit only by the sky, through the window through which the camera looks."""
     _write_sky(folder / "window_sky.exr")
     _write_clouds(folder / "wood.png", [0.25, 0.12, 0.05], [0.6, 0.4, 0.22], seed=4)
-    # Solid walls: Mitsuba's shadow rays to the sky end where its box around all but rectangles does.
+    # Solid walls: Mitsuba ends shadow rays to the sky at its bounding box of all shapes but rectangles.
     walls = {
         "ground": ((3.1, 0.05, 3.1), (0, -0.05, 0)),
         "ceiling": ((3.1, 0.05, 3.1), (0, 3.05, 0)),
@@ -214,7 +215,7 @@ def window(folder: Path) -> str:
     )
 
 
-# ---- what they are made of -----------------------------------------------------------------------------------------
+# ---- parts of the scenes -------------------------------------------------------------------------------------------
 
 
 def _scene(*parts: str) -> str:
@@ -226,7 +227,7 @@ def _head(origin: str, target: str, fov: float, depth: int = 8) -> str:
 
 
 def bumpy(level: int, waves: float) -> tuple[Float[np.ndarray, "V 3"], Int[np.ndarray, "F 3"]]:
-    """A closed solid of 20 * 4^level triangles: a sphere with lobes that hide each other, and `waves` ridges."""
+    """Return a closed solid of 20 * 4^level triangles: a sphere with lobes that hide each other, and `waves` ridges."""
     try:
         import trimesh
     except ImportError:
@@ -239,7 +240,7 @@ def bumpy(level: int, waves: float) -> tuple[Float[np.ndarray, "V 3"], Int[np.nd
 
 
 def _in_box(file: Path, vertices: np.ndarray, faces: np.ndarray) -> str:
-    """A mesh that fills most of the Cornell box, upright along y."""
+    """Return a scene in which the mesh fills most of the Cornell box, upright along y."""
     lowest, highest = vertices.min(0), vertices.max(0)
     middle = (lowest + highest) / 2
     scale = 1.3 / (highest - lowest).max()
@@ -255,7 +256,7 @@ def _in_box(file: Path, vertices: np.ndarray, faces: np.ndarray) -> str:
 
 
 def _room(floor: str, walls: str, half, left: str | None = None, right: str | None = None, open_front=False):
-    """The inside of a box on the floor, around the axis of y."""
+    """Return the inner walls of a box that stands on y = 0, centred on the y axis."""
     x, y, z = half
     sides = [
         _rectangle("floor", floor, (x, z), (0, 0, 0), (0, 1, 0)),
@@ -268,7 +269,7 @@ def _room(floor: str, walls: str, half, left: str | None = None, right: str | No
 
 
 def _rectangle(name: str, bsdf: str, half, at, facing, inside: str = "") -> str:
-    """half: of its width and height; facing: where its normal points, unit."""
+    """Return a rectangle. half: half its width and height; facing: its normal, unit."""
     up = (0, 0, -1) if abs(facing[1]) > 0.99 else (0, 1, 0)
     look = f'<lookat origin="{_list(at)}" target="{_list(np.add(at, facing))}" up="{_list(up)}"/>'
     place = f'<scale x="{half[0]:g}" y="{half[1]:g}" z="1"/>{look}'
@@ -327,7 +328,7 @@ _BOX_BSDFS = [
 
 
 def _write_clouds(file: Path, dark, light, seed: int) -> None:
-    """Smooth noise of several sizes between two colours, which repeats."""
+    """Write tileable smooth noise of several scales between two colours."""
     rng, v = np.random.default_rng(seed), np.zeros((256, 256))
     x = np.arange(256) / 256 * 2 * np.pi
     for octave in range(5):
@@ -339,12 +340,12 @@ def _write_clouds(file: Path, dark, light, seed: int) -> None:
 
 
 def _write_sky(file: Path) -> None:
-    """Blue above, brown below, brighter towards the horizon and around a sun of 3 degrees."""
+    """Write a sky: blue above, brown below, brighter towards the horizon and around a sun of 3 degrees."""
     height = 256
     polar = (np.arange(height) + 0.5)[:, None] / height * np.pi
     azimuth = (np.arange(2 * height) + 0.5) / height * np.pi
     y = np.cos(polar) + 0 * azimuth
-    # The sun stands behind the camera of `sky` and `window`, 35 degrees high.
+    # The sun is behind the camera of `sky` and `window`, 35 degrees high.
     toward = np.sin(polar) * np.cos(azimuth - np.pi * 0.85) * np.cos(np.radians(35)) + y * np.sin(np.radians(35))
     above = np.array([0.25, 0.45, 0.9]) + np.array([0.7, 0.6, 0.35]) * np.exp(-4 * np.abs(y))[..., None]
     picture = np.where(y[..., None] > 0, above, [0.16, 0.13, 0.1])

@@ -1,4 +1,4 @@
-"""How many tests rays cost in a hierarchy: a walk down it in the order of the renderer, in NumPy, for many rays."""
+"""Number of tests per ray in a hierarchy, counted by a NumPy traversal of many rays in the renderer's order."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ from typing import NamedTuple
 import numpy as np
 
 TINY = 1e-18
-# Relative error of entry and exit: a few roundings, of subtraction, reciprocal and product.
+# Relative error of entry and exit distances: a few roundings, of subtraction, reciprocal and product.
 SLACK = 5 * np.finfo(float).eps
 
 
 class Walk(NamedTuple):
-    """What R rays found, and what they tested on the way."""
+    """Hits of R rays, and the number of tests on the way."""
 
-    t: np.ndarray  # (R,) distance to the closest triangle, inf where missed
-    triangle: np.ndarray  # (R,) its row, -1 where missed
+    t: np.ndarray  # (R,) distance to the closest triangle, inf for a miss
+    triangle: np.ndarray  # (R,) its row, -1 for a miss
     nodes: np.ndarray  # (R,) nodes opened; the renderer tests the up to eight boxes of a node at once
     boxes: np.ndarray  # (R,) boxes tested: the children of those nodes
     leaves: np.ndarray  # (R,) leaves visited; the renderer tests the triangles of a leaf at once
@@ -23,20 +23,20 @@ class Walk(NamedTuple):
 
 
 def walk(tree, vertices, origins, directions) -> Walk:
-    """Find what each ray hits first, as `shapes.accel.traverse` does it.
+    """Find the closest hit of each ray, as `shapes.accel.traverse` does.
 
-    Children are visited in octant order, those whose boxes the ray meets before its closest hit so far; they are not
-    looked at again when a closer hit is found in between.
+    Children whose boxes the ray meets before its closest hit so far are visited in octant order. They are not tested
+    again if a closer hit is found in between.
 
     Args:
         tree: `shapes.accel.build.Tree` over the triangles.
         vertices: (P, 3, 3) vertex, axis.
         origins, directions: (R, 3), directions unit.
-    The arithmetic is float64: boxes that a ray grazes may be counted otherwise than by a renderer in float32.
+    The arithmetic is float64, so counts of grazed boxes may differ from those of the renderer in float32.
     """
     vertices, o, d = (np.asarray(x, float) for x in (vertices, origins, directions))
     rays = len(o)
-    # A component of zero becomes one that moves the ray less than rounding does.
+    # Replace a zero component by one that moves the ray by less than rounding does.
     inverse = 1 / np.where(np.abs(d) < TINY, np.copysign(TINY, d), d)
     octant = (d < 0) @ np.array([1, 2, 4])
     t, triangle = np.full(rays, np.inf), np.full(rays, -1)
@@ -54,7 +54,7 @@ def walk(tree, vertices, origins, directions) -> Walk:
         nodes[ray] += 1
         boxes[ray] += filled[node]
         met = _meets(tree.bounds[node], o[ray], inverse[ray], t[ray])
-        for k in range(7, -1, -1):  # the nearest comes to lie on top
+        for k in range(7, -1, -1):  # so that the nearest is on top
             slot = k ^ octant[ray]
             push = np.flatnonzero(met[np.arange(len(ray)), slot])
             stack[ray[push], size[ray[push]]] = tree.child[node[push], slot[push]]
@@ -75,7 +75,7 @@ def walk(tree, vertices, origins, directions) -> Walk:
 
 
 def distances(vertices, o, d):
-    """Distances to the triangles (..., 3, 3) along the rays o, d (..., 3): inf: missed (Möller and Trumbore 1997)."""
+    """Return distances to triangles (..., 3, 3) along rays o, d (..., 3), inf for a miss (Möller and Trumbore 1997)."""
     edge1, edge2 = vertices[..., 1, :] - vertices[..., 0, :], vertices[..., 2, :] - vertices[..., 0, :]
     s = o - vertices[..., 0, :]
     h, q = np.cross(d, edge2), np.cross(s, edge1)
@@ -86,7 +86,7 @@ def distances(vertices, o, d):
 
 
 def _meets(bounds, o, inverse, t):
-    """(R, 8) whether rays meet the boxes (R, 2, 3, 8) before t (R,); never an empty slot, whose bounds are NaN."""
+    """Return (R, 8) bool: whether rays meet boxes (R, 2, 3, 8) before t (R,); False for empty slots, of NaN bounds."""
     a, b = (np.moveaxis(bounds, 1, 0) - o[:, :, None]) * inverse[:, :, None]
     near, far = np.minimum(a, b).max(1), np.maximum(a, b).min(1)
     return np.maximum(near, 0) <= np.minimum(far, t[:, None]) * (1 + SLACK)

@@ -1,8 +1,8 @@
-"""Programs that are measured in processes of their own.
+"""Programs that are measured in separate processes.
 
 Each module but this one is a script, `python PEER.py REQUEST.json`. A request is a JSON object; its "output" names the
-.npz file for arrays, and stdout gets a report, a JSON object. Exit status: 0 done, 1 it failed, 2 the request is wrong,
-3 what is to be measured is missing; the last line on stderr then says why.
+.npz file for arrays. The script prints a report, a JSON object, on stdout. Exit status: 0 done, 1 it failed, 2 the
+request is wrong, 3 the program to measure is missing; the last line on stderr then says why.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 
 
 class PeerMissing(RuntimeError):
-    """What is to be measured is not installed; the message says what to do."""
+    """The program to measure is not installed; the message says what to do."""
 
 
 class RequestError(ValueError):
@@ -26,25 +26,25 @@ class RequestError(ValueError):
 
 
 class PeerFailed(RuntimeError):
-    """The process ended without an answer."""
+    """The process ended without a report."""
 
 
 def call(peer: str, request: dict) -> tuple[dict, dict[str, np.ndarray]]:
     """Run a script of this folder.
 
     Args:
-        peer: its name.
-        request: as at the top of the script; without "output" the arrays go through a temporary file.
+        peer: name of the script.
+        request: as documented at the top of the script; without "output" the arrays go through a temporary file.
     Returns:
         The report, and the arrays by name.
     Raises:
-        PeerMissing, RequestError, PeerFailed: with what the process said last.
+        PeerMissing, RequestError, PeerFailed: with the last line that the process wrote to stderr.
     """
     with tempfile.TemporaryDirectory() as folder:
         request = {"output": str(Path(folder, "output.npz")), **request}
         file = Path(folder, "request.json")
         file.write_text(json.dumps(request))
-        # The process must find this pathjax, wherever it was started, and, by -P, no module beside the script.
+        # The process must import this pathjax from any working directory and, by -P, no module beside the script.
         places = [str(Path(__file__).resolve().parents[3]), os.environ.get("PYTHONPATH")]
         environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, places))}
         command = [sys.executable, "-P", str(Path(__file__).with_name(f"{peer}.py").resolve()), str(file)]

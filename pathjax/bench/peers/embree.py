@@ -1,4 +1,4 @@
-"""Closest hits in Embree, the yardstick for ray rates: single rays, one thread, through embreex.
+"""Closest hits in Embree, the baseline for ray rates: single rays, one thread, through embreex.
 
 Needs NumPy and `pip install embreex trimesh`, and never imports jax. A request is
 
@@ -25,7 +25,7 @@ import numpy as np
 
 
 def closest_hits(vertices, faces, origins, directions, runs: int) -> tuple[dict, np.ndarray]:
-    """The report and `primitive`, as at the top of this file."""
+    """Return the report and `primitive`, as documented at the top of this file."""
     import trimesh
     from trimesh.ray.ray_pyembree import RayMeshIntersector
 

@@ -18,9 +18,9 @@ OUTPUT.npz then holds, for run k, `images_k` (seeds, H, W, 3) float32. The repor
       "runs": [{"spp": 64, "seconds": [2.6, 2.6, 2.7], "cpu_seconds": [5.0, 5.0, 5.1]}]
     }
 
-`spp` is what the sampler really took: all but independent may round up (stratified to a square, say). Mitsuba compiles
-and renders once before the timed renders; each of `seconds` runs from the call to the image in NumPy, and
-`cpu_seconds` are those of all threads.
+`spp` is the sampler's actual sample count: all samplers but independent may round up (stratified to a square, for
+example). Mitsuba compiles and renders once before the timed renders; each of `seconds` runs from the call to the image
+in NumPy, and `cpu_seconds` are those of all threads.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ import numpy as np
 
 SAMPLERS = ("independent", "stratified", "multijitter", "orthogonal", "ldsampler")
 OLDEST_LLVM = 17  # 14 to 16 abort the process: "Cannot select: fminimum"
-WARM_UP_SEED = 987_654_321  # not one that a caller is likely to ask for
+WARM_UP_SEED = 987_654_321  # unlikely to be requested by a caller
 
 
 class PeerMissing(RuntimeError):
@@ -49,14 +49,14 @@ class RequestError(ValueError):
 
 
 def llvm_version(library: str) -> int:
-    """Major version that the path of an LLVM library tells, 0 if none: libLLVM.so.19.1, libLLVM-17.so, llvm-18/..."""
+    """Return the major version in an LLVM library's path, 0 if none: libLLVM.so.19.1, libLLVM-17.so, llvm-18/..."""
     name = os.path.basename(library)
     found = re.search(r"LLVM(?:-|\.so\.)(\d+)", name) or re.search(r"llvm(?:-|@|/)?(\d+)", library)
     return int(found[1]) if found and "libLLVM" in name else 0
 
 
 def find_llvm() -> str:
-    """The newest LLVM library of this machine, by its full path where that is known."""
+    """Return the newest LLVM library of this machine, by its full path if known."""
     candidates = []
     try:
         listed = subprocess.run(["ldconfig", "-p"], capture_output=True, text=True, check=False).stdout
@@ -81,7 +81,7 @@ def find_llvm() -> str:
 
 
 def import_mitsuba(variant: str):
-    """Mitsuba with `variant` set."""
+    """Import Mitsuba and set its variant."""
     if variant.startswith("llvm"):
         library = os.environ.get("DRJIT_LIBLLVM_PATH") or find_llvm()
         if 0 < llvm_version(library) < OLDEST_LLVM:
@@ -104,7 +104,7 @@ def import_mitsuba(variant: str):
 
 
 def load(mi, file: str, parameters: dict, sampler: str, spp: int):
-    """The scene of an XML file with its sampler replaced, as if the file said <sampler type="SAMPLER">."""
+    """Load the scene of an XML file with its sampler replaced, as if the file said <sampler type="SAMPLER">."""
     if sampler not in SAMPLERS:
         raise RequestError(f"sampler {sampler!r} is unknown; use one of {', '.join(SAMPLERS)}")
     if not os.path.isfile(file):
@@ -126,7 +126,7 @@ def load(mi, file: str, parameters: dict, sampler: str, spp: int):
 
 
 def render_run(mi, scene, run: dict) -> tuple[dict, np.ndarray]:
-    """Warm up, then render once for each seed: an entry of the report, and the images."""
+    """Warm up, render once for each seed, and return an entry of the report and the images."""
 
     def timed(seed):
         start, worked = time.perf_counter(), time.process_time()
@@ -140,7 +140,7 @@ def render_run(mi, scene, run: dict) -> tuple[dict, np.ndarray]:
 
 
 def render(request: dict) -> tuple[dict, dict[str, np.ndarray]]:
-    """All runs of a request, in this process: (report, arrays)."""
+    """Do all runs of a request, in this process, and return (report, arrays)."""
     mi = import_mitsuba(request.get("variant", "llvm_ad_rgb"))
     report, arrays = {"program": f"Mitsuba {mi.__version__}", "runs": []}, {}
     for k, run in enumerate(request["runs"]):

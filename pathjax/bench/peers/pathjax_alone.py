@@ -1,12 +1,12 @@
-"""pathjax by itself: peak memory that means something, and float64, which JAX has for a whole process.
+"""pathjax in a process of its own: for a meaningful peak memory, and for float64, which JAX sets per process.
 
 A request is {"scene": FILE, "parameters": {}, "dtype": "float32", "spp": 16, "seeds": [0], "output": FILE.npz}. The npz
 then holds `images` (seeds, H, W, 3), and the report is
 
     {"seconds": [0.1, ...], "peak_memory_bytes": 200000000}
 
-the seconds without compilation; the memory resident at most, above that after `import jax`, compilation included, null
-where the system does not tell (all but Linux).
+The seconds are without compilation. The memory is the peak resident size, compilation included, less the size after
+`import jax`; null on systems other than Linux, which do not report it.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ import numpy as np
 
 
 def resident(name: str) -> int | None:
-    """Bytes of this process by /proc: VmRSS now, VmHWM at most so far."""
-    # getrusage's maximum would hold that of the process which started this one.
+    """Return the resident bytes of this process from /proc: VmRSS the current, VmHWM the peak."""
+    # getrusage's maximum would include that of the parent process.
     try:
         lines = Path("/proc/self/status").read_text().splitlines()
         return next(int(line.split()[1]) * 1024 for line in lines if line.startswith(name))
