@@ -1,7 +1,7 @@
-"""The command line: parses, calls, prints. Results on stdout; progress and messages on stderr.
+"""The command line: parses, calls, prints. Results go to stdout, progress and messages to stderr.
 
-A command is a module of its name, whose `run(options, output)` returns the exit status: 0 done, 1 the work failed (of
-`compare`: the images differ), 2 the command or a file is wrong.
+Each command is a module of the same name, whose `run(options, output)` returns the exit status: 0 done, 1 the work
+failed (for `compare`: the images differ), 2 the command or a file is wrong.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ def main(arguments: list[str] | None = None) -> int:
     with _warnings_as_messages():
         try:
             _join(options)
-            # Only the command that is asked for: the solvers of `fit` alone take half a second.
+            # Import only the requested command: the solvers of `fit` alone take half a second.
             command = importlib.import_module(f"pathjax.cli.{options.command}")
             with distributed.losses():
                 status = command.run(options, output)
@@ -40,12 +40,12 @@ def main(arguments: list[str] | None = None) -> int:
             say("interrupted" if output.written else "interrupted; nothing was written")
             status = FAILED
     status = FAILED if output.failed and status == DONE else status
-    # Else JAX waits at the end for those that have ended, or for those that go on without this one.
+    # Otherwise JAX waits at exit for processes that have ended, or that go on without this one.
     return leave(status, at_once=status != DONE and distributed.count() > 1)
 
 
 def _join(options) -> None:
-    """Join the other processes, if there are any."""
+    """Join the other processes, if any."""
     given = {name: getattr(options, name, None) for name in ("coordinator", "processes", "process")}
     if all(value is None for value in given.values()):
         return
@@ -60,7 +60,7 @@ def _join(options) -> None:
 
 @contextlib.contextmanager
 def _warnings_as_messages():
-    """Print an InputWarning as a message; never raise it, whatever Python was told to do with warnings."""
+    """Print an InputWarning as a message; never raise it, whatever Python's warning filters say."""
     with warnings.catch_warnings():
         warnings.simplefilter("default", InputWarning)
         plain = warnings.showwarning

@@ -1,4 +1,4 @@
-"""What the command line understands."""
+"""Arguments of the command line."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 
 def parser() -> argparse.ArgumentParser:
-    """Return the parser of the whole command line; `command` of what it parses is the command's name."""
+    """Return the parser of the whole command line; `command` of its result is the command's name."""
     program = argparse.ArgumentParser(prog="pathjax", description="A differentiable Monte Carlo path tracer.")
     subparsers = program.add_subparsers(required=True, dest="command", metavar="COMMAND")
 
@@ -156,7 +156,7 @@ def _whole(text: str) -> int:
 
 
 def _number(read: Callable, accepts: Callable, what: str) -> Callable:
-    """A type of argparse's: `read` of the text, if `accepts` says so."""
+    """Return an argparse type that converts text by `read` and refuses values that `accepts` rejects."""
 
     def parse(text: str):
         try:

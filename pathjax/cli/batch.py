@@ -1,4 +1,4 @@
-"""`pathjax batch`: the images of a list of jobs."""
+"""`pathjax batch`: render a list of jobs."""
 
 from __future__ import annotations
 

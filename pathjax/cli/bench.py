@@ -17,7 +17,7 @@ from pathjax.system.output import Output, say
 
 
 def run(options, output: Output) -> int:
-    first = distributed.index() == 0  # of several processes, the one that tells, writes and starts the peer
+    first = distributed.index() == 0  # only the first process prints, writes and starts the peer
     folder = Path(options.output) if options.output is not None and first else None
     if options.scenes and options.bunny:
         raise InputError("--bunny is for the twelve scenes, which are measured where none is named")

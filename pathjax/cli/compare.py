@@ -1,4 +1,4 @@
-"""`pathjax compare`: how an image differs from a reference, and whether by more than is allowed."""
+"""`pathjax compare`: the difference of an image from a reference, and whether it exceeds given limits."""
 
 from __future__ import annotations
 

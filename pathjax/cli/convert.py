@@ -1,4 +1,4 @@
-"""`pathjax convert`: whatever can be loaded to a scene file of Mitsuba."""
+"""`pathjax convert`: any loadable file to a scene file of Mitsuba."""
 
 from __future__ import annotations
 

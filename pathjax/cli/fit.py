@@ -21,7 +21,7 @@ from pathjax.system.output import Output
 
 def run(options, output: Output) -> int:
     table, picture = (Path(f"{Path(options.output)}{suffix}") for suffix in (".json", ".png"))
-    first = distributed.index() == 0  # of several processes, the one that prints and writes
+    first = distributed.index() == 0  # only the first process prints and writes
     for path in (table, picture) if first else ():
         check_writable(path, [options.target, options.scene])
     start, names = {}, []

@@ -32,13 +32,13 @@ def run(options, output: Output) -> int:
 
 
 def _pages() -> dict[str, str]:
-    """Topic -> Markdown, in alphabetical order."""
+    """Return {topic: Markdown} in alphabetical order."""
     files = sorted((resources.files("pathjax") / "manual").iterdir(), key=lambda file: file.name)
     return {file.name.removesuffix(".md"): file.read_text(encoding="utf-8") for file in files}
 
 
 def _summary(text: str) -> str:
-    """What the first line, `# Title: summary`, says after the colon."""
+    """Return the part of the first line, `# Title: summary`, after the colon."""
     return text.partition("\n")[0].partition(": ")[2]
 
 

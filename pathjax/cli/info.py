@@ -1,4 +1,4 @@
-"""`pathjax info`: what a scene holds, what is compiled for it, its parameters, its hierarchies."""
+"""`pathjax info`: the contents of a scene, the kinds compiled for it, its parameters, its hierarchies."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def run(options, output: Output) -> int:
 
 
 def scene_facts(scene: Scene) -> dict:
-    """What `json_text` writes of a scene."""
+    """Return the facts of a scene as a dictionary for `json_text`."""
     about = scene.about
     description = about.description
     max_depth = int(scene.max_depth)
@@ -76,7 +76,7 @@ def scene_facts(scene: Scene) -> dict:
 
 
 def _parameter_facts(parameter: Parameter, value: np.ndarray) -> dict:
-    """What is told of a parameter; of a texture or a grid, the mean stands for all numbers."""
+    """Return value, shape and bounds of a parameter; for a texture or a grid, the mean in place of all values."""
     known = {"value": value}
     if parameter.is_texture:
         entries = (0, 1) if value.ndim < 3 and parameter.corners is None else tuple(range(value.ndim - 1))
@@ -85,7 +85,7 @@ def _parameter_facts(parameter: Parameter, value: np.ndarray) -> dict:
 
 
 def tail_facts(scene: Scene, error: float) -> dict:
-    """What the scene's max_depth cuts off, and the one that cuts off a share `error` of light, from a quick render.
+    """Estimate the light that max_depth cuts off, and the max_depth that cuts off a share `error`, by a quick render.
 
     Raises:
         InputError: error is not between 0 and 1.
@@ -117,7 +117,7 @@ def _tail_lines(tail: dict, max_depth) -> list[str]:
 
 
 def _type(described) -> str:
-    """What scene files call a kind."""
+    """Return the name of a kind in scene files."""
     return type(described).__name__.lower()
 
 
@@ -126,7 +126,7 @@ def _primitives(part) -> int:
 
 
 def text(facts: dict) -> str:
-    """Lay out the facts of a scene for people to read."""
+    """Format the facts of a scene as text."""
     image, integrator, compiled = facts["image"], facts["integrator"], facts["compiled"]
     depth = "unbounded" if integrator["max_depth"] is None else integrator["max_depth"]
     lines = [

@@ -1,4 +1,4 @@
-"""What commands take: scenes, with their parameters set, and numbers."""
+"""Inputs of commands: scenes, with their parameters set, and numbers."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from pathjax.system.interrupts import wait_for
 
 
 def load(options) -> Scene:
-    """Load the scene of a command, with its `-D` and `--set`. There is no warning if it is dark."""
+    """Load the scene of a command, with its `-D` and `--set`. Do not warn if the scene is dark."""
     return wait_for(lambda: _load(options))
 
 
@@ -27,7 +27,7 @@ def _load(options) -> Scene:
 
 
 def numbers(option: str, name: str, text: str) -> float | list[float]:
-    """The value of `option NAME=text`."""
+    """Parse the value of `option NAME=text`: one number, or several separated by commas."""
     try:
         values = [float(part) for part in text.split(",")]
     except ValueError:

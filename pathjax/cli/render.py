@@ -1,4 +1,4 @@
-"""`pathjax render`: a scene to an image, with further channels, until an error, a time or samples are reached."""
+"""`pathjax render`: render a scene to an image, with extra channels, up to an error, a time or a sample count."""
 
 from __future__ import annotations
 
@@ -42,12 +42,12 @@ def run(options, output: Output) -> int:
     render = Render(
         scene, options.error, options.time, options.spp, options.seed, options.strategy, options.checkpoint
     )
-    first = distributed.index() == 0  # of several processes, the one that prints and writes
+    first = distributed.index() == 0  # only the first process prints and writes
     watched = first and sys.stderr.isatty()
     with _compiling() if watched else nullcontext():
         wait_for(render.compile)
         first_hits = wait_for(lambda: _first_hits(scene, options))
-    # From here on a signal only ends the rendering: what is rendered is written, however many come.
+    # From here on signals, however many, only stop the rendering: samples so far are written.
     with Interrupts() as interrupts:
         result = render.run(progress=watched)
         layers = first_hits | _image_layers("error", result.standard_error)
@@ -74,7 +74,7 @@ def run(options, output: Output) -> int:
 
 
 def _compiling():
-    from rich.console import Console  # takes a tenth of the time that a small render does
+    from rich.console import Console  # its import takes a tenth of the time of a small render
 
     return Console(stderr=True).status("compiling")
 
@@ -100,7 +100,7 @@ def _check_depth(scene: Scene, options) -> None:
 
 
 def _first_hits(scene: Scene, options) -> dict[str, np.ndarray]:
-    """Channels of those output variables that show what is hit first."""
+    """Return the channels of the output variables of the first hits."""
     names = [name for name in options.aov if name in aovs.NAMES]
     if not names:
         return {}
@@ -113,7 +113,7 @@ def _image_layers(name: str, image: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def _bounces(scene, result: RenderResult, options, interrupts: Interrupts, output: Output) -> dict[str, np.ndarray]:
-    """Channels of the terms of the series, of the same samples as the image, and of their standard errors."""
+    """Return channels of the terms per bounce, from the same samples as the image, and of their standard errors."""
 
     def rendered():
         found = bounces.render_bounces(scene, int(scene.max_depth), result.samples, options.seed, options.strategy)
@@ -122,7 +122,7 @@ def _bounces(scene, result: RenderResult, options, interrupts: Interrupts, outpu
     try:
         with distributed.interruptible(interrupts):
             terms = wait_for(rendered)
-    except (KeyboardInterrupt, Exception) as error:  # the image is there, whatever this second render ran out of
+    except (KeyboardInterrupt, Exception) as error:  # the image is complete, whatever this second render ran out of
         output.failed = True
         if distributed.index():
             return {}
@@ -137,7 +137,7 @@ def _bounces(scene, result: RenderResult, options, interrupts: Interrupts, outpu
 
 
 def _reached(result: RenderResult, lost: int, place: Path | None, saved: bool, options) -> str:
-    """A message that says what there is, if it is not what was asked for."""
+    """Return a message on what was reached, for a render that ended before its limits."""
     if result.reason == "no estimate":
         why = f"{lost} of its pixels are not finite" if lost else "it is black, or nearly so"
         return (
