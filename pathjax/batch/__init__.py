@@ -1,4 +1,4 @@
-"""Many images in one process: data sets of scenes, which share kernels where their structure is the same."""
+"""Rendering of many images in one process; scenes of the same structure share kernels."""
 
 from pathjax.batch.jobs import Job, read
 from pathjax.batch.run import Outcome, render_batch

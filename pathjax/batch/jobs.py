@@ -1,4 +1,4 @@
-"""What a batch is made of: one job a line, checked before anything is rendered."""
+"""Jobs of a batch: one per line, checked before anything is rendered."""
 
 from __future__ import annotations
 
@@ -16,30 +16,30 @@ from pathjax.integrators.options import Options, check_counts
 
 @dataclass(frozen=True)
 class Job:
-    """One image. The fields but the last are the keys of a line of a jobs file."""
+    """One image. All fields but the last are keys of a line of a jobs file."""
 
     scene: str | os.PathLike  # a scene file, glTF or a mesh; relative to the jobs file
     output: str | os.PathLike  # .exr or .png; relative to the folder of the batch
-    parameters: Mapping[str, object] = field(default_factory=dict)  # of the file's `$parameters`
-    set: Mapping[str, object] = field(default_factory=dict)  # of the scene's parameters
+    parameters: Mapping[str, object] = field(default_factory=dict)  # values of the file's `$parameters`
+    set: Mapping[str, object] = field(default_factory=dict)  # values of the scene's parameters
     sensor: int | str = 0
     spp: int | None = None  # default: the file's, if neither `error` nor `time` is given
     error: float | None = None
     time: float | None = None
     seed: int = 0
     strategy: str = "mis"
-    place: str = ""  # where the job stands, for messages
+    place: str = ""  # file and line of the job, or its index, for messages
 
 
 KEYS = tuple(f.name for f in fields(Job))[:-1]
 
 
 def read(file: str | os.PathLike, folder: str | os.PathLike) -> list[Job]:
-    """Jobs of a JSON Lines file: on each line an object with the fields of `Job`; empty lines are left out.
+    """Read the jobs of a JSON Lines file: one object with the fields of `Job` per line; empty lines are skipped.
 
-    folder: for outputs.
+    folder: folder of the outputs.
     Raises:
-        InputError: the file cannot be read, a line is no job, or two jobs have one output; with file and lines.
+        InputError: the file cannot be read, a line is not a job, or two jobs have the same output; names file and line.
     """
     file = Path(file)
     try:
@@ -47,13 +47,17 @@ def read(file: str | os.PathLike, folder: str | os.PathLike) -> list[Job]:
     except (OSError, UnicodeDecodeError) as error:
         why = getattr(error, "strerror", None) or "it is not UTF-8"
         raise InputError(f"{file}: the jobs cannot be read: {why}") from None
-    # Not `splitlines`, which also ends lines within strings, at U+2028.
+    # Not `splitlines`, which also splits at U+2028 within strings.
     numbered = ((f"{file}:{number}", line) for number, line in enumerate(text.split("\n"), 1) if line.strip())
     return checked(((place, _decoded(place, line)) for place, line in numbered), folder)
 
 
 def checked(numbered: Iterable[tuple[str, object]], folder: str | os.PathLike) -> list[Job]:
-    """Jobs of mappings with the fields of `Job`, and of each the place where it stands. folder: for outputs."""
+    """Return the jobs of pairs (place, mapping with the fields of `Job`). folder: folder of the outputs.
+
+    Raises:
+        InputError: a mapping is not a job, two jobs have the same output, or there is no job.
+    """
     jobs = [_job(place, values) for place, values in numbered]
     if not jobs:
         raise InputError("the batch is empty; give at least one job, such as " + _EXAMPLE)

@@ -1,4 +1,4 @@
-"""Rendering the jobs of a batch, one after another; the next scene is loaded while the present one is rendered."""
+"""Rendering of the jobs of a batch, one after another; next scenes are loaded while the current one is rendered."""
 
 from __future__ import annotations
 
@@ -24,24 +24,24 @@ from pathjax.system.files import check_room
 from pathjax.system.interrupts import Interrupts
 from pathjax.system.output import say
 
-# Scenes that are loaded ahead.
+# Number of scenes that are loaded ahead.
 _AHEAD = 2
-# Seconds between lines of progress, where there is no bar.
+# Seconds between lines of progress if there is no bar.
 _TELLS = 60
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of one job."""
+    """Outcome of one job."""
 
     job: Job
     output: Path
-    status: str  # "done"; "skipped", as the output was there; "failed"; "unwritten"; "waiting", as the batch ended
-    message: str = ""  # why it failed, what it has not reached, or that it is old; with the place of the job
+    status: str  # "done"; "skipped": the output existed; "failed"; "unwritten"; "waiting": the batch ended before it
+    message: str = ""  # why it failed, which limit it missed, or that its output is old; with the place of the job
     spp: float = 0.0
     error: float = math.nan  # of `RenderResult`
     load_seconds: float = 0.0
-    compile_seconds: float = 0.0  # next to nothing, where an earlier scene has left its kernel
+    compile_seconds: float = 0.0  # close to 0 if an earlier scene has compiled the kernel
     run_seconds: float = 0.0
 
 
@@ -52,24 +52,24 @@ def render_batch(
     part: tuple[int, int] = (0, 1),
     progress: bool | Callable[[Outcome], None] = False,
 ) -> list[Outcome]:
-    """Render many scenes to image files. Those of one structure share a kernel, however many triangles each has.
+    """Render many scenes to image files. Scenes of one structure share a kernel, regardless of their triangle counts.
 
-    Images are those that `render_until` gives with the limits of the job, bit for bit. An output that exists is kept,
-    and its job skipped, so that a batch which was stopped, or killed, goes on when it is called again; of one that is
-    older than its scene's file it is told. Outputs appear whole or not at all. A job that fails does not end the
-    others; but an output that cannot be written does, as the rest would be lost too.
+    Images are bitwise equal to those of `render_until` with the limits of the job. A job whose output exists is
+    skipped, so that a batch that was stopped or killed continues when it is called again; its outcome has a message if
+    the output is older than the scene file. Outputs appear whole or not at all. A job that fails does not end the
+    others, but an output that cannot be written does, as the rest would be lost too.
 
     Args:
         jobs: a file of JSON Lines, or mappings: each with the keys of `Job`. Scenes are relative to the file's folder;
             those of mappings to the current one.
-        folder: for outputs; it is made where it is missing, and so are folders within.
-        part: (I, N): every N-th job alone, beginning with the I-th from 0; so N processes share a batch.
+        folder: for outputs; created if missing, like folders within it.
+        part: (I, N): only every N-th job, beginning with the I-th, from 0, so that N processes share a batch.
         progress: True for a bar on stderr, or a function that is called with each outcome.
     Returns:
-        the outcome of each job of this part. Ctrl-C ends the batch, without the image that it is at.
+        The outcome of each job of this part. Ctrl-C ends the batch, and drops the image in progress.
     Raises:
-        InputError: the list of jobs is wrong, with the place of what is, or the folder cannot be made or written to;
-            nothing was rendered then.
+        InputError: the list of jobs is wrong (the message names the place), or the folder cannot be created or written
+            to; nothing was rendered.
     """
     if isinstance(jobs, str | os.PathLike):
         listed, beside = job_lists.read(jobs, folder), Path(jobs).parent
@@ -98,7 +98,7 @@ def render_batch(
 
 
 def _loaded(jobs: list[Job], beside: Path, folder: Path, thread: ThreadPoolExecutor) -> Iterator:
-    """Jobs, their outputs and their scenes to come; None of outputs that are there. Some are loaded ahead."""
+    """Yield jobs, outputs and futures of their scenes, None if the output exists, while loading some scenes ahead."""
     waiting: deque[tuple[Job, Path, Future | None]] = deque()
     for job in jobs:
         output = folder / job.output
@@ -111,7 +111,7 @@ def _loaded(jobs: list[Job], beside: Path, folder: Path, thread: ThreadPoolExecu
 def _skipped(job: Job, output: Path, beside: Path) -> Outcome:
     try:
         old = output.stat().st_mtime < (beside / job.scene).stat().st_mtime
-    except OSError:  # one of them is gone, which is nothing to tell of a job that is done
+    except OSError:  # one of them is gone, which does not matter for a job that is done
         old = False
     told = f"{job.place}: {output} is older than {job.scene}, and kept; delete it to have it rendered anew"
     return Outcome(job, output, "skipped", told if old else "")
@@ -124,7 +124,7 @@ def _load(job: Job, beside: Path) -> tuple[Scene, float]:
 
 
 def _outcome(job: Job, output: Path, loading: Future, interrupts: Interrupts) -> Outcome | None:
-    """Render a job and write its image; None: a signal came before the image was whole."""
+    """Render a job and write its image; None: a signal came before the image was complete."""
     if interrupts.heard:
         return None
     try:
@@ -134,7 +134,7 @@ def _outcome(job: Job, output: Path, loading: Future, interrupts: Interrupts) ->
         render = Render(scene, job.error, job.time, spp, job.seed, job.strategy, None)
         render.compile()
         result = render.run()
-    except Exception as error:  # whatever it is, the other jobs are not to blame
+    except Exception as error:  # whatever it is, the other jobs go on
         return Outcome(job, output, "failed", f"{job.place}: {error or type(error).__name__}")
     if result.reason == "interrupted":
         return None
@@ -153,7 +153,7 @@ def _outcome(job: Job, output: Path, loading: Future, interrupts: Interrupts) ->
 
 @contextmanager
 def _told(progress: bool | Callable[[Outcome], None], count: int) -> Iterator[Callable[[Outcome], None]]:
-    """A context with a function that shows outcomes as they come: by a bar, or lines where stderr is no terminal."""
+    """Context of a function that shows outcomes as they come: by a bar, or by lines if stderr is not a terminal."""
     if progress is not True:
         yield progress or (lambda outcome: None)
         return
