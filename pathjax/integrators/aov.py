@@ -1,4 +1,4 @@
-"""What a camera ray meets first: the mean of its distance, normal and albedo over a pixel's samples."""
+"""Mean distance, normal and albedo of the first hit over a pixel's samples."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ from pathjax.shapes import geometry
 
 
 class FirstHit(NamedTuple):
-    """All 0 where nothing is met, as Mitsuba's `aov` has it."""
+    """First hit of a camera ray; all 0 for a miss, as in Mitsuba's `aov`."""
 
     depth: Float[Array, "1"]  # distance along the ray, from the near clip plane on
     normal: Float[Array, "3"]  # shading normal in world space, on the side that the shape's normals point to
-    albedo: Float[Array, "3"]  # share of light that is sent back; 1 of glass and of null, 0 of a side that absorbs
+    albedo: Float[Array, "3"]  # share of light that is scattered; 1 for glass and null, 0 for an absorbing side
 
 
 def mean(work: Work, scene: Scene) -> FirstHit:
-    """Over a pixel's samples."""
+    """Return the mean over a pixel's samples."""
     pixel, first_sample, spp, seed = work
     stream = sampler.pixel_stream(seed, pixel)
 
@@ -42,9 +42,9 @@ def mean(work: Work, scene: Scene) -> FirstHit:
 
 
 def sample(scene: Scene, pixel: Int[Array, ""], stream: sampler.Word, number: sampler.Word) -> FirstHit:
-    """One sample, at the film position of `pixel.camera_ray`."""
+    """Return one sample, at the film position of `pixel.camera_ray`."""
     ray, weight = camera_ray(scene, pixel, stream, number)
-    if scene.camera.gain != 1:  # which is of radiance
+    if scene.camera.gain != 1:  # the gain applies to radiance only
         weight = weight / scene.camera.gain
     if not scene.geometry.tables:
         return _nothing(scene)
@@ -53,7 +53,7 @@ def sample(scene: Scene, pixel: Int[Array, ""], stream: sampler.Word, number: sa
     def seen():
         u = bounce_numbers(scene, stream, number, jnp.int32(0))
         here = vertex(scene, ray, hit, u.leaf)
-        # The mean weight of a bsdf sample is the albedo, exact where all directions carry the same.
+        # The mean weight of bsdf samples is the albedo; one sample is exact where all directions have the same weight.
         drawn, _ = sample_bsdf(scene, here, u.bsdf)
         transmits = bsdfs.has(scene.materials, here.kind, "transmissive")
         albedo = jnp.where(transmits, 1, jnp.where(here.kind >= 0, drawn.weight, 0))
@@ -64,7 +64,7 @@ def sample(scene: Scene, pixel: Int[Array, ""], stream: sampler.Word, number: sa
 
 
 def _first(scene, ray):
-    """The ray, its hit, and how far it came before; lights that are hidden from the camera let it through."""
+    """Return the last ray, its hit, and the distance before it; rays pass through lights hidden from the camera."""
     shapes = scene.geometry
     state = ray, geometry.closest_hit(shapes, ray), jnp.zeros_like(ray.t_max)
     if not scene.hide_emitters:

@@ -1,4 +1,4 @@
-"""Next event estimation: light that is looked for instead of found by chance, and how the two share (Veach 1997)."""
+"""Next event estimation, and its multiple importance sampling with bsdf sampling (Veach 1997)."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ from pathjax.shapes import geometry
 
 
 def occurs(scene: Scene, choice: Choice | None, options: Options) -> bool:
-    """Whether any light is sampled: not where all bsdfs are Dirac's, whose directions no light sample has."""
+    """Return whether lights are sampled: not where all bsdfs are Dirac, since no light sample has their directions."""
     return options.strategy != "bsdf" and choice is not None and scene.samples_lights
 
 
 def draws_background(scene: Scene, choice: Choice | None, options: Options) -> bool:
-    """Whether some of the light samples are of a background."""
+    """Return whether some of the light samples are of a background."""
     return occurs(scene, choice, options) and emitters.samples_background(scene.emitters, choice)
 
 
 def draw_or_meet(
     scene: Scene, choice: Choice, vertex: Vertex, met: Bool[Array, ""], u: Bounce, d: Float[Array, "3"]
 ) -> tuple[EmitterSample, tuple[Float[Array, "3"], Float[Array, ""]]]:
-    """A light that is drawn if the path has met a vertex, and what comes from the direction d if it has not.
+    """Draw a light sample, for a path that has met a vertex, and the background in direction d, for one that has not.
 
-    One look-up of the background does for both: lanes would make two at each vertex, of which one is of use.
+    Both share one look-up of the background: lanes would do two at each vertex and use only one.
     """
     drawn = emitters.sample(scene.emitters, scene.geometry, choice, vertex.surface.p, u.light, u.triangle, False)
     sky = compute_once(emitters.background(scene.emitters, choice, jnp.where(met, drawn.d, d)))
@@ -52,14 +52,14 @@ def light_sample(
     medium: Int[Array, ""] | None = None,
     drawn: EmitterSample | None = None,
 ) -> Arrival:
-    """One sample of what a vertex reflects of direct light: the integral over all lights of f Le |cos theta| V.
+    """Sample the direct light that a vertex reflects: the integral over all lights of f Le |cos theta| V.
 
     Args:
-        choice: how lights are chosen, of `emitters.choice`.
-        goes_on: else the sample is of no use, and its shadow ray not traced.
+        choice: how lights are chosen, from `emitters.choice`.
+        goes_on: whether the sample counts; if not, its shadow ray is not traced.
         depth: vertices so far.
-        medium: in which the path came; None in scenes without media.
-        drawn: of `draw_or_meet`, where that is known.
+        medium: medium in which the path arrived; None in scenes without media.
+        drawn: light sample of `draw_or_meet`, if already drawn.
     """
     materials = scene.materials
     smooth = is_smooth(scene, vertex)
@@ -89,14 +89,14 @@ def light_sample(
 
 
 def _weight(drawn: EmitterSample, pdf_bsdf: Float[Array, ""], options: Options) -> Float[Array, ""] | int:
-    """Share of a light sample in the light that bsdf sampling finds too."""
+    """Return the MIS weight of a light sample."""
     return mis_weight(drawn.density, pdf_bsdf) if options.strategy == "mis" else 1
 
 
 def share_of_bsdf_sampling(
     scene: Scene, choice: Choice | None, pdf: Float[Array, ""], pdf_light: Float[Array, ""], options: Options
 ) -> Real[Array, ""] | int:
-    """Share of bsdf sampling in light that it found with density `pdf` and a light sample with `pdf_light`."""
+    """Return the weight of bsdf sampling in light that it finds with density `pdf`, light samples with `pdf_light`."""
     if options.strategy == "mis":
         return mis_weight(pdf, pdf_light)
     if occurs(scene, choice, options):
@@ -107,7 +107,7 @@ def share_of_bsdf_sampling(
 def mis_weight(pdf: Float[Array, ""], other_pdf: Float[Array, ""]) -> Float[Array, ""]:
     """Power heuristic for a sample of density `pdf` > 0 that the other technique finds with `other_pdf`.
 
-    1 for an infinite `pdf`, what cannot be found otherwise, even where a grazing light makes the other one overflow.
+    It is 1 for an infinite `pdf` (only this technique finds it), even where a grazing light makes `other_pdf` overflow.
     """
     ratio = other_pdf / pdf
     return jnp.where(jnp.isinf(pdf), 1, 1 / (1 + ratio * ratio))

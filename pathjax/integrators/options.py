@@ -1,6 +1,6 @@
-"""What a path tracer may be asked to do: one record, made and checked where the public functions begin.
+"""Options of the path tracer: one record, built and checked at the start of the public functions.
 
-It is what `jax.jit` gets as a static argument, so each choice compiles a kernel of its own, and the defaults compile
+The record is a static argument of `jax.jit`, so each choice compiles a kernel of its own, and the defaults compile
 nothing of the other choices.
 """
 
@@ -20,32 +20,32 @@ from pathjax.scene.scene import Scene
 
 STRATEGIES = ("mis", "light", "bsdf")
 SAMPLERS = tuple(sampler.POINTS)
-# Branches double with each.
+# The number of branches doubles with each split.
 MOST_SPLITS = 8
-# Numbers of samples, or seeds: one for all, or one for each pixel or replicate.
+# Sample counts or seeds: one for all, or one per pixel or replicate.
 Counts = int | np.integer | Integer[Array | np.ndarray, "..."]
 
 
 @dataclass(frozen=True)
 class Options:
-    """Choices of one path tracer.
+    """Options of one path tracer.
 
     Raises:
-        InputError: a choice that is unknown or out of range.
+        InputError: a choice is unknown or out of range.
     """
 
-    # What users choose; `pathjax.render` says what it means.
-    strategy: str = "mis"  # of STRATEGIES
-    fresnel: str = "exact"  # of `bsdfs.FRESNEL`
+    # Chosen by users; documented in `pathjax.render`.
+    strategy: str = "mis"  # one of STRATEGIES
+    fresnel: str = "exact"  # one of `bsdfs.FRESNEL`
     split_depth: int = 0  # at most MOST_SPLITS
-    sampler: str = "lattice"  # of SAMPLERS
-    controlled: bool = False  # a `transport.Control` decides on roulette
-    # How films are sampled, of which users choose nothing but the filter.
-    shared: bool = False  # samples count in all pixels under the filter, so pixels are all of the film, in order
-    # What other parts of the package ask for.
-    derivative: bool = False  # follow also what carries nothing, since its derivative may; the value is the same
+    sampler: str = "lattice"  # one of SAMPLERS
+    controlled: bool = False  # a `transport.Control` decides roulette
+    # How films are sampled; users choose only the filter.
+    shared: bool = False  # samples count in all pixels under the filter, so pixels are the whole film, in order
+    # Set by other parts of the package.
+    derivative: bool = False  # also follow paths of no throughput: their derivative may not be 0; the value is the same
     by_vertex: bool = False  # `Path.L` is the Gain of the last vertex
-    watch_moving: bool = False  # tell which bsdfs it met that move paths
+    watch_moving: bool = False  # record in `Path.moving` which bsdfs that move paths were met
 
     def __post_init__(self):
         named = {"strategy": STRATEGIES, "fresnel": bsdfs.FRESNEL, "sampler": SAMPLERS}
@@ -56,7 +56,7 @@ class Options:
             raise InputError(f"split_depth = {self.split_depth!r}; it must be an integer in [0, {MOST_SPLITS}]")
 
     def check_counts(self, spp: Counts, seed: Counts) -> None:
-        """Refuse, with an InputError, numbers of samples and seeds out of range; see `check_counts`."""
+        """Refuse, with an InputError, sample counts and seeds out of range; see `check_counts`."""
         check_counts(spp, seed)
         if self.sampler == "subpixel" and not is_traced(spp):
             if np.any(np.asarray(spp) % sampler.SUBPIXELS):
@@ -72,7 +72,7 @@ class Options:
             )
 
     def check_differentiable(self) -> None:
-        """Refuse, with an InputError, what derivatives are not made with."""
+        """Refuse, with an InputError, options that derivatives do not support."""
         if self.split_depth or self.sampler != "lattice":
             raise InputError(
                 f"derivatives are not made with split_depth={self.split_depth} and sampler={self.sampler!r}; "
@@ -82,7 +82,7 @@ class Options:
             raise InputError("derivatives are not made with a control; without one the image has the same expectation")
 
     def applied(self, scene: Scene) -> Scene:
-        """The scene whose dielectrics reflect as chosen."""
+        """Return the scene with the chosen Fresnel model in its dielectrics."""
         return replace(scene, materials=bsdfs.with_fresnel(scene.materials, self.fresnel))
 
 
@@ -90,14 +90,14 @@ DEFAULTS = Options()
 
 
 def strategies(scene: Scene) -> tuple[str, ...]:
-    """The strategies that find all light of a scene."""
+    """Return the strategies that find all light of a scene."""
     return tuple(each for each in STRATEGIES if each != "bsdf" or not emitters.met_by_no_ray(scene.emitters))
 
 
 def check_counts(spp: Counts, seed: Counts, name: str = "spp") -> None:
-    """Refuse, with an InputError, a number of samples below 1 and a seed below 0; arrays, traced ones too, pass.
+    """Refuse, with an InputError, a sample count below 1 or a seed below 0; arrays, also traced ones, are not checked.
 
-    name: what the samples are called.
+    name: name of the sample count in the message.
     """
     for its_name, value, least in ((name, spp, 1), ("seed", seed, 0)):
         if isinstance(value, jax.Array) or np.ndim(value):

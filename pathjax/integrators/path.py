@@ -2,14 +2,14 @@
 
 `extend` is one vertex of a path. Its steps, each a function, are the terms of the equation:
 
-    emission                      Le: light of what the path ends on, as far as bsdf sampling is to find it
+    emission                      Le: light emitted where the path arrives, times the share of bsdf sampling
     next_event.light_sample       T Le: light of a sampled light, reflected once
-    vertex.sample                 T L: one direction stands for the integral, and the path goes on in it
-    roulette.survival             few of the paths that carry little go on, for all of them
-    splitting                     both branches of glass instead of one by chance, where that is asked for
-    control.roulette              paths end in light that is known instead of in darkness, where that is asked for
+    vertex.sample                 T L: one sampled direction estimates the integral; the path continues in it
+    roulette.survival             few paths of little throughput survive, with the weight of all of them
+    splitting                     optional: both branches of glass instead of a random one
+    control.roulette              optional: paths end in known light instead of in darkness
 
-`reference` is the same without choices and without care for speed: read it first.
+`reference` is the same estimator without options or optimisation: read it first.
 """
 
 from __future__ import annotations
@@ -37,44 +37,44 @@ from pathjax.shapes import geometry
 
 
 class Gain(NamedTuple):
-    """What one vertex does, by the terms of L = Le + T Le + T^2 Le + ...; all over the throughput before it."""
+    """Contribution of one vertex to the terms of L = Le + T Le + T^2 Le + ..., divided by the throughput before it."""
 
-    emission: Float[Array, "3"]  # of the term T^depth Le, depth being that of the path before the vertex
-    light: Float[Array, "3"]  # of the next one: the light sample
-    weight: Float[Array, "3"]  # what the throughput is multiplied by
-    passed: Int[Array, ""] | None = None  # and of so many further ones; None: nothing lets light pass
-    nudged: Passed | None = None  # on the way of the light sample; None: nothing asks for it
+    emission: Float[Array, "3"]  # to the term T^depth Le, depth being that of the path before the vertex
+    light: Float[Array, "3"]  # light sample, to the term T^(depth + 1 + passed) Le
+    weight: Float[Array, "3"]  # factor of the throughput
+    passed: Int[Array, ""] | None = None  # vertices passed straight on by the light sample; None: nothing can be passed
+    nudged: Passed | None = None  # from the light sample's shadow ray; None: not needed
     dimmed: Dimmed | None = None  # likewise
 
 
 class Path(NamedTuple):
-    """What a path carries from one vertex to the next: the state of the loop."""
+    """State of the path loop, carried from one vertex to the next."""
 
     ray: Ray  # from the last vertex to the next
     L: Float[Array, "3"] | Gain  # radiance gathered so far; a Gain: at the last vertex alone
     throughput: Float[Array, "3"]  # product of the weights so far
     pdf: Float[Array, ""]  # density [1/sr] of ray.d by bsdf sampling; inf from a camera or a Dirac lobe
-    # Straight on through what lets light pass pdf stays that of the vertex before, which light samples saw.
-    depth: Int[Array, ""]  # vertices so far; where passes are free, without these
-    alive: Bool[Array, ""]  # once it is not, L is whole
-    # None where nothing asks for it, so that nothing of it is compiled:
-    origin: Float[Array, "3"] | None = None  # the point whose `pdf` it is
+    # A path that passes straight through a surface keeps the pdf of the vertex before, where light samples were drawn.
+    depth: Int[Array, ""]  # vertices so far, without free passes
+    alive: Bool[Array, ""]  # False: L is complete
+    # None where not needed, so that it is not compiled:
+    origin: Float[Array, "3"] | None = None  # the point at which `pdf` was sampled
     passed: Int[Array, ""] | None = None  # free passes so far
-    passive: Float[Array, ""] | None = None  # what refraction did to the throughput, which roulette takes out
-    moving: Int[Array, ""] | None = None  # bit r % 31 is set once it met row r of the bsdfs that move paths
-    expected: Float[Array, ""] | None = None  # what a control expects of it, all channels
+    passive: Float[Array, ""] | None = None  # factor of the throughput by refraction, which roulette divides out
+    moving: Int[Array, ""] | None = None  # bit r % 31 is set once the path met row r of the bsdfs that move paths
+    expected: Float[Array, ""] | None = None  # value that a control expects of the path, all channels
     splits: Int[Array, ""] | None = None  # how many dielectrics may still split it
-    medium: Int[Array, ""] | None = None  # through which the ray goes, a row or media.NONE
-    pending: Path | None = None  # (split_depth, ...) branches that wait, those alive; see `splitting`
+    medium: Int[Array, ""] | None = None  # medium of the ray: a row or media.NONE
+    pending: Path | None = None  # (split_depth, ...) waiting branches where alive; see `splitting`
 
 
 def vertices(path: Path) -> Int[Array, ""]:
-    """How many a path has behind it: the number of the next one."""
+    """Return the number of vertices so far, which is the index of the next one."""
     return path.depth if path.passed is None else path.depth + path.passed
 
 
 def start(scene: Scene, ray: Ray, options: Options) -> Path:
-    """A path that has its camera ray."""
+    """Return the path that starts with a camera ray."""
     one, zero3 = jnp.ones_like(ray.t_max), jnp.zeros_like(ray.o)
     transmits, passes = (bsdfs.occurs(scene.materials, each) for each in ("transmissive", "passes"))
     splits = options.split_depth and bsdfs.occurs(scene.materials, "branches")
@@ -99,20 +99,21 @@ def extend(scene: Scene, choice: Choice | None, path: Path, u: Bounce, options: 
     """Follow a path to its next vertex.
 
     Args:
-        choice: how lights are chosen, of `emitters.choice`.
-        path: alive; u: the vertex's own.
-        control: `transport.Control`, for options that are controlled.
+        choice: how lights are chosen, from `emitters.choice`.
+        path: alive.
+        u: random numbers of this vertex.
+        control: `transport.Control`, if `options.controlled`.
     Returns:
         The path; once it is not alive, `L` is the radiance that arrives, unbiased up to max_depth.
-    Gradient: what is drawn is detached from albedos and radiances, so weights carry the derivative, unbiased. Where the
-    IOR of glass moves the path, the derivative is that of the moving points (attached), and edges are missing from it.
+    Gradient: samples are detached from albedos and radiances, so weights carry the derivative, unbiased. Where the IOR
+    of glass moves the path, the derivative follows the moving points (attached) and misses the terms of edges.
     """
     hit, here, u = meet(scene, path, u, options)
     return onward(scene, choice, path, hit, here, u, options, control)
 
 
 def meet(scene: Scene, path: Path, u: Bounce, options: Options) -> tuple[Hit, Vertex | None, Bounce]:
-    """What the ray of a path meets, None in a scene without shapes; and u as it was."""
+    """Return the hit and vertex of a path's ray (no vertex, None, in a scene without shapes), and u unchanged."""
     ray = path.ray
     if scene.scatters:
         distance = media.distance(scene.media, path.medium, ray, path.throughput, u.flight)
@@ -123,7 +124,6 @@ def meet(scene: Scene, path: Path, u: Bounce, options: Options) -> tuple[Hit, Ve
         return here.hit, here, u
     hit = geometry.closest_hit(scene.geometry, ray)
     here = vertex(scene, ray, hit, u.leaf, options.derivative) if scene.geometry.tables else None
-    # What many results share is computed once.
     u, here = compute_once((u, here))
     return hit, here, u
 
@@ -138,7 +138,7 @@ def onward(
     options: Options,
     control=None,
 ) -> Path:
-    """`extend` of a path whose ray is known to meet `here`."""
+    """Do the rest of `extend` for a path whose ray is known to meet `here`."""
     ray, first = path.ray, path.depth == 0
     if options.by_vertex:
         path = path._replace(L=path.L._replace(weight=jnp.ones_like(ray.o)))
@@ -168,7 +168,7 @@ def onward(
         )
     go_on = partial(scatter, scene, choice, here, u, goes_on, options, light)
     if scene.hide_emitters:
-        # What emits lets camera rays through, as in Mitsuba.
+        # Camera rays pass through emitters, as in Mitsuba.
         beyond = spawn_ray(here.surface, ray.d, hit.primitive)._replace(t_max=ray.t_max - hit.t)
         through = path._replace(ray=beyond, depth=jnp.int32(0), medium=leaving(scene, here, path.medium, ray.d))
         hidden = first & geometry.emits(scene.geometry, hit)
@@ -181,9 +181,9 @@ def onward(
 def emission(
     scene: Scene, choice: Choice | None, path: Path, hit: Hit, here: Vertex | None, options: Options, sky=None
 ) -> Float[Array, "3"]:
-    """Le of what a path ends on, times its throughput and the share of bsdf sampling in finding that light.
+    """Return Le where a path arrives, times its throughput and the share of bsdf sampling in finding that light.
 
-    path: before the vertex `here`, which its ray meets at `hit`; sky: of `next_event.draw_or_meet`, if known.
+    path: before the vertex `here`, which its ray meets at `hit`; sky: background, from `next_event.draw_or_meet`.
     """
     shapes, found = scene.geometry, hit.primitive >= 0
 
@@ -200,11 +200,11 @@ def emission(
         Le, pdf_light = at_infinity() if here is None else lax.cond(found, at_surface, at_infinity)
         share = next_event.share_of_bsdf_sampling(scene, choice, path.pdf, pdf_light, options)
         if scene.hide_emitters:
-            # Lights are black to camera rays, the background among them.
+            # Lights, including the background, are black to camera rays.
             share = jnp.where(path.depth == 0, 0, share)
         return _carried(path) * Le * share
 
-    # Most surfaces are dark.
+    # The branch saves time, since most surfaces do not emit.
     bright = True if here is None else ~found | geometry.emits(shapes, hit)
     if scene.scatters:
         bright = bright & ~here.scattered
@@ -221,9 +221,9 @@ def scatter(
     light: EmitterSample | None,
     path: Path,
 ) -> Path:
-    """T L at a vertex: a light sample, and a direction in which the path goes on if roulette lets it.
+    """Estimate T L at a vertex: a light sample, and a direction in which the path continues if it survives roulette.
 
-    light: of `next_event.draw_or_meet`, where that is known.
+    light: light sample of `next_event.draw_or_meet`, if known.
     """
     if here.weight is not None:
         path = _scaled(path, lambda carried: carried * here.weight)
@@ -241,7 +241,7 @@ def scatter(
         survival = jnp.ones_like(drawn.pdf)
     else:
         survival = roulette.survival(scene, path.depth, behind.throughput, passive)
-    # A direction of density 0 (in the surface, by rounding; a branch of glass that cannot be) carries nothing.
+    # A direction of density 0 (in the surface, by rounding; an impossible branch of glass) carries nothing.
     scatters = (here.kind >= 0) | here.scattered if scene.scatters else here.kind >= 0
     carries = scatters & (drawn.pdf > 0) & (options.derivative | (roulette.largest(behind.throughput) > 0))
     on = _scaled(behind, lambda carried: carried / survival)._replace(
@@ -260,7 +260,7 @@ def scatter(
 
 
 def _met(scene, hit, here):
-    """Whether the path has a vertex."""
+    """Return whether the path has a vertex."""
     found = hit.primitive >= 0
     return found | here.scattered if scene.scatters else found
 
@@ -270,13 +270,13 @@ def _ended(path: Path) -> Path:
 
 
 def _scaled(path: Path, scale: Callable) -> Path:
-    """The path whose throughput is scaled, and with it what its vertex does to that."""
+    """Return the path with its throughput scaled, and its vertex's weight too."""
     L = path.L._replace(weight=scale(path.L.weight)) if isinstance(path.L, Gain) else path.L
     return path._replace(L=L, throughput=scale(path.throughput))
 
 
 def _carried(path: Path) -> Float[Array, "3"]:
-    """What light is multiplied by that the path meets."""
+    """Return the factor of light that the path meets."""
     return path.L.weight if isinstance(path.L, Gain) else path.throughput
 
 

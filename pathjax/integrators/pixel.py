@@ -1,4 +1,4 @@
-"""One pixel: the mean of its samples, from the film to the light."""
+"""Estimate one pixel: the mean of its samples, from the film to the light."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ from pathjax.integrators.random_numbers import bounce_numbers, camera_numbers
 from pathjax.scene.scene import Scene
 from pathjax.sensors import film
 
-# The pixel, and its `numbers`.
+# The pixel and its `numbers`: first sample, spp, seed.
 Work = tuple[Int[Array, ""], sampler.Word, sampler.Word, sampler.Word]
 
 
 def numbers(
     pixels: Integer[Array | np.ndarray, " N"], first_sample: Counts, spp: Counts, seed: Counts
 ) -> tuple[UInt[Array | np.ndarray, " N"], ...]:
-    """What to sample of each pixel, of what is one number or one of each."""
+    """Broadcast first sample, spp and seed, each one for all pixels or one per pixel, to (N,) uint32."""
 
     def of_each(x):
-        module = jnp if isinstance(x, jax.Array) else np  # which compiles nothing
+        module = jnp if isinstance(x, jax.Array) else np  # NumPy compiles nothing
         return module.broadcast_to(module.asarray(x, np.uint32), pixels.shape)
 
     return tuple(map(of_each, (first_sample, spp, seed)))
@@ -39,9 +39,9 @@ def numbers(
 def camera_ray(
     scene: Scene, pixel: Int[Array, ""], stream: sampler.Word, number: sampler.Word, points: str = "lattice"
 ) -> tuple[Ray, Float[Array, ""]]:
-    """Ray of one sample at the camera, and the sample's weight.
+    """Return the camera ray of one sample, and the sample's weight.
 
-    stream: the pixel's `sampler.pixel_stream`; points: of `options.SAMPLERS`.
+    stream: the pixel's `sampler.pixel_stream`; points: one of `options.SAMPLERS`.
     """
     u_film, u_lens = compute_once(camera_numbers(scene, stream, number, points))
     position, weight = film.sample_position(scene.film, pixel, u_film)
@@ -53,22 +53,22 @@ def camera_ray(
 def camera_path(
     scene: Scene, pixel: Int[Array, ""], stream: sampler.Word, number: sampler.Word, options: Options
 ) -> tuple[path.Path, Float[Array, ""]]:
-    """Path of one sample at the camera, and the sample's weight; arguments as for `camera_ray`."""
+    """Return the path of one sample at the camera, and the sample's weight; arguments as for `camera_ray`."""
     ray, weight = camera_ray(scene, pixel, stream, number, options.sampler)
     return path.start(scene, ray, options), weight
 
 
 def no_path(scene: Scene, options: Options) -> tuple[path.Path, Float[Array, ""]]:
-    """What stands where a `camera_path` is to be put: anything that is not alive, so that lanes need not write it."""
+    """Return a placeholder for a `camera_path`: not alive, the rest `unset`, so that lanes need not write it."""
     nothing = jax.eval_shape(lambda x: camera_path(scene, jnp.int32(0), x, x, options), jnp.uint32(0))
     now, weight = unset(jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), nothing))
     return now._replace(alive=jnp.bool_(False)), weight
 
 
 def mean(work: Work, scene: Scene, choice: Choice | None, control=None, *, options: Options) -> Float[Array, "3"]:
-    """Mean of a pixel's samples; 0 of none.
+    """Return the mean of a pixel's samples; 0 if it has none.
 
-    choice, control: of `path.extend`.
+    choice, control: as for `path.extend`.
     """
 
     def add(sums, _, now, weight):
@@ -82,11 +82,11 @@ def mean(work: Work, scene: Scene, choice: Choice | None, control=None, *, optio
 
 
 def over_vertices(work: Work, scene: Scene, choice: Choice | None, add: Callable, sums, options: Options, control=None):
-    """Sums over all vertices of a pixel's samples: one loop, so that no lane waits for the longest path of another.
+    """Sum over all vertices of a pixel's samples, in one loop, so that no lane waits for the longest path of another.
 
     Args:
         add: (sums, Path before the vertex, Path after it, weight of the sample) -> sums.
-        choice, control: of `path.extend`.
+        choice, control: as for `path.extend`.
     """
     pixel, first_sample, spp, seed = work
     stream = sampler.pixel_stream(seed, pixel)
@@ -112,7 +112,7 @@ def begun(
     weight: Float[Array, ""],
     options: Options,
 ) -> tuple[path.Path, Float[Array, ""]]:
-    """Path and weight of a sample; where the path has ended, those of `camera_path` for the sample `number`."""
+    """Return path and weight unchanged while the path is alive; else those of `camera_path` for the sample `number`."""
 
     def begin():
         return camera_path(scene, pixel, stream, number, options)
@@ -121,7 +121,7 @@ def begun(
 
 
 def add_compensated(state, term):
-    """Kahan's sum: a million samples keep their digits. state: total and what its last rounding lost."""
+    """Add a term by Kahan summation: a million samples keep their digits. state: total and its last rounding error."""
     total, lost = state
     term = term - lost
     new = total + term

@@ -1,6 +1,6 @@
-"""The random numbers of a path: four of a low-discrepancy point for each vertex, and hashed ones for its other choices.
+"""Random numbers of a path: four of a low-discrepancy point for each vertex, and hashed ones for its other choices.
 
-The camera is vertex 0 of the sampler, so what a path meets at depth d is vertex d + 1.
+The camera is vertex 0 of the sampler, so the vertex of a path at depth d is vertex d + 1.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from pathjax import bsdfs
 from pathjax.core import sampler
 from pathjax.scene.scene import Scene
 
-# Hashed numbers of lobes begin here: the others are two for each depth, and depths end at `scene.UNBOUNDED`, 2^30.
+# First hashed dimension for lobes: the others take two per depth, and depths end at `scene.UNBOUNDED`, 2^30.
 _LOBES = 1 << 31
 _LEAVES = _LOBES + (1 << 30)
 
@@ -23,19 +23,19 @@ class Bounce(NamedTuple):
     """Random numbers of one vertex, uniform in [0, 1)."""
 
     light: Float[Array, "2"]
-    bsdf: Float[Array, " numbers"]  # 2 or 3, `bsdf_dimensions`
+    bsdf: Float[Array, " numbers"]  # 2 or 3, see `bsdf_dimensions`
     triangle: Float[Array, ""]  # chooses within a mesh that emits
     roulette: Float[Array, ""]
     leaf: Float[Array, ""] | None = None  # chooses among bsdfs that hold others; None: there are none
-    flight: Float[Array, "2"] | None = None  # how far light goes; None: it meets nothing on the way
-    # For derivatives in grids: a point of the flight, a part of a shadow ray, a point of that; None: there are none.
+    flight: Float[Array, "2"] | None = None  # distance to a scattering event; None: no medium scatters
+    # For derivatives in grids: a point of the flight, a segment of a shadow ray, a point on it; None: there are none.
     along: Float[Array, "3"] | None = None
 
 
 def camera_numbers(
     scene: Scene, stream: sampler.Word, sample: sampler.Word, points: str = "lattice"
 ) -> tuple[Float[Array, "2"], Float[Array, "2"]]:
-    """Film and lens, of a `sampler.pixel_stream` and the number of a sample. points: of `options.SAMPLERS`."""
+    """Return the numbers for film and lens. stream: of `sampler.pixel_stream`; points: one of `options.SAMPLERS`."""
     u = sampler.POINTS[points](stream, sample, 0).astype(scene.camera.origin.dtype)
     return u[:2], u[2:]
 
@@ -48,7 +48,7 @@ def bounce_numbers(
     points: str = "lattice",
     along: bool = False,
 ) -> Bounce:
-    """Random numbers of the vertex number depth. along: whether `Bounce.along` is asked for."""
+    """Return the random numbers of the vertex of index `depth`. along: whether to draw `Bounce.along`."""
     dtype = scene.camera.origin.dtype
     u = sampler.POINTS[points](stream, sample, depth + 1).astype(dtype)
     key = sampler.path_key(stream, sample)
@@ -68,5 +68,5 @@ def bounce_numbers(
 
 
 def bsdf_dimensions(materials: bsdfs.Materials) -> int:
-    """How many numbers a bsdf draws: 2 for its direction, and a third where some kind chooses among lobes."""
+    """Return how many numbers a bsdf draws: 2 for its direction, and a third if some kind chooses among lobes."""
     return 3 if bsdfs.occurs(materials, "lobes") else 2

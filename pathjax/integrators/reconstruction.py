@@ -1,15 +1,16 @@
-"""Images from samples that count in all pixels under the film's filter.
+"""Reconstruct images from samples that count in all pixels under the film's filter.
 
 A sample of pixel q, at an offset d from its middle, weighs w_k = f(d_x - k_x) f(d_y - k_y) in pixel q + k. With n_q
 samples of each pixel the image is
 
     I(p) = A(p) / W(p),    A(p) = sum_k 1/n_(p-k) sum_i w_ki L_i,    W the same without L.
 
-So a constant stays constant, at borders too, where pixels around have no samples; and pixels with many samples weigh no
-more than others. W does not depend on the scene, so I is linear in what is sampled, and derivatives go the same way.
+So a constant stays constant, also at borders, where some neighbours have no samples; and pixels with many samples weigh
+no more than others. W does not depend on the scene, so I is linear in the samples, and derivatives are reconstructed in
+the same way.
 
-Kernels know nothing of it: they give single samples of pixels that look through a box. The rest is sums of shifted
-images, outside of them.
+Kernels do not know about the filter: they return single samples of box-filtered pixels. The reconstruction is sums of
+shifted images, outside the kernels.
 """
 
 from __future__ import annotations
@@ -35,29 +36,29 @@ from pathjax.scene.scene import Scene
 from pathjax.sensors import film
 from pathjax.sensors.film import Film
 
-# What `pixel.Work` is of one pixel, of each of N.
+# `pixel.Work` of N pixels.
 Works = tuple[Int[Array, " N"], UInt[Array, " N"], UInt[Array, " N"], UInt[Array, " N"]]
-# Pixels in a row of `film.of_samples`, of R images: the first, and of each (R, n) first sample, spp, seed, and what a
-# sample weighs, 1/n_q above.
+# A run of n pixels in the order of `film.of_samples`, of R images: the first pixel, and per pixel (R, n) the first
+# sample, spp, seed, and the weight of a sample, 1/n_q above.
 Run = tuple[Int[Array, ""], UInt[Array, "R n"], UInt[Array, "R n"], UInt[Array, "R n"], Float[Array, "R n"]]
 
-# Samples that a call of the kernel gives: so many that few lanes are idle at its end; of one pixel at most, since few
-# may be asked for; and numbers of which they consist at most, where there are many derivatives.
+# Samples per kernel call, enough that few lanes are idle at its end; most samples of one pixel in a call, since spp may
+# be small; and most scalars in all samples of a call, which limits it where there are many derivatives.
 _SAMPLES, _OF_PIXEL, _NUMBERS = 1 << 16, 16, 1 << 24
 
 
 def map_pixels(
     of_pixel: Callable, work: Works, scene: Scene, *shared, options: Options, means: bool = True, **how
 ) -> object:
-    """`native_map` of pixels; of a film that shares samples, the images that these make.
+    """Map `of_pixel` over pixels by `native_map`; for a film that shares samples, reconstruct the images.
 
     Args:
         of_pixel: (`pixel.Work`, scene, *shared) -> pytree, the mean over samples of a pixel, or the sum.
-        work: arrays (N,); where samples are shared `film.pixels` of one image or of some, one after another.
-        means: whether it gives the mean. Of a film that shares samples, sums become means.
+        work: arrays (N,); where samples are shared, `film.pixels` of one or more images, one after another.
+        means: whether `of_pixel` returns the mean. For a film that shares samples, sums become means.
         how: `form` and `devices` of `native_map`.
     Returns:
-        pytree of (N, ...); of a film that shares samples, without the pixels outside of its crop window.
+        pytree of (N, ...); for a film that shares samples, without the pixels outside its crop window.
     """
     if not options.shared:
         return _own_samples(of_pixel, work, scene, *shared, means=means, **how)
@@ -70,7 +71,7 @@ def map_pixels(
 def images(
     of_samples: Callable, like, work: Works, scene: Scene, *shared, options: Options, devices: int | None = None
 ) -> object:
-    """What `map_pixels` gives of a film that shares samples. of_samples, like: of `sums`."""
+    """Do `map_pixels` for a film that shares samples. of_samples, like: as for `sums`."""
     run = _whole(work, scene)
     totals, weights = sums(of_samples, like, run, scene, *shared, options=options, devices=devices)
     return jax.tree.map(lambda total: _images(scene.film, total, weights), totals)
@@ -86,11 +87,11 @@ def pulled(
     options: Options,
     devices: int | None = None,
 ) -> Float[Array, "..."]:
-    """The transpose of `images`: of their adjoint, the sum of what samples give of theirs.
+    """Apply the transpose of `images`: pull the adjoint of the images back to samples and sum `of_samples` over them.
 
     Args:
-        of_samples: (adjoint (N, 3) of the values of samples, Works, scene, *shared) -> what is added up, like `zero`.
-        work, options, devices: of `images`.
+        of_samples: (adjoint (N, 3) of the samples' values, Works, scene, *shared) -> summand, like `zero`.
+        work, options, devices: as for `images`.
     """
     run = first_pixel, *_, scale = _whole(work, scene)
     through, channels = scene.film, adjoint.shape[-1]
@@ -109,14 +110,14 @@ def pulled(
 
 
 def _whole(work: Works, scene: Scene) -> Run:
-    """All pixels of an image or of some."""
+    """Return the run of all pixels of one or more images."""
     count = film.pixel_count(film.of_samples(scene.film))
     _, first_sample, spp, seed = (x.reshape(-1, count) for x in work)
     return jnp.int32(0), first_sample, spp, seed, 1 / jnp.maximum(spp, 1).astype(scene.camera.origin.dtype)
 
 
 def _own_samples(of_pixel: Callable, work: Works, scene: Scene, *shared, means: bool, **how) -> object:
-    """`map_pixels`, where no sample is shared. An accelerator takes some samples of a pixel at once."""
+    """Do `map_pixels` where no sample is shared. Accelerators take parts of a pixel's samples in parallel."""
     pixels, first_sample, spp, seed = work
     parts = cuts(len(pixels), how.get("form"))
     if parts == 1:
@@ -131,7 +132,7 @@ def _own_samples(of_pixel: Callable, work: Works, scene: Scene, *shared, means: 
         x = x.reshape(*counts.shape, *x.shape[1:])
         if not means:
             return x.sum(0)
-        # A mean of no samples may be anything.
+        # The mean of no samples is arbitrary, perhaps NaN.
         share = (counts / jnp.maximum(spp, 1)).reshape(*counts.shape, *[1] * (x.ndim - 2)).astype(x.dtype)
         return jnp.where(share > 0, x * share, 0).sum(0)
 
@@ -141,7 +142,7 @@ def _own_samples(of_pixel: Callable, work: Works, scene: Scene, *shared, means: 
 def _images(
     through: Film, totals: Float[Array, "R m *rest"], weights: Float[Array, "R m"]
 ) -> Float[Array, "pixels ..."]:
-    """A / W, of all pixels and the halo around them."""
+    """Return A / W for the pixels of the crop window. totals, weights: of all pixels and the halo around them."""
     mean = safe_divide(totals, weights.reshape(*weights.shape, *[1] * (totals.ndim - 2)))
     edge = halo(through)
     mean = film.cropped(through, mean[:, edge : mean.shape[1] - edge])
@@ -149,19 +150,19 @@ def _images(
 
 
 def halo(made: Film) -> int:
-    """How many pixels before and after a run, row by row, its samples reach."""
+    """Return how many pixels, counted row by row, the samples of a run reach before and after it."""
     return made.reach * (film.of_samples(made).crop[2] + 1)
 
 
 def sums(
     of_samples: Callable, like, run: Run, scene: Scene, *shared, options: Options, devices: int | None = None
 ) -> tuple[object, Float[Array, "R m"]]:
-    """A and W of the samples of pixels in a row: pytree of (R, m, ...), (R, m), m = n + 2 `halo`, which begin before.
+    """Return A and W of the samples of a run and its halo: pytree of (R, m, ...), (R, m), m = n + 2 `halo`.
 
     Args:
-        of_samples: (Works of N pixels with a sample each, or none; scene, *shared) -> pytree of (N, ...).
-        like: that of one sample, shapes and dtypes.
-        devices: of `native_map`.
+        of_samples: (Works of N pixels with one sample or none each, scene, *shared) -> pytree of (N, ...).
+        like: pytree of one sample: shapes and dtypes.
+        devices: as for `native_map`.
     """
     first_pixel, _, spp, _, scale = run
     through = scene.film
@@ -173,7 +174,7 @@ def sums(
     def add(number, state):
         work, there, u = of_block(number)
         values = jax.tree.leaves(of_samples(work, _sampled(scene), *shared))
-        none = jnp.zeros((*there.shape, 0), scale.dtype)  # where the weights alone are asked for
+        none = jnp.zeros((*there.shape, 0), scale.dtype)  # `like` may be empty, for the weights alone
         values = jnp.concatenate([none, *(x.reshape(*there.shape, -1) for x in values)], -1)
         values = jnp.where(there[..., None], values, 0)
         spread = spread_samples(through, first_pixel, u, jnp.where(there, scale, 0), values, devices)
@@ -187,17 +188,17 @@ def sums(
 
 
 def _sampled(scene: Scene) -> Scene:
-    """The scene whose pixels look through a box."""
+    """Return the scene with box-filtered pixels."""
     return replace(scene, film=film.of_samples(scene.film))
 
 
 def _blocks(run: Run, scene: Scene, channels: int, options: Options) -> tuple[Int[Array, ""], Callable]:
-    """The number of calls of a kernel that all samples take, and what the call of a number is of.
+    """Return the number of kernel calls for all samples, and a function that gives the samples of each call.
 
     Args:
-        channels: numbers that a sample consists of.
+        channels: scalars per sample.
     Returns:
-        count, and number -> `Works` of B samples of each pixel; (B, R, n) which of them are there; and their
+        count, and index of a call -> `Works` of B samples of each pixel; (B, R, n) mask of those that exist; and their
         `film_numbers` (B, R, n, 2).
     """
     first_pixel, first_sample, spp, seed, _ = run
@@ -223,7 +224,7 @@ def film_numbers(
     seed: UInt[Array, "#*shape"],
     points: str = "lattice",
 ) -> Float[Array, "*shape 2"]:
-    """Where in their pixels the samples lie that have these numbers."""
+    """Return the positions within their pixels of the samples with these numbers."""
 
     def one(stream, number):
         return camera_numbers(sampled, stream, number, points)[0]
@@ -242,11 +243,11 @@ def spread_samples(
     values: Float[Array, "B R n C"],
     devices: int | None = None,
 ) -> Float[Array, "R C+1 m"]:
-    """Sums as `sums` gives them, the weights last, of B samples of each pixel; linear in the values."""
+    """Return the sums of `sums`, the weights last, for B samples of each pixel; linear in the values."""
     edge = halo(through)
     ones = jnp.ones_like(scale)[..., None]
     weighted = jnp.concatenate([values, ones], -1) * scale[..., None]
-    # Columns are pixels: those around the run, and what the last device has too many, have no samples.
+    # Columns are pixels. Those around the run, and the excess of the last device, have no samples.
     spare = 2 * edge + len(jax.devices())
     ends = (0, 0), (0, 0), (0, 0), (2 * edge, spare)
     u, weighted = (jnp.pad(jnp.moveaxis(x, -1, 2), ends) for x in (u, weighted))
@@ -272,13 +273,13 @@ def spread_samples(
 def _spread(
     through: Film, pixels: Int[Array, " n"], u: Float[Array, "2 n"], weighted: Float[Array, "C n"]
 ) -> Float[Array, "C m"]:
-    """One sample of each of n pixels in a row, spread; m = n - 2 `halo`, so that all that reach a pixel are there."""
+    """Spread one sample of each pixel of a run of n to m = n - 2 `halo` pixels, whose contributions are complete."""
     edge, total = halo(through), 0
     by_x, by_y, weighted = lax.optimization_barrier((*_weights(through, pixels, u), weighted))
     for b, a, step in _steps(through):
         here = np.s_[..., edge - step : len(pixels) - edge - step]
         weight = by_x[a][here] * by_y[b][here]
-        # What is not finite spoils no pixel in which it does not count.
+        # A non-finite sample must not spoil pixels in which its weight is 0.
         total = total + jnp.where(weight != 0, weight * weighted[here], 0)
     return total
 
@@ -286,17 +287,17 @@ def _spread(
 def _weights(
     through: Film, pixels: Int[Array, " n"], u: Float[Array, "2 n"]
 ) -> tuple[Float[Array, "S n"], Float[Array, "S n"]]:
-    """The two factors of what samples weigh in pixels -reach, ..., reach away."""
+    """Return the factors, by x and by y, of the samples' weights in pixels -reach, ..., reach away."""
     width = film.of_samples(through).crop[2]
     steps = jnp.arange(-through.reach, through.reach + 1)[:, None]
     by_x, by_y = (through.filter.evaluate(u[axis] - 0.5 - steps.astype(u.dtype)) for axis in (0, 1))
-    # What lies beyond a row's ends is in no pixel.
+    # Beyond the ends of a row there are no pixels.
     x = pixels % width + steps
     return jnp.where((x >= 0) & (x < width), by_x, 0), by_y
 
 
 def _steps(through: Film) -> list[tuple[int, int, int]]:
-    """Of all pixels around one, the numbers of their factors of `_weights` in y and x, and how far on they are."""
+    """Return, per pixel around one, the indices of its factors of `_weights` in y and x, and its offset in the run."""
     reach, width = through.reach, film.of_samples(through).crop[2]
     around = range(2 * reach + 1)
     return [(b, a, (b - reach) * width + a - reach) for b in around for a in around]
@@ -309,7 +310,7 @@ def gather_samples(
     scale: Float[Array, "B R n"],
     of_sums: Float[Array, "R m C"],
 ) -> Float[Array, "B R n C"]:
-    """The transpose of `spread_samples` but for the weights: of the adjoint of sums, that of the values of samples."""
+    """Apply the transpose of `spread_samples` without the weights: adjoint of the sums to adjoint of the values."""
     edge, count = halo(through), u.shape[2]
     pixels, adjoint = first_pixel + jnp.arange(count), jnp.moveaxis(of_sums, -1, 1)
 
@@ -321,7 +322,7 @@ def gather_samples(
             total = total + jnp.where(weight != 0, weight * around[:, edge + step : edge + step + count], 0)
         return scale * total
 
-    # On one device: XLA of jax 0.7 aborts where the columns are dealt to some.
+    # On one device: XLA of jax 0.7 aborts where the columns are distributed over several.
     found = lax.map(lambda sample: jax.vmap(gather)(*sample, adjoint), (jnp.moveaxis(u, -1, 2), scale))
     return jnp.moveaxis(found, 2, -1)
 
@@ -329,6 +330,6 @@ def gather_samples(
 def image_of_samples(
     through: Film, u: Float[Array, "B N 2"], values: Float[Array, "B N C"]
 ) -> Float[Array, "pixels C"]:
-    """The image that B samples of each of all pixels make, `film_numbers` u; linear in their values."""
+    """Return the image of B samples of every pixel, with `film_numbers` u; linear in their values."""
     total = spread_samples(through, jnp.int32(0), u[:, None], jnp.ones_like(u[:, None, :, 0]), values[:, None])
     return _images(through, jnp.moveaxis(total[:, :-1], 1, 2), total[:, -1])

@@ -1,14 +1,14 @@
-"""The path tracer of textbooks (Kajiya 1986; PBRT 4 ed., chapter 14): read it first. `path` gives the same, faster.
+"""The textbook path tracer (Kajiya 1986; PBRT 4 ed., chapter 14): read it first. `path` computes the same, faster.
 
 With w = -ray.d, the radiance that arrives along a ray from the point that it meets is
 
     L(w) = Le(w) + integral of f(w, w') L(w') |cos theta'| dw'        over the directions w' of the sphere.
 
-One direction, drawn by the bsdf, stands for the integral, so that a path is a loop. Light that a bsdf seldom finds is
-also looked for, by a sample of the lights; each technique gets the share of the power heuristic (Veach 1997).
+One direction, drawn by the bsdf, estimates the integral, so a path is a loop. A light sample also looks for light that
+the bsdf seldom finds; each technique is weighted by the power heuristic (Veach 1997).
 
-It knows no choices, has no care for speed and does not hide emitters, and is the oracle of tests: with the same random
-numbers a sample of `path` is the same to rounding.
+This tracer has no options, is not optimised and does not hide emitters. It is the oracle of tests: with the same random
+numbers it equals a sample of `path` up to rounding.
 """
 
 from __future__ import annotations
@@ -37,10 +37,10 @@ from pathjax.shapes import geometry
 
 
 def radiance(scene: Scene, choice: Choice | None, ray: Ray, numbers: Callable) -> Float[Array, "3"]:
-    """One estimate of the radiance that arrives along a ray, unbiased up to the scene's max_depth.
+    """Return one estimate of the radiance that arrives along a ray, unbiased up to the scene's max_depth.
 
     Args:
-        choice: how lights are chosen, of `emitters.choice`.
+        choice: how lights are chosen, from `emitters.choice`.
         numbers: depth -> Bounce.
     """
     shapes, materials = scene.geometry, scene.materials
@@ -81,10 +81,10 @@ def radiance(scene: Scene, choice: Choice | None, ray: Ray, numbers: Callable) -
         drawn, d = sample(scene, here, u.bsdf)
         throughput, passive = throughput * drawn.weight, passive * drawn.passive
 
-        # Roulette, by the share of light that is left, which refraction does not change: `roulette` says why 3 times.
+        # Roulette, by the share of light that is left, which refraction does not change; `roulette` explains the 3.
         survival = jnp.where(depth >= scene.rr_depth, jnp.clip(3 * jnp.max(throughput) / passive, 0.05, 0.95), 1)
         alive = goes_on & (drawn.pdf > 0) & jnp.any(throughput > 0) & (u.roulette < survival)
-        # What goes straight on comes from where it came from.
+        # A ray that passes straight on keeps its pdf and origin.
         pdf = jnp.where(passes, pdf, jnp.where(drawn.delta, jnp.inf, drawn.pdf))
         origin = jnp.where(passes, origin, here.surface.p)
         ray, medium = spawn_ray(here.surface, d, hit.primitive), leaving(scene, here, medium, d)
@@ -99,7 +99,7 @@ def radiance(scene: Scene, choice: Choice | None, ray: Ray, numbers: Callable) -
 def meet(
     scene: Scene, ray: Ray, medium: Int[Array, ""] | None, throughput: Float[Array, "3"], u: Bounce
 ) -> tuple[Vertex, Float[Array, "3"]]:
-    """The particle or the surface that comes first, and the weight of the way there."""
+    """Return the vertex at the particle or surface that comes first, and the weight of the flight to it."""
     distance = jnp.full_like(ray.t_max, jnp.inf)
     if scene.scatters:
         distance = media.distance(scene.media, medium, ray, throughput, u.flight)
@@ -114,13 +114,13 @@ def meet(
 
 
 def share(pdf: Float[Array, ""], other_pdf: Float[Array, ""]) -> Float[Array, ""]:
-    """Power heuristic for what was drawn with density `pdf` and might have been with `other_pdf`; inf: Dirac's."""
+    """Power heuristic for a sample of density `pdf` that the other technique finds with `other_pdf`; inf: Dirac."""
     return jnp.where(jnp.isinf(pdf), 1, 1 / (1 + (other_pdf / pdf) ** 2))
 
 
 @partial(jax.jit, static_argnames="spp")
 def samples(scene: Scene, spp: int, seed: Number) -> Float[Array, "{spp} height width 3"]:
-    """Samples of an image of a scene without names; their mean is that of `pathjax.render`."""
+    """Return the samples of an image of a scene without names; their mean equals `pathjax.render`."""
     pixels = jnp.arange(film.pixel_count(scene.film), dtype=jnp.int32)
     choice = emitters.choice(scene.emitters, "mis")
 

@@ -1,4 +1,4 @@
-"""Shadow rays where some surfaces let light pass, or media absorb it."""
+"""Shadow rays through surfaces that let light pass and through media that absorb it."""
 
 from __future__ import annotations
 
@@ -19,34 +19,34 @@ from pathjax.shapes import geometry
 
 
 class Passed(NamedTuple):
-    """The one of the surfaces that a shadow ray passes which `Materials.nudged` names."""
+    """The surface selected by `Materials.nudged` among those that a shadow ray passes."""
 
-    count: Int[Array, ""]  # of all of them
+    count: Int[Array, ""]  # of all surfaces passed
     surface: Surface
-    held: Int[Array, "held 2"]  # of `tree.on_the_way`
+    held: Int[Array, "held 2"]  # kinds and rows of `tree.on_the_way`
 
 
 class Dimmed(NamedTuple):
-    """A point of a shadow ray, drawn evenly of all its ways through grids of extinctions."""
+    """A point of a shadow ray, drawn uniformly from all its segments in grids of extinctions."""
 
     medium: Int[Array, ""]
     p: Float[Array, "3"]
-    length: Float[Array, ""]  # of all these ways
+    length: Float[Array, ""]  # of all these segments
     u: Float[Array, ""]  # uniform in [0, 1): chooses among them
 
 
 class Arrival(NamedTuple):
-    """Light at the end of a shadow ray, and what derivatives ask of its way."""
+    """Light at the end of a shadow ray, and the records of its way that derivatives need."""
 
-    light: Float[Array, ""] | Float[Array, "3"]  # share of it that arrives; of a light sample, what is reflected of it
-    passed: Int[Array, ""] | None = None  # vertices that it took to pass surfaces straight; None: nothing lets it pass
-    nudged: Passed | None = None  # None: nothing asks for it
+    light: Float[Array, ""] | Float[Array, "3"]  # share of light that arrives; from `light_sample`: reflected light
+    passed: Int[Array, ""] | None = None  # vertices at surfaces passed straight on; None: no surface lets light pass
+    nudged: Passed | None = None  # None: not needed
     dimmed: Dimmed | None = None  # likewise
 
 
 class _Way(NamedTuple):
-    ray: Ray  # what is left of the shadow ray
-    share: Float[Array, ""] | Float[Array, "3"]  # of light that gets through what lies behind
+    ray: Ray  # the rest of the shadow ray
+    share: Float[Array, ""] | Float[Array, "3"]  # of light that passes the part already traced
     passed: Int[Array, ""]  # surfaces so far
     goes_on: Bool[Array, ""]
     medium: Int[Array, ""] | None
@@ -63,18 +63,18 @@ def transmitted(
     medium: Int[Array, ""] | None = None,
     along: Float[Array, "3"] | None = None,
 ) -> Arrival:
-    """The share of light that a shadow ray finds.
+    """Return the share of light that arrives along a shadow ray.
 
-    It is the probability that paths pass all surfaces on the way: what light samples and bsdf samples find is the same.
-    In a scene with media it is one of each colour.
+    It is the probability that a path passes all surfaces on the way, so light samples and bsdf samples agree.
+    In a scene with media there is one share per channel.
 
     Args:
-        ray: up to the light; of negative length: no share is asked for.
+        ray: up to the light; a negative length skips the ray, and its share is 0.
         target: primitive of the light, which does not shadow itself.
-        most: surfaces that it may pass, unless passes are free.
-        differentiated: go on through what lets nothing pass, if other parameters may change that.
+        most: most surfaces that the ray may pass, unless passes are free.
+        differentiated: continue through surfaces that let nothing pass, if other parameters may change that.
         medium: in which the ray starts; None in scenes without media.
-        along: of `Bounce`.
+        along: `Bounce.along`.
     """
     passes = bsdfs.occurs(scene.materials, "passes")
     nobody = none_passed(scene)
@@ -88,7 +88,7 @@ def transmitted(
         none_dimmed(scene, along),
     )
     if passes:
-        # A line meets no primitive more than twice: rounding that found one again and again comes to an end.
+        # A line meets a primitive at most twice; the limit ends the loop if rounding finds one again and again.
         ever = jnp.int32(2 * scene.geometry.shape.shape[0])
         most = ever if scene.free_passes else jnp.minimum(most, ever)
         beyond = partial(_beyond, scene, target, most, differentiated, along)
@@ -103,7 +103,7 @@ def transmitted(
 
 
 def _beyond(scene, target, most, differentiated, along, way: _Way) -> _Way:
-    """The way beyond the next surface, or its end at the light or at what lets nothing pass."""
+    """Step the ray past the next surface, or end it at the light or at a surface that lets nothing pass."""
     hit = geometry.closest_hit(scene.geometry, way.ray)
     arrives = (hit.primitive < 0) | (hit.primitive == target)
     surface = geometry.surface(scene.geometry, way.ray, hit)
@@ -136,7 +136,7 @@ def _beyond(scene, target, most, differentiated, along, way: _Way) -> _Way:
 
 
 def _flown(scene, way: _Way, distance, along) -> _Way:
-    """The way after so far through its medium."""
+    """Attenuate the light over a distance in the ray's current medium."""
     if way.medium is None:
         return way
     share = way.share * media.transmittance(scene.media, way.medium, way.ray, distance)
@@ -146,7 +146,7 @@ def _flown(scene, way: _Way, distance, along) -> _Way:
 
 
 def _looked_at(scene, seen, medium, ray, distance, u):
-    """What is drawn of the ways so far and of one more."""
+    """Update the drawn point with one more segment (reservoir sampling, reusing one random number)."""
     p, length = media.on_the_way(scene.media, medium, ray, distance, u)
     total = seen.length + length
     mark = seen.u * total
@@ -157,7 +157,7 @@ def _looked_at(scene, seen, medium, ray, distance, u):
 
 
 def none_dimmed(scene: Scene, along: Float[Array, "3"] | None) -> Dimmed | None:
-    """What stands where no shadow ray is; None where no derivative asks for its depth."""
+    """Return the `Dimmed` of no shadow ray; None where no derivative needs the optical depth of shadow rays."""
     if along is None or scene.media.nudges is None or scene.media.nudges.shadow is None:
         return None
     zero = jnp.zeros_like(along)
@@ -165,7 +165,7 @@ def none_dimmed(scene: Scene, along: Float[Array, "3"] | None) -> Dimmed | None:
 
 
 def none_passed(scene: Scene) -> Passed | None:
-    """What stands where no shadow ray is; None where nothing asks for what they pass."""
+    """Return the `Passed` of no shadow ray; None where no derivative needs the surfaces that shadow rays pass."""
     if scene.materials.nudged is None:
         return None
 

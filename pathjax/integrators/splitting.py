@@ -1,8 +1,8 @@
 """Paths that follow both branches of their first dielectrics, one after the other.
 
-Branches that wait are kept with the path: a stack of fixed depth. One that may split k times more lies in entry k. What
-a path leaves behind may split less often than all that waits already, so no entry is needed twice, and the lowest
-that is taken is the youngest.
+Waiting branches are kept with the path in a stack of fixed depth; entry k holds a branch that may split k more times. A
+new branch may split fewer times than any that already waits, so two branches never need the same entry, and the lowest
+occupied entry is the youngest.
 """
 
 from __future__ import annotations
@@ -19,22 +19,23 @@ from pathjax.scene.scene import Scene
 
 
 def start(path, depth: int):
-    """A path that may split `depth` times, depth > 0."""
+    """Return the path with room to split `depth` times, depth > 0."""
     path = path._replace(splits=jnp.int32(depth))
     nothing = jax.tree.map(lambda x: jnp.zeros((depth, *jnp.shape(x)), x.dtype), _branch(path))
     return path._replace(pending=nothing)
 
 
 def takes_place(scene: Scene, here: Vertex, path) -> Bool[Array, ""]:
-    """Whether both branches are followed at a vertex."""
+    """Return whether both branches are followed at a vertex."""
     return bsdfs.has(scene.materials, here.kind, "branches") & (path.splits > 0)
 
 
 def split(scene: Scene, here: Vertex, u: Float[Array, " numbers"], splits: Bool[Array, ""], path, on):
-    """The path behind a vertex, `on`, which has taken one branch there; where it `splits`, the other one waits.
+    """Return the path `on` after a vertex, which took one branch there; where it `splits`, the other branch waits.
 
     Args:
-        u: of `Bounce.bsdf`; path: before the vertex.
+        u: of `Bounce.bsdf`.
+        path: before the vertex.
     """
 
     def with_other(path, on):
@@ -53,7 +54,7 @@ def split(scene: Scene, here: Vertex, u: Float[Array, " numbers"], splits: Bool[
 
 
 def _push(path, branch):
-    """Let a branch, a Path, wait; branch.splits < depth."""
+    """Put a branch, a Path, among the waiting ones; branch.splits < depth."""
 
     def put(entries, new):
         here = jnp.arange(len(entries)) == branch.splits
@@ -63,7 +64,7 @@ def _push(path, branch):
 
 
 def resume(path):
-    """The youngest branch that waits, if the path has ended: alive again, with the radiance that it had gathered."""
+    """Return the youngest waiting branch, with the radiance gathered so far, if the path has ended; else the path."""
     waits = path.pending.alive
     numbers = jnp.arange(len(waits))
     youngest = jnp.min(jnp.where(waits, numbers, len(waits)))
@@ -77,5 +78,5 @@ def resume(path):
 
 
 def _branch(path):
-    """What a branch has of its own; the rest belongs to the whole sample."""
+    """Return the fields that each branch has of its own; the others belong to the whole sample."""
     return path._replace(L=None, moving=None, pending=None)

@@ -1,4 +1,4 @@
-"""One pixel, term by term: what each power of T in L = Le + T Le + T^2 Le + ... adds to it."""
+"""One pixel, term by term: the contribution of each power of T in L = Le + T Le + T^2 Le + ..."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from pathjax.scene.scene import Scene
 
 
 def sums(work: Work, scene: Scene, choice: Choice | None, depth: int, options: Options) -> Float[Array, "{depth} 3"]:
-    """Sums over a pixel's samples, the paths of `pixel.mean`: row k is T^k Le.
+    """Return sums over a pixel's samples, with the paths of `pixel.mean`: row k is T^k Le.
 
-    The sums are plain, so for some thousand samples at most. depth: max_depth of the scene; options: by vertex.
+    The sums are not compensated: use at most a few thousand samples. depth: the scene's max_depth; options: by_vertex.
     """
     rows = jnp.arange(depth)[:, None]
 

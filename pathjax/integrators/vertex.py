@@ -1,4 +1,4 @@
-"""Where a path meets a surface, or a particle of a medium, and what scatters it there."""
+"""Vertices of a path: where it meets a surface or a particle of a medium, and what scatters it there."""
 
 from __future__ import annotations
 
@@ -21,32 +21,32 @@ from pathjax.textures import Pairs
 class Vertex(NamedTuple):
     hit: Hit
     surface: Surface
-    frame: Frame  # around the shading normal; of reflectors, turned towards the ray
+    frame: Frame  # around the shading normal; for reflectors, turned towards the ray
     wi: Float[Array, "3"]  # unit, in the frame, where the ray came from
-    kind: Int[Array, ""]  # of the bsdf; -1: none, which absorbs
+    kind: Int[Array, ""]  # of the bsdf; -1: none, absorbs
     row: Int[Array, ""]
-    # Where bsdfs hold others, of `tree.Leaf`:
+    # Of `tree.Leaf`, where bsdfs hold others:
     weight: Float[Array, ""] | None = None
     turns: tuple[tree.Turn, ...] = ()
     chosen: tuple[tree.Chosen, ...] = ()
-    colors: bsdfs.Colors | None = None  # of the textures of the bsdf; None: there are none
+    colors: bsdfs.Colors | None = None  # of the bsdf's textures; None: there are none
     entries: tuple[Pairs, ...] | None = None  # of these textures; None: none is differentiated
-    medium: Int[Array, ""] | None = None  # that scatters here, or media.NONE: a surface does. None: no medium scatters
+    medium: Int[Array, ""] | None = None  # that scatters here; media.NONE: a surface does. None: no medium scatters
 
     @property
     def scattered(self) -> Bool[Array, ""]:
-        """Whether it lies within a medium."""
+        """Whether a medium scatters here, not a surface."""
         return jnp.bool_(False) if self.medium is None else self.medium != media.NONE
 
 
 def vertex(scene: Scene, ray: Ray, hit: Hit, u: Float[Array, ""] | None = None, differentiated: bool = False) -> Vertex:
-    """What a ray meets at its hit; of a miss, some surface. The scene holds a shape.
+    """Return the vertex at a ray's hit; for a miss, that of an arbitrary surface. The scene holds a shape.
 
-    Reflectors see either side as their front, so their frame is turned towards the ray; glass tells its sides apart.
+    Reflectors treat either side as their front, so their frame is turned towards the ray; glass tells its sides apart.
 
     Args:
-        u: chooses among bsdfs that hold others; None where there are none.
-        differentiated: of `tree.leaf`.
+        u: chooses a leaf of bsdfs that hold others; None where there are none.
+        differentiated: as for `tree.leaf`.
     """
     surface = compute_once(geometry.surface(scene.geometry, ray, hit))
     frame = shading_frame(surface)
@@ -61,11 +61,11 @@ def vertex(scene: Scene, ray: Ray, hit: Hit, u: Float[Array, ""] | None = None, 
 
 
 def within(here: Vertex, ray: Ray, medium: Int[Array, ""], distance: Float[Array, ""]) -> Vertex:
-    """The vertex in a medium, of which no bsdf knows, if the ray meets a particle before its hit and its end.
+    """Return the vertex in a medium, which has no bsdf, if the ray meets a particle before its hit and its end.
 
     Args:
-        here: `vertex` of what it hits up to there.
-        distance: to the particle, of `media.distance`.
+        here: `vertex` of the ray's hit up to that distance; returned otherwise.
+        distance: to the particle, from `media.distance`.
     """
     scattered = (here.hit.primitive < 0) & (distance < ray.t_max)
     distance = jnp.where(scattered, distance, 0)
@@ -91,7 +91,7 @@ def within(here: Vertex, ray: Ray, medium: Int[Array, ""], distance: Float[Array
 def leaving(
     scene: Scene, here: Vertex, medium: Int[Array, ""] | None, d: Float[Array, "3"]
 ) -> Int[Array, ""] | None:
-    """The medium in which light goes on that came in `medium` and leaves a vertex in the direction d.
+    """Return the medium of a ray that arrived in `medium` and leaves a vertex in the direction d.
 
     None in scenes without media.
     """
@@ -101,13 +101,13 @@ def leaving(
 
 
 def is_smooth(scene: Scene, here: Vertex) -> Bool[Array, ""]:
-    """Whether what scatters at a vertex has a density."""
+    """Return whether the bsdf or phase function at a vertex has a density (is not Dirac)."""
     smooth = bsdfs.has(scene.materials, here.kind, "smooth")
     return smooth if here.medium is None else smooth | here.scattered
 
 
 def evaluate(scene: Scene, here: Vertex, d: Float[Array, "3"]) -> tuple[Float[Array, "3"], Float[Array, ""]]:
-    """f |cos theta| and pdf of the bsdf, or the phase function and its density, for light from the unit direction d."""
+    """Return f |cos theta| and pdf of the bsdf (or the phase function and its pdf) for light from unit direction d."""
     wo = to_local(here.frame, d)
 
     def of_surface():
@@ -129,11 +129,11 @@ def _evaluate_bsdf(scene, here, wo, d):
 def sample(
     scene: Scene, here: Vertex, u: Float[Array, " numbers"], other: bool = False
 ) -> tuple[BSDFSample, Float[Array, "3"]]:
-    """A sample of the bsdf, whose weight estimates the integral of f |cos theta|, and its direction in world space.
+    """Sample the bsdf, or in a medium the phase function; also return the direction in world space.
 
-    In a medium it is one of the phase function.
+    The sample's weight estimates the integral of f |cos theta|.
 
-    u: of `random_numbers.Bounce.bsdf`; other: of `bsdfs.sample_other`.
+    u: of `random_numbers.Bounce.bsdf`; other: draw by `bsdfs.sample_other`.
     """
 
     def of_surface():
