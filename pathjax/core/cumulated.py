@@ -1,4 +1,4 @@
-"""Tables from which numbers are drawn by what comes before them."""
+"""Sampling from tables of cumulated probabilities."""
 
 from __future__ import annotations
 
@@ -9,13 +9,16 @@ from jaxtyping import Array, Float, Int
 
 from pathjax.core.math import at
 
-# Tabled probabilities are multiples of this, and random numbers odd multiples of half of it: so what is tabled is what
-# is drawn, exactly.
+# Tabled probabilities are multiples of this, and random numbers odd multiples of half of it, so entries are drawn with
+# exactly the tabled probabilities.
 STEP = 2.0**-23
 
 
 def cumulated(weights: np.ndarray) -> np.ndarray:
-    """(..., N) weights to probabilities (..., N + 1) of what comes before; multiples of STEP, of none but 0 less."""
+    """Turn (..., N) weights into the cumulated probabilities (..., N + 1) before each entry, multiples of STEP.
+
+    Every positive weight gets at least STEP. Where all weights are 0, all entries are equally likely.
+    """
     weights = np.where(weights.any(-1, keepdims=True), weights, 1)
     total, lit = np.cumsum(weights, -1), np.cumsum(weights > 0, -1)
     steps = np.rint(total / total[..., -1:] * (1 / STEP - lit[..., -1:])) + lit
@@ -29,9 +32,9 @@ def search(
     u: Float[Array, ""],
     most: int | None = None,
 ) -> tuple[Int[Array, ""], Float[Array, ""]]:
-    """The last i < count with cdf[first + i] <= u, and where u lies between that and the next, in [0, 1).
+    """Return the last i < count with cdf[first + i] <= u, and the relative position of u up to the next, in [0, 1).
 
-    most: that count may be, where it is traced.
+    most: upper bound of count, if count is traced.
     """
     halvings = max((int(count) if most is None else most) - 1, 0).bit_length()
 

@@ -1,4 +1,4 @@
-"""Vectors, frames and the few functions that must be safe to differentiate."""
+"""Vectors, frames and functions that are safe to differentiate."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, Int, Integer, Real, Shaped
 from pathjax.compile import compute_once
 from pathjax.core.types import Frame, Ray, Surface
 
-# x, y and z, each of one number or of some, as the leaves of hierarchies have them.
+# x, y and z, each a scalar or several lanes, as in the leaves of hierarchies.
 Components = Float[Array, "3 *#lanes"] | Sequence[Float[Array, "*#lanes"]]
 
 
@@ -28,18 +28,20 @@ def cross(a: Components, b: Components) -> Float[Array, "3 *#lanes"]:
 
 
 def smaller(a: Real[Array, "*#shape"], b: Real[Array, "*#shape"] | float) -> Real[Array, "*#shape"]:
-    """One `vmin`; `b` where either is NaN. (`jnp.minimum` spends four instructions on passing NaN on.)"""
+    """Minimum in one `vmin`; `b` where either is NaN. (`jnp.minimum` spends four instructions on propagating NaN.)"""
     return jnp.where(a < b, a, b)
 
 
 def larger(a: Real[Array, "*#shape"], b: Real[Array, "*#shape"] | float) -> Real[Array, "*#shape"]:
-    """One `vmax`; `b` where either is NaN."""
+    """Maximum in one `vmax`; `b` where either is NaN."""
     return jnp.where(a > b, a, b)
 
 
 def at(table: Shaped[Array, "..."], *index: Integer[Array, ""] | int) -> Shaped[Array, "..."]:
-    """`table[index]` for integers known to lie inside: one contiguous load. (Plain indexing, which counts negative
-    indices from the end, and gathers cost a dozen instructions each in the kernel. Unsigned ones are clamped in two.)
+    """Return `table[index]` for indices known to be in range: one contiguous load.
+
+    (Plain indexing, which counts negative indices from the end, and gathers cost a dozen instructions each in the
+    kernel. Clamping an unsigned index takes two.)
     """
     if all(isinstance(i, int) for i in index):
         return table[index]
@@ -50,7 +52,7 @@ def at(table: Shaped[Array, "..."], *index: Integer[Array, ""] | int) -> Shaped[
 
 
 def integer_like(dtype: np.dtype) -> type[np.signedinteger]:
-    """The integers as wide as a float type."""
+    """Return the integer type as wide as a float type."""
     return np.int64 if dtype == np.float64 else np.int32
 
 
@@ -74,12 +76,12 @@ def normalize(v: Float[Array, "3"]) -> Float[Array, "3"]:
 
 
 def rescale(v: Float[Array, "3"]) -> Float[Array, "3"]:
-    """v over its largest component: neither squares nor products of the result overflow or underflow."""
+    """Return v over its largest component, so that squares and products of it neither overflow nor underflow."""
     largest = jnp.max(jnp.abs(v))
     return v / lax.stop_gradient(jnp.where(largest > 0, largest, 1))
 
 
-# Taylor's series on short ranges, to rounding: a few multiply-adds where the general functions are calls to a library.
+# Taylor series on short ranges, exact to rounding: a few multiply-adds, where the general functions are library calls.
 
 
 def _series(x: Float[Array, ""], coefficients: Sequence[float]) -> Float[Array, ""]:
@@ -126,7 +128,7 @@ def safe_atan2(y: Float[Array, ""], x: Float[Array, ""]) -> Float[Array, ""]:
 
 
 def turns(y: Float[Array, ""], x: Float[Array, ""]) -> Float[Array, ""]:
-    """Angle of the point x, y from the x axis, in turns: 0 to 1; 0, with derivatives 0, at the origin."""
+    """Angle of the point (x, y) from the x axis, in turns from 0 to 1; value and derivatives 0 at the origin."""
     angle = safe_atan2(y, x) / (2 * math.pi)
     return jnp.where(angle < 0, angle + 1, angle)
 
@@ -166,14 +168,14 @@ def to_world(frame: Frame, v: Float[Array, "3"]) -> Float[Array, "3"]:
 
 
 def offset_point(surface: Surface, d: Float[Array, "3"]) -> Float[Array, "3"]:
-    """Point of the surface moved to that side of it that `d` points to, clear of its rounding error.
+    """Return the point moved to the side of the surface that `d` points to, by the bound of its rounding error.
 
-    The bound is relative to the coordinates that made the point (PBRT, "Managing rounding error"), so a scene may have
-    any size and lie anywhere. The primitive itself is excluded by number, so sheets thinner than this stay solid.
+    The bound is relative to the coordinates that the point was computed from (PBRT, "Managing rounding error"), so a
+    scene may have any size and position. The primitive itself is excluded by index, so thinner sheets stay solid.
     """
     return surface.p + surface.n * jnp.copysign(surface.margin, dot(surface.n, d))
 
 
 def spawn_ray(surface: Surface, d: Float[Array, "3"], primitive: Int[Array, ""]) -> Ray:
-    """Ray leaving `primitive` at `surface` in the unit direction d."""
+    """Return the ray that leaves `primitive` at `surface` in the unit direction d."""
     return Ray(offset_point(surface, d), d, jnp.full_like(surface.margin, jnp.inf), primitive)

@@ -2,9 +2,9 @@
 
 The points of a pixel's paths are a rank-1 lattice in many dimensions at once, ordered by the radical inverse so that
 the first 2^m of them are a lattice for every m, and moved as a whole by a random shift (Dick, Kuo and Sloan 2013, Acta
-Numerica 22). So every number is uniform and the estimate unbiased, and what a path decides at several vertices is
-stratified jointly, which padded pairs of a Sobol' sequence are not. Choices are hashed. Every pixel and every seed is
-an independent randomisation. POINTS holds what classic path tracers use instead, for comparison.
+Numerica 22). So every number is uniform and the estimate unbiased, and the numbers of several vertices are stratified
+jointly, which padded pairs of a Sobol' sequence are not. The numbers for other choices are hashed. Every pixel and
+every seed is an independent randomisation. POINTS also holds the points of classic path tracers, for comparison.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from pathjax.core.types import Number
 # Generating vector of an extensible lattice sequence for a path tracer, up to 2^20 points. Rows are the four dimensions
 # of a vertex: film and lens, then light sample and bsdf sample. The light sample of a vertex is never multiplied with
 # another's, nor with the bsdf samples of its own and later vertices; so each pair was chosen, component by component
-# (Dick, Kuo and Sloan), for the least shift-averaged error of the terms that hold it: film, lens, bsdf samples of the
-# vertices before, and one light or bsdf sample. A dimension weighs 0.3, and 0.7 as much at each further vertex. The
+# (Dick, Kuo and Sloan), to minimise the shift-averaged error of the terms that contain it: film, lens, bsdf samples of
+# the vertices before, and one light or bsdf sample. A dimension weighs 0.3, and 0.7 as much at each further vertex. The
 # lowest twelve bits serve 2^3 to 2^12 points together, each further bit twice as many. Some sixty vectors of nearly the
 # least error, by several weights, were tried on four scenes; this is among the best, and did as well on six others.
-# Deeper vertices use the rows again, under other shifts: still unbiased.
+# Deeper vertices reuse the rows under other shifts, which is still unbiased.
 _GENERATORS = np.array(
     [
         [1, 273965, 177595, 892119], [574107, 988125, 412389, 873177], [1006923, 598441, 1007947, 797155],
@@ -46,7 +46,7 @@ def _u32(x: Integer[Array, "*shape"] | int) -> UInt[Array, "*shape"]:
 
 
 def hash_u32(x: Integer[Array, "*shape"] | int) -> UInt[Array, "*shape"]:
-    """Avalanche of 32 bits (Wellons' lowbias32)."""
+    """Hash 32 bits with full avalanche (Wellons' lowbias32)."""
     bits = _u32(x)
     bits = (bits ^ (bits >> 16)) * jnp.uint32(0x21F0AAAD)
     bits = (bits ^ (bits >> 15)) * jnp.uint32(0xD35A2D97)
@@ -56,12 +56,12 @@ def hash_u32(x: Integer[Array, "*shape"] | int) -> UInt[Array, "*shape"]:
 def combine(
     a: Integer[Array, "*#shape"] | int, b: Integer[Array, "*#shape"] | int
 ) -> UInt[Array, "*#shape"]:
-    """Hash of an ordered pair of 32-bit numbers."""
+    """Hash an ordered pair of 32-bit numbers."""
     return hash_u32(_u32(a) * jnp.uint32(0x9E3779B9) ^ hash_u32(_u32(b) + jnp.uint32(0x85EBCA6B)))
 
 
 def to_unit(x: UInt[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """float32: the odd multiple of 2^-24 in the middle of one of 2^23 equal intervals, so never 0 or 1."""
+    """Map 32 bits to float32: the middle of one of 2^23 equal intervals, an odd multiple of 2^-24, so never 0 or 1."""
     return (x >> 9).astype(jnp.float32) * jnp.float32(2**-23) + jnp.float32(2**-24)
 
 
@@ -72,27 +72,27 @@ def reverse_bits(x: Word) -> Word:
 
 
 def lattice_point(stream: Word, sample: Word, vertex: Number) -> Float[Array, "4"]:
-    """Dimensions of one vertex of one path, float32.
+    """Return the four dimensions of one vertex of one path, float32.
 
     Args:
-        stream: of `pixel_stream`.
-        sample: number of the sample.
-        vertex: which four dimensions.
+        stream: from `pixel_stream`.
+        sample: index of the sample.
+        vertex: index of the vertex, which selects the dimensions.
     """
     vertex = _u32(vertex)
     generators = at(jnp.asarray(_GENERATORS), vertex % len(_GENERATORS))
-    place = compute_once(reverse_bits(_u32(sample)))  # which all four share
+    place = compute_once(reverse_bits(_u32(sample)))  # shared by all four
     return to_unit(place * generators + _hashes(stream, vertex * DIMENSIONS, DIMENSIONS))
 
 
 def independent_point(stream: Word, sample: Word, vertex: Number) -> Float[Array, "4"]:
-    """Numbers like those of `lattice_point`, but independent of each other."""
+    """Return numbers like those of `lattice_point`, but independent of each other."""
     return to_unit(_point_hashes(stream, sample, vertex))
 
 
 def subpixel_point(stream: Word, sample: Word, vertex: Number) -> Float[Array, "4"]:
-    """Independent numbers, but of four samples in a row each has the film position, the first pair of vertex 0, in its
-    own quarter of the unit square, as in smallpt (Beason 2008)."""
+    """Return independent numbers, but four consecutive samples have their film positions, the first pair of vertex 0,
+    in different quarters of the unit square, as in smallpt (Beason 2008)."""
     bits, sample = _point_hashes(stream, sample, vertex), _u32(sample)
     quarter = jnp.stack([sample & 1, (sample >> 1) & 1]) << 31
     first = jnp.where(_u32(vertex) == 0, quarter | (bits[:2] >> 1), bits[:2])
@@ -108,17 +108,17 @@ SUBPIXELS = 4
 
 
 def pixel_stream(seed: Number, pixel: Number) -> Word:
-    """The stream of one pixel; different for every seed and pixel."""
+    """Return the stream of one pixel; different for every seed and pixel."""
     return combine(pixel, hash_u32(_u32(seed)))
 
 
 def path_key(stream: Word, sample: Word) -> Word:
-    """What `hashed` hashes for one sample."""
+    """Return the key of one sample for `hashed`."""
     return combine(stream ^ jnp.uint32(0x5BF03635), _u32(sample))
 
 
 def hashed(key: Word, dimension: Number, count: int) -> Float[Array, " {count}"]:
-    """Independent numbers for dimensions dimension, ..., dimension + count - 1 of a path."""
+    """Return independent numbers for the dimensions dimension, ..., dimension + count - 1 of a path."""
     return to_unit(_hashes(key, dimension, count))
 
 

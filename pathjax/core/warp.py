@@ -1,4 +1,4 @@
-"""Uniform numbers to points and directions, each beside its density."""
+"""Maps from uniform numbers to points and directions, each beside its density."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from pathjax.core.math import cos_sin_octant, cos_sin_turns, safe_divide, safe_s
 
 
 def chosen(u: Float[Array, " numbers"], chance: Float[Array, ""]) -> tuple[Bool[Array, ""], Float[Array, " numbers"]]:
-    """Whether the first of two is chosen, by u[0], and u with a number in place of u[0] that is uniform in either case.
+    """Choose between two by u[0]; return whether the first is chosen, and u with u[0] rescaled to be uniform again.
 
-    chance: of the first one. What is unlikely gets few digits.
+    chance: probability of the first. After an unlikely choice the rescaled number has few digits.
     """
     first = u[0] < chance
     rest = safe_divide(u[0] - jnp.where(first, 0, chance), jnp.where(first, chance, 1 - chance))
@@ -32,18 +32,18 @@ def square_to_disk(u: Float[Array, "2"]) -> Float[Array, "2"]:
 
 
 def square_to_cosine_hemisphere(u: Float[Array, "2"]) -> Float[Array, "3"]:
-    """Unit directions, z >= 0."""
+    """Map to unit directions with z >= 0, cosine-weighted."""
     p = square_to_disk(u)
     return jnp.stack([p[0], p[1], safe_sqrt(1 - p[0] * p[0] - p[1] * p[1])])
 
 
 def square_to_cosine_hemisphere_pdf(w: Float[Array, "3"]) -> Float[Array, ""]:
-    """1/sr."""
+    """Density in 1/sr."""
     return jnp.maximum(w[2], 0) / math.pi
 
 
 def square_to_sphere(u: Float[Array, "2"]) -> Float[Array, "3"]:
-    """Unit directions, density SPHERE_PDF in 1/sr."""
+    """Map to unit directions, density SPHERE_PDF in 1/sr."""
     z = 1 - 2 * u[1]
     r = safe_sqrt(1 - z * z)
     cos, sin = cos_sin_turns(u[0])
@@ -54,9 +54,9 @@ SPHERE_PDF = 1 / (4 * math.pi)
 
 
 def square_to_cone(u: Float[Array, "2"], one_minus_cos: Float[Array, ""]) -> Float[Array, "3"]:
-    """Uniform unit directions around +z up to the angle whose 1 - cos is given.
+    """Map to uniform unit directions around +z, up to the angle whose 1 - cos is given.
 
-    1 - cos instead of cos, so that a small distant light keeps its digits.
+    The argument is 1 - cos instead of cos, so that a small distant light keeps its digits.
     """
     h = u[0] * one_minus_cos
     r = safe_sqrt(h * (2 - h))
@@ -65,12 +65,12 @@ def square_to_cone(u: Float[Array, "2"], one_minus_cos: Float[Array, ""]) -> Flo
 
 
 def cone_pdf(one_minus_cos: Float[Array, ""]) -> Float[Array, ""]:
-    """1/sr inside the cone."""
+    """Density in 1/sr inside the cone."""
     return 1 / ((2 * math.pi) * one_minus_cos)
 
 
 def square_to_triangle(u: Float[Array, "2"]) -> Float[Array, "2"]:
-    """Barycentric (b1, b2) of a uniform point (Heitz 2019, "A low-distortion map"), density 1/area."""
+    """Map to barycentric (b1, b2) of a uniform point (Heitz 2019, "A low-distortion map"), density 1/area."""
     x, y = u[0], u[1]
     above = y > x
     b1 = jnp.where(above, x / 2, x - y / 2)
@@ -79,7 +79,7 @@ def square_to_triangle(u: Float[Array, "2"]) -> Float[Array, "2"]:
 
 
 def tent(u: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """[0, 1) -> [-1, 1], density 1 - |x|."""
+    """Map [0, 1) to [-1, 1], density 1 - |x|."""
     low = u < 0.5
     return jnp.where(low, safe_sqrt(2 * u) - 1, 1 - safe_sqrt(2 - 2 * u))
 
