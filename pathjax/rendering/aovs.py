@@ -1,4 +1,4 @@
-"""Arbitrary output variables: what the camera sees first, for denoisers and for compositing."""
+"""Arbitrary output variables of the camera's first hit, for denoisers and compositing."""
 
 from __future__ import annotations
 
@@ -21,26 +21,26 @@ from pathjax.sensors import film
 
 NAMES = aov.FirstHit._fields
 MAX_SPP = 16
-# Pixels in one call of the kernel, whose memory they bound.
+# Pixels in one call of the kernel, which bounds its memory.
 CHUNK_PIXELS = 1 << 14
 
 
 @by_all
 @usual_promotion
 def render_aovs(scene: Scene, names: Sequence[str], spp: int = MAX_SPP, seed: int = 0) -> dict[str, np.ndarray]:
-    """Return images of what the camera sees first, as Mitsuba's `aov` integrator does.
+    """Return images of the camera's first hit, as Mitsuba's `aov` integrator does.
 
-    Each is the mean over the film positions of the first min(spp, 16) samples that `render_until` takes for this seed,
-    through the film's filter.
+    Each is the mean over the film positions of the first min(spp, 16) samples of `render_until` with this seed, through
+    the film's filter.
 
     Args:
         names: "depth" (1 channel), the distance along the ray from the near clip plane; "normal" (3), the shading
-            normal in world space; "albedo" (3), the share of light that a reflector sends back, textures and Fresnel's
-            terms included, and 1 for glass and where light goes straight on.
+            normal in world space; "albedo" (3), the share of light that a reflector scatters, including textures and
+            Fresnel terms, and 1 for glass and where light passes straight on.
         spp: samples per pixel, of which at most 16 are used.
-        seed: of `render_until`.
+        seed: as for `render_until`.
     Returns:
-        name -> (H, W, channels) float32; 0 where nothing is seen.
+        name -> (H, W, channels) float32; 0 for misses.
     Raises:
         InputError: a name is unknown or repeated; spp or seed is out of range.
     """
@@ -68,7 +68,7 @@ def render_aovs(scene: Scene, names: Sequence[str], spp: int = MAX_SPP, seed: in
 
 
 def check_names(names: Sequence[str], known: Sequence[str]) -> None:
-    """Refuse what is no list, not known, or named twice."""
+    """Refuse names that are not a list, and unknown or repeated names."""
     if isinstance(names, str):
         raise InputError(f"names is a list of output variables; write [{names!r}]")
     for i, name in enumerate(names):

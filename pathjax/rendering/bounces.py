@@ -1,4 +1,4 @@
-"""The Neumann series, term by term: L = Le + T Le + T^2 Le + ..., an image of each term from the same paths."""
+"""Render the Neumann series L = Le + T Le + T^2 Le + ..., an image of each term from the same paths."""
 
 from __future__ import annotations
 
@@ -25,41 +25,41 @@ from pathjax.scene.alike import by_all
 from pathjax.scene.scene import Scene
 from pathjax.sensors import film
 
-# Every term is three more numbers that each path of the kernel keeps.
+# Every term adds three scalars to the state of each lane.
 MOST_TERMS = 64
-# Samples of a replicate that are summed up plainly: float32 keeps 5 digits even where all are equal.
+# Samples of a replicate in one uncompensated sum: float32 keeps 5 digits even where all samples are equal.
 _PORTION = 1 << 12
-# What `pilot` renders: enough that the light of a scene is spread evenly by the last terms.
+# Size of the `pilot`: enough terms that the last ones are spread evenly over the scene.
 PILOT_TERMS, PILOT_PIXELS, PILOT_SPP = 12, 1 << 12, 64
 
 
 @register_dataclass
 @dataclass(frozen=True, eq=False)
 class Bounces:
-    """Terms of the series: `terms[k]` is T^k Le, light that was reflected or refracted k times."""
+    """Terms of the series: `terms[k]` is T^k Le, the light reflected or refracted k times."""
 
     terms: jax.Array  # (depth, H, W, 3) linear RGB
     deviation: jax.Array  # (depth, H, W, 3) root of `variance`; float32 may not hold the variance itself
-    samples: jax.Array  # (H, W) int32 of each pixel, from which the standard error is made
-    correlation: jax.Array | np.ndarray  # (S, S) of the noise of pixels around one with its own, `film.correlation`
+    samples: jax.Array  # (H, W) int32 samples per pixel, for the standard error
+    correlation: jax.Array | np.ndarray  # (S, S) of a pixel's noise with that of those around it, `film.correlation`
 
     @property
     def variance(self) -> jax.Array:
-        """(depth, H, W, 3) unbiased estimate of that of `terms`, 3 degrees of freedom; nan below 2 spp."""
+        """(depth, H, W, 3) unbiased estimate of the variance of `terms`, 3 degrees of freedom; nan below 2 spp."""
         return self.deviation**2
 
     @property
     def standard_error(self) -> np.ndarray:
-        """(depth, H, W, 3), pooled over 3 x 3 pixels as that of `render_until`."""
+        """(depth, H, W, 3), pooled over 3 x 3 pixels as in `render_until`."""
         images, variances = np.asarray(self.terms), np.asarray(self.deviation, float) ** 2
         count = np.asarray(self.samples)
         return np.stack([error_estimate.standard_error(*term, count) for term in zip(images, variances, strict=True)])
 
     def tail(self) -> tail.Tail:
-        """How much light there is beyond these terms, in the mean over the pixels that are finite.
+        """Estimate the light beyond these terms, in the mean over the finite pixels.
 
         Raises:
-            InputError: fewer than 3 terms, or no such pixel.
+            InputError: fewer than 3 terms, or no finite pixel.
         """
         means, deviation = (np.asarray(x, float).reshape(len(x), -1, 3) for x in (self.terms, self.deviation))
         known = np.isfinite(means).all((0, 2))
@@ -82,23 +82,23 @@ def render_bounces(
 ) -> Bounces:
     """Render an image of each of the first `depth` terms of L = Le + T Le + T^2 Le + ..., from the same paths.
 
-    Their sum is, to rounding, the image with max_depth = depth that `render_until(scene, spp=spp, seed=seed)` gives:
-    the mean of four replicates, whose spread tells the standard errors. With `errors=False` there is one sequence and
-    no standard error, and the sum is that of `render(scene, spp, seed)`. Either costs about as much as `render`. The
-    scene's own max_depth is disregarded.
+    Their sum equals, up to rounding, the image of `render_until(scene, spp=spp, seed=seed)` with max_depth = depth: the
+    mean of four replicates, whose spread gives the standard errors. With `errors=False` there is one sequence and no
+    standard error, and the sum equals `render(scene, spp, seed)`. Either costs about as much as `render`. The scene's
+    own max_depth is ignored.
 
     Pure. It may be called inside `jax.jit` and under `jax.vmap`, and `terms` may be differentiated in named
     reflectances, radiances and other colours, forwards or backwards. `deviation` and `variance` have no derivative.
 
     Args:
-        depth: how many terms, 1 to 64; 1 is emission alone. Static.
+        depth: number of terms, 1 to 64; 1 is emission alone. Static.
         spp: samples per pixel; or `samples` of a `RenderResult`, whose image is then the sum.
-        seed: of `render`.
-        strategy: of `render`.
+        seed: as for `render`.
+        strategy: as for `render`.
         errors: whether to estimate the variance.
     Raises:
         InputError: depth, spp or seed out of range, unknown strategy; differentiation in the IOR of glass or in
-            anything but named parameters.
+            anything other than named parameters.
     """
     _check_depth(depth)
     options = Options(strategy, shared=scene.film.shared)
@@ -128,7 +128,7 @@ def _check_depth(depth) -> None:
 
 
 def _bounces(scene, depth, pixels, samples, seed, options, errors) -> Bounces:
-    """samples: (H, W); pixels: as many, or all of a film that shares samples."""
+    """Render the terms. samples: (H, W); pixels: as many, or all of a film that shares samples."""
     shares = _shares(samples) if errors else samples.reshape(1, -1)
     seeds = replicates.seeds(seed) if errors else jnp.asarray(seed, jnp.uint32)[None]
     most = None if is_traced(shares) else int(np.asarray(shares).max())
@@ -152,12 +152,15 @@ def _shares(samples):
 
 @partial(jax.jit, static_argnames="shape")
 def _moments(sums, shares, *, shape):
-    """Means and deviations (depth, H, W, 3), of sums (R, N, depth, 3) of (R, N) samples; see `replicates.moments`."""
-    sums, shares = list(sums), [x[:, None, None].astype(sums.dtype) for x in shares]  # a loop over them vectorises
+    """Return means and deviations (depth, H, W, 3) of sums (R, N, depth, 3) over (R, N) samples.
+
+    See `replicates.moments`.
+    """
+    sums, shares = list(sums), [x[:, None, None].astype(sums.dtype) for x in shares]  # a loop over lists vectorises
     count = jnp.maximum(sum(shares), 1)
     mean = sum(sums) / count
     apart = [lax.stop_gradient(x / jnp.maximum(n, 1) - mean) for x, n in zip(sums, shares, strict=True)]
-    # As in a norm: squares of radiances leave the range of float32.
+    # Scaled, as in a norm: squares of radiances leave the range of float32.
     largest = reduce(jnp.maximum, map(jnp.abs, apart))
     scale = jnp.where(largest > 0, largest, 1)
     spread = sum(n * (x / scale) ** 2 for x, n in zip(apart, shares, strict=True)) / count
@@ -169,7 +172,7 @@ def _moments(sums, shares, *, shape):
 
 @dataclass(frozen=True)
 class _TermSums:
-    """(R, N, depth, 3) sums of pixels (N,); spp: (R, N) of each replicate, whose seeds (R,) are given."""
+    """Estimator of the sums (R, N, depth, 3) of pixels (N,). spp: (R, N) per replicate, seeds: (R,)."""
 
     depth: int
     options: Options
@@ -197,7 +200,7 @@ class _TermSums:
 
 @partial(jax.jit, static_argnames=("depth", "options", "colors"))
 def _kernel(scene, pixels, first_sample, spp, seeds, *, depth, options: Options, colors: tangents.Places = ()):
-    """Sums (R, N, depth, 3), and derivatives (R, N, T, depth, 3) in some colours."""
+    """Return sums (R, N, depth, 3), and derivatives (R, N, T, depth, 3) in T colours."""
     choice = emitters.choice(scene.emitters, options.strategy)
 
     def one_pixel(work, scene, choice, unit_tangents):
@@ -214,5 +217,5 @@ def _kernel(scene, pixels, first_sample, spp, seeds, *, depth, options: Options,
     shared = scene, choice, tangents.unit_tangents(scene, colors)
     results = map_pixels(one_pixel, work, *shared, options=options, means=False)
     results = (x.reshape(*spp.shape, *x.shape[1:]) for x in results)
-    # A film that shares samples gives means.
+    # A film that shares samples returns means.
     return tuple(x * spp.reshape(*spp.shape, *[1] * (x.ndim - 2)) if options.shared else x for x in results)

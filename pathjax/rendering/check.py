@@ -1,4 +1,4 @@
-"""Is a derivative right? What is claimed to be one, against differences of rendered images."""
+"""Test a claimed derivative against differences of rendered images."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ from pathjax.scene.scene import Scene
 Render = Callable[[np.ndarray, int], ArrayLike]
 Derivative = Callable[[np.ndarray, np.ndarray, int], ArrayLike]
 
-# Chance that a right derivative is called wrong.
+# Probability that a correct derivative is rejected.
 FALSE_ALARM = 1e-3
-# Reach of the differences, relative to the value, or to the range between two bounds ...
+# Reach of the differences, relative to the range between two bounds, or to the value where there is no finite range ...
 _REACH = 0.1
-# ... but no further than half the value, since what a roughness does changes with its logarithm, and no less than this
-# part of the range, which float32 resolves.
+# ... but within a range no more than half the value, since the effect of a roughness varies with its logarithm, and no
+# less than this part of the range, which float32 resolves.
 _OF_VALUE, _LEAST = 0.5, 1e-3
 
 
@@ -38,15 +38,15 @@ _OF_VALUE, _LEAST = 0.5, 1e-3
 class GradientCheck:
     """Derivative minus differences, over blocks of pixels, in standard errors."""
 
-    z: np.ndarray  # (h, w, channels), by block; where the derivative is right, Student's t of this freedom:
-    freedom: int
+    z: np.ndarray  # (h, w, channels), per block; if the derivative is right, Student's t
+    freedom: int  # degrees of freedom of t
     p_value: float  # of the largest |z|, over all blocks (Sidak); 0 where anything is not finite
     passed: bool  # p_value is above the false alarm rate
-    # Relative error of the derivative, the same everywhere, that is found in half of all checks; inf: nothing would be,
+    # Relative error of the derivative, the same everywhere, that half of all checks detect; inf: no error is detected,
     # since no image changes.
     resolution: float
-    direction: np.ndarray  # v, of theta's shape: what the derivative is along
-    derivative: np.ndarray  # (H, W, channels) as it is claimed, mean over the seeds
+    direction: np.ndarray  # v, of theta's shape: direction of the derivative
+    derivative: np.ndarray  # (H, W, channels) as claimed, mean over the seeds
     difference: np.ndarray  # (H, W, channels)
 
     @property
@@ -99,32 +99,32 @@ def check_gradient(
 ) -> GradientCheck:
     """Test the derivative of an image in one parameter, of this renderer or of any other.
 
-    It is compared with differences of images at other values of the parameter, which share its random numbers, block by
+    It is compared with differences of images at other values of the parameter, which share its random numbers, per
     block of pixels: over independent seeds, the mean of derivative minus difference must be 0 within its standard
-    error. Of a colour, a texture, or any array of numbers, all move at once, along a random direction v whose entries
+    error. All entries of a colour, a texture or any other array move at once, along a random direction v whose entries
     are between 1/2 and 1, or their negatives where the bounds leave no room.
 
-    Differences are those of polynomials through five values around the present one; for the IOR of smooth glass of two,
-    at the step that `jacobian` chose, so that both have the same bias.
+    Differences are those of polynomials through five values around the present one; for the IOR of smooth glass through
+    two, at the step that `jacobian` chose, so that both have the same bias.
 
     Args:
         of: a scene; or a function (theta, seed) -> image (H, W, channels).
-        at: the name of a parameter of the scene, as `parameters` lists them; or theta, a number or an array.
-        spp: samples per pixel of each image, of a scene.
-        seed: of the first comparison.
-        derivative: of such a function, what is to be tested: (theta, v, seed) -> derivative of the image along v, that
-            of a number being along v = 1. It need not share random numbers with the image, but finds more if it does.
-        bounds: of each entry of such a theta; None: any number.
-        reach: how far the five values of such a theta lie apart in all; None: a tenth of the value, or of the range, if
-            that is finite.
+        at: the name of a parameter of the scene, as `parameters` lists them; or theta, a scalar or an array.
+        spp: samples per pixel of each image, for a scene.
+        seed: seed of the first comparison.
+        derivative: for a function, the derivative to be tested: (theta, v, seed) -> derivative of the image along v;
+            for a scalar v = 1. It need not share random numbers with the image, but the test detects more if it does.
+        bounds: for a function, bounds of each entry of theta; None: unbounded.
+        reach: for a function, distance from the first to the last of the five values; None: a tenth of the value, or of
+            the range, if that is finite.
         seeds: number of independent comparisons, at least 3.
         block: side of the blocks of pixels over which derivatives are averaged.
-        false_alarm: chance that a right derivative does not pass, in (0, 1). Means over blocks are taken to be normally
+        false_alarm: probability that a correct derivative fails, in (0, 1), if means over blocks are normally
             distributed.
     Returns:
         GradientCheck.
     Raises:
-        InputError: an unknown name; a number out of its range; an image of another shape; bounds that leave no room.
+        InputError: an unknown name; a value out of its range; an image of another shape; bounds that leave no room.
     """
     if seeds < 3:
         raise InputError(f"seeds = {seeds}; at least 3 are needed to estimate their scatter")
@@ -153,7 +153,7 @@ def check_gradient(
 
 
 def _of_scene(scene, name, spp):
-    """Render, derivative, value and bounds of a parameter; and nodes, or None for those that fit the value."""
+    """Return Render, Derivative, value and bounds of a parameter; and nodes, or None to choose them from the value."""
     parameter = named.find(scene, name)
     value = named.parameters(scene)[name]
 
@@ -181,7 +181,7 @@ def _image(x):
 
 
 def _direction(theta, bounds, reach):
-    """v, of the shape of theta, and (5,) nodes x, so that all theta + x v lie within the bounds."""
+    """Return v, of the shape of theta, and (5,) nodes x, such that all theta + x v lie within the bounds."""
     low, high = bounds
     if not theta.size:
         raise InputError("theta holds no number, so no image can change with it")
@@ -209,18 +209,18 @@ def _direction(theta, bounds, reach):
 
 
 def _weights(nodes):
-    """Weights of values at the nodes whose sum is the derivative at 0, exact for polynomials."""
+    """Return the weights of values at the nodes whose weighted sum is the derivative at 0, exact for polynomials."""
     powers = np.arange(len(nodes))
     return np.linalg.solve(nodes[None] ** powers[:, None], (powers == 1).astype(float))
 
 
 def _compared(direction, derivatives, differences, largest, block, false_alarm):
-    """derivatives, differences: (seeds, H, W, channels); largest: quotient of a difference, whose rounding is known."""
+    """Compare derivatives and differences (seeds, H, W, channels); eps * largest is a difference's rounding error."""
     seeds = len(derivatives)
-    derivatives = np.where(np.isfinite(derivatives), derivatives, np.nan)  # without differences of infinities
+    derivatives = np.where(np.isfinite(derivatives), derivatives, np.nan)  # avoids differences of infinities
     gap, slope = _blocks(derivatives - differences, block), _blocks(differences, block).mean(0)
     size = _blocks(np.abs(derivatives) + np.abs(differences), block).mean(0)
-    # What rounding leaves where both agree to the last bits.
+    # Rounding error, where both agree to the last bits.
     floor = np.finfo(np.float32).eps * (size + largest)
     error = np.sqrt(gap.var(0, ddof=1) / seeds + floor**2 + np.finfo(float).tiny)
     z = gap.mean(0) / error
@@ -235,7 +235,7 @@ def _compared(direction, derivatives, differences, largest, block, false_alarm):
 
 
 def _blocks(images, side):
-    """(K, H, W, C) to means over blocks (K, h, w, C); what is left over at the borders is not looked at."""
+    """Average (K, H, W, C) over blocks, to (K, h, w, C); incomplete blocks at the borders are ignored."""
     count, height, width, channels = images.shape
     side = min(side, height, width)
     h, w = height // side, width // side

@@ -1,4 +1,4 @@
-"""Ray queries on a scene, many rays at a time; inside of jit, vmap and loops too."""
+"""Ray queries on a scene, many rays at a time; also inside jit, vmap and loops."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ Vectors = Real[Array | np.ndarray, "N 3"]
 @by_all
 @usual_promotion
 def closest_hit(scene: Scene, origins: Vectors, directions: Vectors) -> Hit:
-    """Return the first primitive that each ray meets; directions are of any positive length.
+    """Return the first primitive that each ray meets; directions may have any positive length.
 
     Returns:
         Hit of arrays (N,). `t` is the distance, inf where the ray meets nothing; `primitive` and `shape` are then -1.
-        `shape` counts the shapes of the file; `primitive` counts spheres, rectangles (six of each cube), disks and
-        triangles, in this order.
+        `shape` counts the shapes of the file; `primitive` counts spheres, rectangles (six of each cube), disks,
+        triangles, cylinders and ellipsoids, in this order.
     Raises:
         InputError: origins and directions do not have one shape (N, 3).
     """
@@ -41,13 +41,13 @@ def closest_hit(scene: Scene, origins: Vectors, directions: Vectors) -> Hit:
 def any_hit(
     scene: Scene, origins: Vectors, directions: Vectors, distances: Real[ArrayLike, "..."] = jnp.inf
 ) -> Bool[Array, " N"]:
-    """Return whether each ray meets anything before a distance: cheaper than to ask for the first of what it meets.
+    """Return whether each ray meets anything before a distance; cheaper than `closest_hit`.
 
     Args:
         directions: of any positive length.
         distances: (N,) or one for all, in units of the scene, whatever the length of the directions; inf: no limit.
     Raises:
-        InputError: origins and directions do not have one shape (N, 3), or there is another number of distances.
+        InputError: origins and directions do not have one shape (N, 3), or distances are neither one nor N.
     """
     origins, directions = _rays(scene, origins, directions)
     if np.shape(distances) not in ((), origins.shape[:1]):
@@ -57,7 +57,7 @@ def any_hit(
 
 
 def _rays(scene: Scene, origins: Vectors, directions: Vectors) -> tuple[Float[Array, "N 3"], Float[Array, "N 3"]]:
-    """Both as arrays of the scene's dtype. Kernels clamp indices, and would make vectors of whatever is there."""
+    """Return both as arrays of the scene's dtype. Checked here, since kernels clamp indices and accept any shape."""
     shapes = np.shape(origins), np.shape(directions)
     if shapes[0] != shapes[1] or shapes[0][1:] != (3,):
         raise InputError(f"origins and directions have the shapes {shapes[0]} and {shapes[1]}; both must be (N, 3)")

@@ -1,4 +1,4 @@
-"""From a scene to an image."""
+"""Render a scene to an image."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from pathjax.scene.alike import by_all
 from pathjax.scene.scene import Scene
 from pathjax.sensors import film
 
-# Derivatives in so many colours at once may be differentiated again; more would cost a tangent of the kernel each.
+# Derivatives in at most this many colours at once can be differentiated again; each costs a tangent of the kernel.
 MOST_TWICE = 8
 
 
@@ -42,14 +42,14 @@ def render(
 ) -> Float[Array, "height width 3"]:
     """Render a scene: linear RGB, unbiased up to the scene's max_depth (except with `fresnel="schlick"`).
 
-    Through a filter wider than a pixel, samples count in all pixels under it, and images are ratios of sums
-    (`integrators.reconstruction`): their bias is O(1/spp) of what light varies within a pixel.
+    With a filter wider than a pixel, samples count in all pixels under it, and images are ratios of sums
+    (`integrators.reconstruction`): their bias is O(1/spp) of the variation of light within a pixel.
 
     Pure. It may be called inside `jax.jit`, under `jax.vmap` over scenes that differ in parameters or cameras, and be
-    differentiated in what `parameters` lists, forwards or backwards. The derivative is that of `jacobian`, which says
-    how far it may be trusted. A kernel is compiled once for each scene structure, image size and set of the choices
-    below; other parameters, cameras, spp and seeds reuse it. A sample that is not finite leaves the pixels not finite
-    in which it counts, and the others untouched.
+    differentiated in the entries of `parameters`, forwards or backwards. The derivative is that of `jacobian`, whose
+    documentation states its limits. A kernel is compiled once for each scene structure, image size and set of the
+    options below; other parameters, cameras, spp and seeds reuse it. A non-finite sample makes the pixels non-finite in
+    which it counts, and does not affect the others.
 
     Args:
         spp: samples per pixel, at least 1.
@@ -57,17 +57,17 @@ def render(
             CPU devices.
         strategy: "mis", or "light" or "bsdf" for experiments. "bsdf" is refused where it misses the light of emitters
             that no ray meets.
-        fresnel: reflectance of dielectrics, "exact", or "schlick", whose approximation biases the image. This and what
-            follows are for experiments; the defaults compile nothing of them.
-        split_depth: number of dielectrics, counted along a path, at which both branches are followed instead of one by
-            chance; 0 to 8. A sample may then be 2^split_depth paths.
-        sampler: random numbers, "lattice", or "independent" of each other, or "subpixel": independent, but with a
-            quarter of the samples in each of 2 x 2 strata of the pixel's filter; spp is then a multiple of 4.
-        control: a `transport.Control`, made by `Operator.control`, into which paths end instead of into darkness. The
-            mean stays, whatever light it holds. It seldom pays: see `pathjax help transport`.
+        fresnel: reflectance of dielectrics, "exact", or "schlick", whose approximation biases the image. This and the
+            following options are for experiments; the defaults compile nothing of them.
+        split_depth: number of dielectrics, counted along a path, at which both branches are followed instead of a
+            random one; 0 to 8. A sample may then be 2^split_depth paths.
+        sampler: random numbers: "lattice"; "independent"; or "subpixel": independent, but with a quarter of the samples
+            in each of 2 x 2 strata of the pixel's filter; spp is then a multiple of 4.
+        control: a `transport.Control`, built by `Operator.control`. Paths end in its light instead of in darkness. The
+            mean is the same whatever its light. It seldom pays off: see `pathjax help transport`.
     Raises:
-        InputError: a choice is unknown or refused, or spp, seed or split_depth is out of range; differentiation in
-            anything but named parameters, or with another sampler, split_depth or control than the default.
+        InputError: an option is unknown or refused, or spp, seed or split_depth is out of range; differentiation in
+            anything other than named parameters, or with a sampler, split_depth or control other than the default.
     """
     shared = scene.film.shared
     options = Options(strategy, fresnel, split_depth, sampler, controlled=control is not None, shared=shared)
@@ -94,12 +94,13 @@ def _check_control(control, scene: Scene) -> None:
 def render_pixels(
     scene: Scene, pixels, first_sample, spp, seed, options: Options = DEFAULTS, control=None, shape=None, **how
 ):
-    """Means over the samples first_sample, ..., first_sample + spp - 1 of some pixels: (N,) int32 -> (N, 3).
+    """Return the means (N, 3) over the samples first_sample, ..., first_sample + spp - 1 of pixels (N,) int32.
 
-    first_sample, spp, seed: each one number, or (N,) of the pixels.
-    control: of `render`, for options that are controlled.
-    shape: (height, width) of an image that the pixels make; the means are (height, width, 3) then.
-    how: `form` and `devices` of `native_map`.
+    Args:
+        first_sample, spp, seed: each a scalar, or (N,), one per pixel.
+        control: as for `render`, if `options.controlled`.
+        shape: (height, width) of the image of the pixels; the means are then (height, width, 3).
+        how: `form` and `devices` of `native_map`.
     """
     numbers = pixel.numbers(pixels, first_sample, spp, seed)
     scene = on_all_devices(scene, how.get("devices"))
@@ -111,7 +112,7 @@ def render_pixels(
 class _PixelMeans:
     options: Options
     how: tuple[tuple[str, object], ...]
-    ring: int  # of `backward.longest_ring`, which the scene tells here alone: within `estimate` nothing of it is known
+    ring: int  # `backward.longest_ring`, computed here because the scene is traced within `estimate`
     shape: tuple[int, ...]  # of the pixels in the value
 
     def value(self, scene, control, pixels, *numbers):
@@ -125,7 +126,7 @@ class _PixelMeans:
         return self._shaped(image), {name: self._shaped(derivatives[name]) for name in wanted}
 
     def matrix_free(self, scene, wanted):
-        # Many colours, and textures always.
+        # Textures always, colours if there are many.
         swept = {name for name, parameter in wanted.items() if matrix_free.is_swept(scene, parameter)}
         textures = {name for name, parameter in wanted.items() if parameter.is_texture}
         return swept if len(swept) > MOST_TWICE else textures
@@ -141,7 +142,7 @@ class _PixelMeans:
         return matrix_free.pull(scene, wanted, adjoint.reshape(-1, 3), *work, **dict(self.how))
 
     def _shaped(self, values):
-        """(N, ...) -> (*shape, ...)"""
+        """Reshape (N, ...) to (*shape, ...)."""
         return values.reshape(*self.shape, *values.shape[1:])
 
 
@@ -149,7 +150,7 @@ class _PixelMeans:
 def pixel_means(
     scene, pixels, first_sample, spp, seed, control=None, *, options: Options, form=None, devices=None, shape=None
 ):
-    """What `render_pixels` gives, without derivatives; arguments as there, spp and seed (N,) uint32."""
+    """Do `render_pixels` without derivatives; the same arguments, but first_sample, spp and seed are (N,) uint32."""
     scene = options.applied(scene)
     choice = emitters.choice(scene.emitters, options.strategy)
     work = pixels, first_sample, spp, seed

@@ -1,7 +1,7 @@
-"""How much light a last depth cuts off: a geometric series through the last terms of L = Le + T Le + T^2 Le + ...
+"""Estimate the light that max_depth cuts off, by a geometric series through the last terms of L = Le + T Le + ...
 
-Terms decay like powers of the largest eigenvalue of T once their light is spread over the scene. What passes through
-more vertices than were rendered before it comes to light at all (glass in glass) no fit to these terms can know.
+Terms decay like powers of the largest eigenvalue of T once their light is spread over the scene. No fit can account for
+paths that reach a light only after more vertices than were rendered (glass in glass).
 """
 
 from __future__ import annotations
@@ -13,24 +13,24 @@ import numpy as np
 
 from pathjax.errors import InputError
 
-# Terms that the series is fitted to; the first, lamps in view, says nothing of how light decays.
+# Number of last terms in the fit. The first term, lamps in view, is left out: it says nothing about the decay.
 LAST = 4
 
 
 @dataclass(frozen=True, eq=False)
 class Tail:
-    """NumPy, float64, by channel. The series goes on from the last term as light * (1 - ratio) * ratio^k."""
+    """Fit per channel, NumPy float64. The series continues after the last term as light * (1 - ratio) * ratio^k."""
 
     terms: np.ndarray  # (depth, 3) mean radiance of each term over the image
     standard_error: np.ndarray  # (depth, 3)
-    ratio: np.ndarray  # (3,) of a term to the one before it; 0 where none is left
+    ratio: np.ndarray  # (3,) of a term to the one before it; 0 where no light is left
     light: np.ndarray  # (3,) radiance of all terms beyond; inf where they do not decay
     covariance: np.ndarray  # (3, 2, 2) of log(last term) and log(ratio)
 
     def cut_off(self, max_depth: int) -> tuple[np.ndarray, np.ndarray]:
-        """Share of all light (3,) that is lost beyond max_depth terms, and its standard error (3,).
+        """Return the share of all light (3,) that is lost beyond max_depth terms, and its standard error (3,).
 
-        Errors of terms add up as if they went together, at worst.
+        Errors of terms are added as if fully correlated, the worst case.
         """
         if max_depth < 0:
             raise InputError(f"max_depth = {max_depth}; it is a number of terms, 0 or more")
@@ -51,7 +51,7 @@ class Tail:
         return tuple(shares)
 
     def depth_for(self, error: float) -> int | None:
-        """Least max_depth that cuts off no more than this share of light in any channel; None: light does not decay.
+        """Return the least max_depth that cuts off at most this share of light in every channel; None: no decay.
 
         Raises:
             InputError: error is not between 0 and 1.
@@ -70,15 +70,15 @@ class Tail:
 
 
 def check_share(error: float) -> None:
-    """Raises InputError where a share of light that may be cut off is not between 0 and 1."""
+    """Refuse, with an InputError, a share of light to cut off that is not between 0 and 1."""
     if not 0 < error < 1:
         raise InputError(f"error = {error}; a share of light that may be cut off lies between 0 and 1")
 
 
 def fit(terms: np.ndarray, standard_error: np.ndarray) -> Tail:
-    """The Tail of mean radiances (depth, 3) with their standard errors.
+    """Fit the Tail to mean radiances (depth, 3) with their standard errors.
 
-    Least squares for the logarithms, weighted by their errors; where they scatter by more than these, so does the fit.
+    Least squares for the logarithms, weighted by their errors; if they scatter more, the covariance grows accordingly.
 
     Raises:
         InputError: fewer than 3 terms.
@@ -93,7 +93,7 @@ def fit(terms: np.ndarray, standard_error: np.ndarray) -> Tail:
 
 
 def _fit(m, error):
-    """Ratio, light beyond, and the covariance (2, 2) of one channel."""
+    """Return ratio, light beyond, and the covariance (2, 2) of one channel."""
     if m[-1] <= 0:
         return 0.0, 0.0, np.zeros((2, 2))
     k = np.arange(len(m)) - (len(m) - 1.0)
@@ -101,7 +101,7 @@ def _fit(m, error):
     k, m, error = k[lit], m[lit], error[lit]
     if len(m) < 2:
         return np.inf, np.inf, np.full((2, 2), np.inf)
-    # What is rendered without noise still has rounding.
+    # Terms rendered without noise still have rounding errors.
     sigma = np.maximum(np.nan_to_num(error), np.finfo(np.float32).eps * m) / m
     design = np.stack([np.ones_like(k), k], -1) / sigma[:, None]
     covariance = np.linalg.inv(design.T @ design)

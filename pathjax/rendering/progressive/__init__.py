@@ -1,5 +1,5 @@
-"""Renders that go on until an error is reached, can be interrupted, and leave a state that can be taken up again.
+"""Renders that continue until an error is reached, can be interrupted, and resumed from a saved state.
 
-`until` decides when to stop and how many samples come next, `passes` renders them, `replicates` is how samples are
-split so that their spread tells the error, `error_estimate` tells it, `checkpoint` keeps the state on disk.
+`until` decides when to stop and how many samples come next, `passes` renders them, `replicates` splits the samples into
+independent parts, `error_estimate` estimates the error from their spread, `checkpoint` saves the state on disk.
 """

@@ -1,4 +1,4 @@
-"""A render's state on disk: a process that was killed left the last whole one, which leads on to the same bits."""
+"""A render's state on disk: a killed process leaves the last complete one, which continues to the same bits."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from pathjax.sensors import film
 from pathjax.system.files import write_whole
 from pathjax.system.json_text import json_text
 
-# Saving costs at most one in this many seconds.
+# Saving takes at most one in this many seconds.
 COST = 200
-# What the first is thought to cost: it is made after a second.
+# Assumed seconds of the first save with samples, so that it is due after a second.
 _FIRST_COST = 0.005
 
 
 def identity(scene: Scene, seed: int, strategy: str, adaptive: bool) -> dict[str, str | int]:
-    """What a state may be continued with, and nothing else."""
+    """Return the facts that must agree for a state to be continued."""
     height, width = film.image_shape(scene.film)
     return {
         "pathjax": version.__version__,
@@ -49,17 +49,17 @@ class Checkpoint:
         self.path, self.identity = Path(path), dict(identity)
         self.problem: str | None = None  # why the last state is not in the file
         self._saved, self._cost = 0.0, _FIRST_COST
-        # What a killed process left half written.
+        # Remove partial files of killed processes.
         parts = () if distributed.index() else self.path.parent.glob(f".{glob.escape(self.path.name)}.*.part")
         for part in parts:
             with contextlib.suppress(OSError):
                 part.unlink()
 
     def load(self, fresh: State) -> State:
-        """The saved state, or `fresh`, which has the same shapes, where there is no file.
+        """Return the saved state, or `fresh`, which has the same shapes, if there is no file.
 
         Raises:
-            InputError: damaged, no checkpoint, or one of another render; the message says which.
+            InputError: the file is damaged, not a checkpoint, or of another render; the message says which.
         """
         if not self.path.exists():
             return fresh
@@ -69,7 +69,7 @@ class Checkpoint:
                 identity, spp, seconds = facts["identity"], int(facts["spp"]), float(facts["seconds"])
                 chunk = min(max(int(facts["chunk"]), 1), len(fresh.count))
                 arrays = {name: file[name] for name in ("means", *fresh.of_pixels)} if file.files != ["facts"] else {}
-        except Exception as error:  # zipfile, zlib, NumPy and json raise what they like, as the file's bytes have it
+        except Exception as error:  # zipfile, zlib, NumPy and json raise many kinds, depending on the file's bytes
             raise self._refusal(f"is not a checkpoint, or is damaged ({error})") from None
         for name, ours in self.identity.items():
             theirs = identity.get(name)
@@ -88,15 +88,15 @@ class Checkpoint:
         return state
 
     def save(self, state: State) -> None:
-        """Write the state to the file; of several processes the first one does.
+        """Write the state to the file; of several processes only the first one writes.
 
         Raises:
-            InputError: it cannot be written; the last one that was is intact.
+            InputError: the file cannot be written; the last one written is intact.
         """
         if distributed.index():
             return
         started = time.perf_counter()
-        # Before the first sample nothing needs to be kept, only to be known to be writable.
+        # Before the first sample there is nothing to save; this only checks that the file is writable.
         arrays = {}
         if state.count.any():
             arrays = {"means": state.means} | {name: one_if_equal(getattr(state, name)) for name in state.of_pixels}
@@ -110,7 +110,7 @@ class Checkpoint:
                 self._cost = self._saved - started
 
     def keep(self, state: State) -> None:
-        """Save; where that fails warn, once for each reason, for the render is worth more than its checkpoint."""
+        """Save; on failure only warn, once for each reason, since the render is worth more than its checkpoint."""
         earlier, self.problem = self.problem, None
         try:
             self.save(state)
@@ -120,7 +120,7 @@ class Checkpoint:
                 warnings.warn(f"{self.problem}; the render goes on without", InputWarning, stacklevel=2)
 
     def save_if_due(self, state: State) -> None:
-        """Keep, unless the last time was so lately that it would slow the render down."""
+        """Call `keep`, unless the last save was so recent that it would slow the render down."""
         if time.perf_counter() - self._saved > COST * self._cost:
             self.keep(state)
 

@@ -1,8 +1,8 @@
-"""How wrong an image is, from the variance between its replicates: of a pixel, and of the whole.
+"""Estimate the error of an image, per pixel and as a whole, from the variance between its replicates.
 
-Three degrees of freedom are few, so a pixel borrows from its neighbours. Of light that no sample of a pixel and its
-neighbours has met these numbers cannot know: they are then too small. Variances are float64, as those of
-`replicates.moments`: so nothing here depends on the unit of radiance, but for what float32 cannot hold.
+Three degrees of freedom are few, so a pixel borrows from its neighbours. Light that no sample of a pixel and its
+neighbours has met is not in the estimates, which are then too small. Variances are float64, as in `replicates.moments`,
+so nothing here depends on the unit of radiance, except where float32 cannot hold the radiance.
 """
 
 from __future__ import annotations
@@ -18,26 +18,28 @@ from pathjax.rendering.progressive.replicates import blocks
 OWN_SHARE = 0.25
 # One-sided 95 % of a normal distribution.
 CONFIDENCE = 1.645
-# Least share of the samples that a pixel gets, of the mean.
+# Least number of samples of a pixel, relative to the mean.
 LEAST_SHARE = 0.25
 
 
 class ImageError(NamedTuple):
-    """`images.relative_error` of an image against the truth; nan where nothing is known."""
+    """Estimated `images.relative_error` of an image against the truth; nan where nothing is known."""
 
     estimate: float
-    bound: float  # that the error exceeds in some 5 % of renders
+    bound: float  # exceeded by the error in some 5 % of renders
 
 
 def standard_error(image: np.ndarray, variance: np.ndarray, count: np.ndarray) -> np.ndarray:
-    """(H, W, 3) of the image; nan where a pixel is not finite or has fewer than 2 samples.
+    """Return the standard error (H, W, 3); nan where a pixel is not finite or has fewer than 2 samples.
 
-    Never less than image / (3 count): among the 9 count samples of the neighbourhood, which may all agree, the next
-    could have been twice as bright. Without this, what is reflected in glass by one path in a hundred had no error.
-    Too small where the variance of a pixel is many times its neighbours' and it was lucky, and where pixels are black.
+    It is at least image / (3 count): even if the 9 count samples of the neighbourhood agree, the next could be twice as
+    bright. Without this bound, reflections in glass that one path in a hundred finds had no error. It is too small
+    where a pixel's true variance is many times its neighbours' but its samples agree by luck, and where pixels are
+    black.
 
     Args:
-        variance: (H, W, 3) of each pixel of the image (H, W, 3); count: (H, W) its samples.
+        variance: (H, W, 3) of each pixel of the image (H, W, 3).
+        count: (H, W) samples per pixel.
     """
     result = np.empty_like(image)
     for rows in blocks(len(image), image.shape[1]):
@@ -48,7 +50,7 @@ def standard_error(image: np.ndarray, variance: np.ndarray, count: np.ndarray) -
 
 
 def _standard_error(image, variance, count):
-    # By planes: loops over three neighbours in memory are slow.
+    # Channels first: loops over an innermost axis of length 3 are slow.
     image, variance = (np.ascontiguousarray(np.moveaxis(x, -1, 0)) for x in (image, variance))
     around = _around(variance, 1)
     pooled = np.where(np.isfinite(around), OWN_SHARE * variance + (1 - OWN_SHARE) * around, variance)
@@ -57,7 +59,7 @@ def _standard_error(image, variance, count):
 
 
 def contributions(image: np.ndarray, variance: np.ndarray) -> np.ndarray:
-    """(...,) share of each pixel in the squared relative error, from (..., 3); nan where it is not known.
+    """Return each pixel's contribution (...,) to the squared relative error, from (..., 3); nan where unknown.
 
     image^2 - variance estimates the squared truth without bias. Taking image^2 would halve the error of noisy images,
     since what makes a pixel too bright makes its variance large.
@@ -69,17 +71,18 @@ def contributions(image: np.ndarray, variance: np.ndarray) -> np.ndarray:
 
 
 def _floor(image: np.ndarray) -> float:
-    """What is added to the squared truth in relative errors; nan where the image has no level."""
+    """Return the constant added to the squared truth in relative errors; nan where the image has no level."""
     return RELATIVE_FLOOR * level(image) ** 2
 
 
 def image_error(image: np.ndarray, variance: np.ndarray, alike: float = 1.0) -> ImageError:
-    """Estimate the error of an image (..., 3); pixels that are not finite are left out, nan without an `images.level`.
+    """Estimate the error of an image (..., 3) over its finite pixels; nan without an `images.level`.
 
-    The bound takes pixels as draws from a population: where few of them make up most of the error, their number is
-    small and the bound high. Where single samples do (skewness beyond 6), the error exceeds it more often.
+    The bound treats pixels as draws from a population: if a few of them cause most of the error, their number is small
+    and the bound high. If single samples do (skewness beyond 6), the error exceeds the bound more often.
 
-    alike: how many pixels tell as much of variances as one that shares no samples: sum of squared correlations.
+    alike: number of pixels that carry as much information on variances as one that shares no samples: the sum of
+        squared correlations.
     """
     shares = contributions(image, variance)
     known = shares[np.isfinite(shares)]
@@ -92,11 +95,11 @@ def image_error(image: np.ndarray, variance: np.ndarray, alike: float = 1.0) -> 
 
 
 def sample_weights(image: np.ndarray, variance: np.ndarray) -> np.ndarray:
-    """(H, W) float32 of mean 1: how samples are best spread over the pixels, from equally many in each.
+    """Return the best weights (H, W) for samples per pixel, float32 of mean 1, given equally many samples per pixel.
 
-    In proportion to the relative standard deviation, in the 24 pixels around a pixel and never in itself: so its
-    number of samples does not depend on what they were (but through the mean of all weights, by 1/N), and its mean
-    stays unbiased.
+    They are proportional to the relative standard deviation in the 24 pixels around a pixel, without the pixel itself.
+    So a pixel's number of samples does not depend on their values (except through the mean of all weights, by 1/N), and
+    its mean stays unbiased.
     """
     with np.errstate(invalid="ignore"):
         relative = mean_of_channels(variance / (np.square(image, dtype=float) + _floor(image)))
@@ -110,7 +113,7 @@ def sample_weights(image: np.ndarray, variance: np.ndarray) -> np.ndarray:
 
 
 def _around(x: np.ndarray, radius: int) -> np.ndarray:
-    """(C, H, W) mean over the square around each pixel, without itself and what is not finite; nan if none is left."""
+    """Return means (C, H, W) over the square around each pixel, without itself and non-finite pixels; nan if none."""
     known = np.isfinite(x).all(0)
     values = np.where(known, x, 0)
     count = _box(known.astype(x.dtype), radius) - known
@@ -120,7 +123,7 @@ def _around(x: np.ndarray, radius: int) -> np.ndarray:
 
 
 def _box(x: np.ndarray, radius: int) -> np.ndarray:
-    """(..., H, W) sums over squares, cut off at the border."""
+    """Return sums (..., H, W) over the square around each pixel, cut off at the border."""
     for axis in (-2, -1):
         total = x.copy()
         line, out = np.moveaxis(x, axis, 0), np.moveaxis(total, axis, 0)

@@ -1,4 +1,4 @@
-"""A render in passes: something to look at soon, bounded memory, and a state that can be left and taken up again."""
+"""Render in passes: an early image, bounded memory, and a state from which a render can resume."""
 
 from __future__ import annotations
 
@@ -22,35 +22,35 @@ from pathjax.scene.scene import Scene
 from pathjax.sensors import film
 from pathjax.sensors.film import Film
 
-# Pixels in one call of the kernel and samples that it adds to each at most: so many that the call costs little, so few
-# that an interrupt is heard at once. The schedule is fixed, not timed, so that the same command gives the same image.
+# Pixels in one call of the kernel, and most samples that it adds to each: enough that the overhead of a call is small,
+# few enough that interrupts are handled at once. The schedule does not depend on time, so that images are reproducible.
 CHUNK_PIXELS = 1 << 13
 MAX_PASS_SPP = 48 * replicates.COUNT
-# Samples of the first pass over the image, so that there is soon a whole picture, and the goals from which on it is the
-# second and the third of them.
+# Samples per pixel of the first pass, few so that a whole image exists early. The second and third value apply to goals
+# from _GOALS[0] and _GOALS[1] on.
 _FIRST_SPP = replicates.COUNT * np.array([1, 4, 16], np.int32)
 _GOALS = np.array([17, 256])
-# A call of few items is another program, whose last bits may differ.
+# A call with fewer items is another program, whose last bits may differ.
 _LEAST_CHUNK = -(-MANY_ITEMS // replicates.COUNT)
 
 
 @dataclass
 class State:
-    """Running means of the replicates, row by row over the image, and how far they are to go."""
+    """Running means of the replicates, row by row over the image, and the goal of the current round."""
 
     means: np.ndarray  # (R, N, 3) float32
     count: np.ndarray  # (N,) int32 samples so far, of all replicates together
     goal: np.ndarray  # (N,) int32 samples at the end of this round
-    weights: np.ndarray  # (N,) float32 of mean 1, how samples are spread over the pixels
-    chunk: int  # pixels of a call
-    spp: int = 0  # mean samples of a pixel that the round was planned for
+    weights: np.ndarray  # (N,) float32 of mean 1, distribution of samples over the pixels
+    chunk: int  # pixels per call
+    spp: int = 0  # mean samples per pixel that the round was planned for
     seconds: float = 0.0  # spent rendering
 
-    # What a checkpoint keeps, beside the means: one number for each pixel, or one for all.
+    # Fields in a checkpoint, besides the means: one value per pixel, or one for all.
     of_pixels: ClassVar[tuple[str, ...]] = ("count", "weights")
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """All but the means, which all processes have from the same calls."""
+        """Return all arrays except the means, which are the same in all processes already."""
         return {name: getattr(self, name) for name in ("goal", *self.of_pixels)}
 
     def take(self, arrays: Mapping[str, np.ndarray]) -> None:
@@ -58,15 +58,15 @@ class State:
             setattr(self, name, array)
 
     def moments(self) -> tuple[np.ndarray, np.ndarray]:
-        """The image and its variance, (H W, 3) each."""
+        """Return the image and its variance, (H W, 3) each."""
         return replicates.moments(self.means, self.count)
 
     def samples(self) -> np.ndarray:
-        """(H W,) int32 of each pixel of the image."""
+        """Return the samples per pixel of the image, (H W,) int32."""
         return self.count
 
     def spread(self, weights: np.ndarray) -> None:
-        """Let the samples of later rounds be spread as these weights (H, W) say."""
+        """Distribute the samples of later rounds by these weights (H, W)."""
         self.weights = weights.ravel()
 
     def plan(self, spp: int) -> None:
@@ -78,47 +78,47 @@ class State:
         self.spp = spp
 
     def resume(self, spp: int, chunk: int) -> None:
-        """Go on with a round that a checkpoint has kept, of calls of so many pixels: any number gives the same bits."""
+        """Continue a round from a checkpoint. chunk: pixels per call there; here any number gives the same bits."""
         self.plan(spp)
 
     def runs(self, missing: np.ndarray) -> Iterator[np.ndarray]:
-        """Pixels of each call of the kernel, of those (n,) that miss samples: at most `chunk`."""
+        """Return the pixels of each call of the kernel, at most `chunk`, from those (n,) that miss samples."""
         return (missing[first : first + self.chunk] for first in range(0, missing.size, self.chunk))
 
     def more(self, pixels: np.ndarray) -> tuple[np.ndarray, ...]:
-        """What the kernel takes beside the numbers of samples."""
+        """Return the further arguments of the kernel."""
         return ()
 
     def add(self, pixels: np.ndarray, before: np.ndarray, after: np.ndarray, means: np.ndarray) -> None:
-        """Means (R, chunk, 3), the first those of the pixels, of what lies between two numbers of samples."""
-        # Pixels that follow each other are a slice, which is many times faster.
+        """Add means (R, chunk, 3), which begin with those of the pixels, over the samples from `before` to `after`."""
+        # Consecutive pixels are a slice, which is many times faster.
         follow = pixels[-1] - pixels[0] == len(pixels) - 1
         here = slice(pixels[0], pixels[-1] + 1) if follow else pixels
         means = means[:, : len(pixels)]
         if before.any():
             begin, end = (replicates.shares(replicates.one_if_equal(count)) for count in (before, after))
             share = ((end - begin) / np.maximum(end, 1)).astype(np.float32)[..., None]
-            with np.errstate(invalid="ignore"):  # a pixel that met a sample that is not finite
+            with np.errstate(invalid="ignore"):  # pixels with a non-finite sample
                 change = means - self.means[:, here]
                 change *= share
                 self.means[:, here] += change
         else:
-            # The same; but reading fresh memory before it is written stops all threads, page by page, at the write.
+            # Equivalent. Reading fresh memory before it is written would stop all threads, page by page, at the write.
             self.means[:, here] = means
         self.count[here] = after
 
 
 @dataclass
 class SharedState(State):
-    """The state of a film that shares samples: its pixels are those of `film.of_samples`, and its means are sums.
+    """State of a film that shares samples: its pixels are those of `film.of_samples`, and its means are sums.
 
     A pixel's samples weigh `scale` each, so that in the end all pixels weigh the same, however many samples they have:
-    the image is A / W of `reconstruction`. What is chosen for a round by the noise of earlier ones changes no mean.
+    the image is A / W of `reconstruction`. Sample counts chosen from the noise of earlier rounds change no mean.
     """
 
     # means: (R, N, 4) A and W of each replicate.
     scale: np.ndarray = field(kw_only=True)  # (N,) float32 weight of a sample of this round
-    begun: np.ndarray = field(kw_only=True)  # (N,) int32 samples at the begin of this round
+    begun: np.ndarray = field(kw_only=True)  # (N,) int32 samples at the start of this round
     film: Film = field(kw_only=True)
 
     of_pixels = "count", "weights", "goal", "scale", "begun"
@@ -126,7 +126,7 @@ class SharedState(State):
     def moments(self) -> tuple[np.ndarray, np.ndarray]:
         sums = film.cropped(self.film, self.means)
         values, weights = sums[..., :3], sums[..., 3:]
-        with np.errstate(invalid="ignore"):  # a pixel that met a sample that is not finite
+        with np.errstate(invalid="ignore"):  # pixels with a non-finite sample
             means = values / np.where(weights > 0, weights, 1)
         return replicates.moments(means, self.samples())
 
@@ -137,7 +137,7 @@ class SharedState(State):
         (self.weights,) = np.asarray(film.extended(self.film, weights[None]))
 
     def plan(self, spp: int) -> None:
-        # What is missing of the weight that all pixels have in the end.
+        # Missing part of the weight that all pixels have in the end.
         missing = spp - self.spp + self.scale.astype(float) * (self.goal - self.count)
         wanted = self.weights * missing
         if (self.weights != 1).any():
@@ -148,11 +148,11 @@ class SharedState(State):
         self.spp = spp
 
     def resume(self, spp: int, chunk: int) -> None:
-        # In the same runs: of others some would be half done, and sums would have another order.
-        self.spp, self.chunk = spp, chunk  # the rest is as it was kept
+        # Keep the same runs: others would be half done, and sums would have another order.
+        self.spp, self.chunk = spp, chunk  # the rest is restored already
 
     def runs(self, missing: np.ndarray) -> Iterator[np.ndarray]:
-        """Runs of pixels; some of them may have all their samples."""
+        """Yield runs of consecutive pixels, some of which may have all their samples."""
         for number in np.unique(missing // self.chunk):
             yield np.arange(number * self.chunk, min((number + 1) * self.chunk, len(self.count)), dtype=np.int32)
 
@@ -160,7 +160,7 @@ class SharedState(State):
         return (np.pad(self.scale[pixels], (0, self.chunk - len(pixels))),)
 
     def add(self, pixels: np.ndarray, before: np.ndarray, after: np.ndarray, means: np.ndarray) -> None:
-        """Sums (R, chunk + 2 halo, 4), of which the first pixels lie before."""
+        """Add sums (R, chunk + 2 halo, 4), which begin `halo` before the first pixel."""
         first = pixels[0] - reconstruction.halo(self.film)
         begin, end = max(first, 0), min(first + means.shape[1], len(self.count))
         self.means[:, begin:end] += means[:, begin - first : end - first]
@@ -178,7 +178,7 @@ def start(scene: Scene) -> State:
 
 
 def plan(state: State, spp: int) -> None:
-    """Begin a round that ends with `spp` samples a pixel, on average; what a pixel has already it keeps."""
+    """Begin a round that ends with `spp` samples per pixel, on average; pixels keep the samples that they have."""
     state.plan(spp)
     state.take(distributed.of_first(state.arrays()))
 
@@ -186,14 +186,14 @@ def plan(state: State, spp: int) -> None:
 def extend(
     scene: Scene, state: State, seed: int, options: Options, stopped: Callable[[], object] = lambda: False
 ) -> Iterator[bool]:
-    """Render what is missing of the round; yields after every call of the kernel, when the state is whole: False where
-    it was stopped.
+    """Render the missing part of the round. Yield after every call of the kernel, when the state is consistent: True,
+    or False if it was stopped.
 
-    The samples of a pixel are added in portions that depend on its own count and goal alone, so that a state which was
-    saved between two calls leads to the same bits.
+    The samples of a pixel are added in portions that depend only on its own count and goal, so that a state saved
+    between two calls continues to the same bits.
 
     Args:
-        stopped: asked before each call. Once it is true none begins; those that run are waited for.
+        stopped: called before each kernel call. Once it is true no call starts; running ones are awaited.
     """
     kernel = compile(scene, options, state.chunk)
 
@@ -211,9 +211,9 @@ def extend(
 
 
 def _portions(state: State) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """What lies between the state and its goal, portion by portion: pixels and their numbers of samples before and
-    after, (n,) int32 each, n <= `state.chunk`."""
-    # From where the round began, for sums of neighbouring runs depend on their order; what is there is left out.
+    """Yield the portions between the state and its goal: pixels and their sample counts before and after, (n,) int32
+    each, n <= `state.chunk`."""
+    # Start where the round began, since sums of neighbouring runs depend on their order; skip portions already there.
     there = state.count.copy()
     planned = (state.begun if isinstance(state, SharedState) else state.count).copy()
     while (missing := np.flatnonzero(planned < state.goal).astype(np.int32)).size:
@@ -226,10 +226,11 @@ def _portions(state: State) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray
 
 
 def compile(scene: Scene, options: Options, chunk: int) -> Callable:
-    """The kernel of `extend`: (3, n) int32 of a chunk, the pixels and their numbers of samples before and after, and a
-    seed -> means of each replicate over the samples between, 0 of none, (R, n, 3) float32. Of a film that shares
-    samples: also what each weighs, (n,) float32 -> A and W of `reconstruction.sums`, (R, m, 4)."""
-    # Without the derivatives of `render_pixels`, whose machinery takes longer than a call of few samples.
+    """Return the compiled kernel of `extend`: (3, n) int32 pixels and their sample counts before and after, and a seed
+    -> means of each replicate over the samples between, (R, n, 3) float32, 0 if there are none. For a film that shares
+    samples it also takes the weight of a sample, (n,) float32, and returns A and W of `reconstruction.sums`, (R, m, 4).
+    """
+    # Without the derivatives of `render_pixels`, whose overhead is longer than a call of few samples.
     scene = nameless(scene)
     arguments = scene, jax.ShapeDtypeStruct((3, chunk), np.int32), np.uint32(0)
     if scene.film.shared:
@@ -237,8 +238,7 @@ def compile(scene: Scene, options: Options, chunk: int) -> Callable:
         kernel = compiled(_sums_of_replicates, *arguments, scale, options=replace(options, shared=True))
     else:
         kernel = compiled(_means_of_replicates, *arguments, options=options)
-    # A compiled kernel, unlike a jitted function, does not ask for the calling thread's contexts, such as
-    # `jax.enable_x64`.
+    # A compiled kernel, unlike a jitted function, ignores the calling thread's contexts, such as `jax.enable_x64`.
     return partial(kernel, scene)
 
 
@@ -270,7 +270,7 @@ def _sums_of_replicates(scene, numbers, seed, scale, *, options):
 
 
 def _chunk(count: int) -> int:
-    """Pixels of a call: all calls have one shape, so one kernel, and each of those that run at once gets as many."""
+    """Return the pixels per call: all calls have one shape, so one kernel, and concurrent calls get equally many."""
     at_once = calls_at_once() * distributed.count()
     calls = at_once * -(-count // (at_once * CHUNK_PIXELS))
     return min(count, max(-(-count // calls), _LEAST_CHUNK))

@@ -1,4 +1,4 @@
-"""Render until an error is reached, a time is over or samples are spent; nothing is lost when it is stopped."""
+"""Render until an error, a time limit or a number of samples is reached; nothing is lost when it is stopped."""
 
 from __future__ import annotations
 
@@ -25,29 +25,29 @@ from pathjax.scene.scene import Scene
 from pathjax.sensors import film
 from pathjax.system.interrupts import Interrupts
 
-# Samples of every pixel before their number may differ.
+# Samples of every pixel before sample counts may differ between pixels.
 PILOT_SPP = 16
-# A round multiplies the samples by at most MOST_GROWTH. Near the target it takes this power of what is predicted to be
-# lacking, so as not to pass it by, but never less than LEAST_GROWTH.
+# A round multiplies the samples by at most MOST_GROWTH and at least LEAST_GROWTH. Near the target it multiplies by the
+# predicted missing factor to the power CAUTION, so as not to overshoot.
 MOST_GROWTH, LEAST_GROWTH, CAUTION = 2.0, 1.05, 0.75
 MAX_SPP = 2**31 - 1
-# Why a round may be left.
+# Reasons to leave a round early.
 REASONS = None, "time limit", "interrupted"
 UNKNOWN = error_estimate.ImageError(math.nan, math.nan)
 
 
 @dataclass(frozen=True)
 class RenderResult:
-    """An image and how wrong it is."""
+    """An image and its estimated error."""
 
     image: np.ndarray  # (H, W, 3) float32
     standard_error: np.ndarray  # (H, W, 3) float32 of the image; nan where a pixel has fewer than 2 samples
     spp: float  # mean over the pixels
-    samples: np.ndarray  # (H, W) int32 of each pixel
+    samples: np.ndarray  # (H, W) int32 per pixel
     compile_seconds: float  # of this call
     run_seconds: float  # of all calls that shared the checkpoint
-    error: float  # estimate of `images.relative_error`, of the pixels that are finite; nan where it cannot be made
-    error_bound: float  # that the error exceeds in some 5 % of renders; what is compared with the target
+    error: float  # estimate of `images.relative_error` over the finite pixels; nan if there is no estimate
+    error_bound: float  # exceeded by the error in some 5 % of renders; compared with the target
     reason: str  # why it ended: "target error", "time limit", "spp", "interrupted", "no estimate"
 
 
@@ -66,30 +66,30 @@ def render_until(
 
     The error is sqrt(mean((I - R)^2 / (R^2 + 0.01 L^2))) of the image I against the truth R, where L is the level of R:
     the mean of its lit pixels without the brightest quarter, such as lamps in view (`images.level`). So 0.02 is 2 % in
-    any unit of radiance. It is estimated as long as float32 holds the radiances, some 1e-31 to 1e36. Of an image that
-    is black, darker than that or not finite, no target is claimed. A render that nothing else would end then ends with
-    the reason "no estimate", after the pilot or when the finite pixels are on target.
+    any unit of radiance. It is estimated as long as float32 holds the radiances, some 1e-31 to 1e36. An image that is
+    black, darker than that or not finite never counts as on target. If no other limit would end the render, it then
+    ends with the reason "no estimate", after the pilot or when the finite pixels are on target.
 
-    The image is the mean of independent replicates, so it is not that of `render` for the same seed. If only `spp` is
-    given, all pixels get equally many samples. Otherwise, after a pilot, noisy neighbourhoods get more: see
+    The image is the mean of independent replicates, so it differs from that of `render` for the same seed. If only
+    `spp` is given, all pixels get equally many samples. Otherwise, after a pilot, noisy neighbourhoods get more: see
     `error_estimate.sample_weights`. Either way the image is unbiased up to the scene's max_depth. The same arguments
     give the same image, bit for bit, unless a time limit or an interrupt ended it.
 
     Args:
         target_error: the error to reach; it counts as reached when the upper bound of the estimate is no higher.
-        time_limit: seconds of rendering. Compilation, which nothing can cut short, is not counted.
+        time_limit: seconds of rendering. Compilation, which cannot be interrupted, is not counted.
         spp: most samples per pixel, on average.
         seed: other seeds give independent images.
-        strategy: of `render`.
+        strategy: as for `render`.
         checkpoint: a .npz file in which the state is saved, at intervals, when interrupted and at the end. If it
-            exists, the render goes on from there. Killed at any moment and called again, it gives the image of an
-            undisturbed run.
+            exists, the render continues from there. A render that was killed at any moment and called again gives the
+            image of an undisturbed run.
         progress: show a bar on stderr.
     Raises:
         InputError: an argument is out of range, or no limit is given; the checkpoint is of another render, is damaged
             or cannot be written.
         KeyboardInterrupt: Ctrl-C while the kernel compiles. Later, Ctrl-C, SIGTERM and SIGHUP end the render, which
-            returns what is done (in the main thread only, since Python handles signals nowhere else).
+            returns the image so far (in the main thread only, since Python handles signals nowhere else).
     Warns:
         InputWarning: the checkpoint cannot be written after rendering has begun. The image is returned, and the last
             checkpoint that was written is intact.
@@ -100,14 +100,14 @@ def render_until(
 
 
 class Render:
-    """What `render_until` does, in steps: check the arguments and take up the checkpoint, compile, run."""
+    """The steps of `render_until`: check the arguments and load the checkpoint, compile, run."""
 
     def __init__(self, scene, target_error, time_limit, spp, seed, strategy, checkpoint):
         _check(target_error, time_limit, spp)
         self.options = Options(strategy)
         check_counts(MAX_SPP if spp is None else spp, seed)
         self.options.check_strategy(scene)
-        # So the kernel that one scene has left in the cache is another one's too, of a batch or not.
+        # Padded, so that other scenes, in a batch or not, find this one's kernel in the cache.
         self.scene, self.seed = padded(scene), operator.index(seed)
         self.target_error, self.time_limit = target_error, time_limit
         self.spp = MAX_SPP if spp is None else int(spp)
@@ -128,7 +128,7 @@ class Render:
             passes.plan(self.state, min(PILOT_SPP, self.spp))
 
     def _agree(self) -> None:
-        """Begin where the first process does, who alone needs to see the checkpoint."""
+        """Start from the state of the first process, the only one that needs access to the checkpoint."""
         state = self.state
         facts = np.int32(state.spp), np.int32(state.chunk), np.float32(state.seconds)
         (spp, chunk, seconds), state.means = distributed.of_first((facts, state.means))
@@ -151,10 +151,10 @@ class Render:
         return result
 
     def _run(self, interrupts, show) -> tuple[str, tuple | None]:
-        """Extend the state until there is a reason to stop. What it becomes depends on itself alone, not on time.
+        """Extend the state until there is a reason to stop. Its evolution depends on itself alone, not on time.
 
         Returns:
-            the reason, and what `_evaluate` gives where it is known.
+            the reason, and the result of `_evaluate` if it is known.
         """
         state, error = self.state, UNKNOWN
         started = time.perf_counter() - state.seconds
@@ -162,7 +162,7 @@ class Render:
         def stopped():
             if interrupts.heard:
                 return "interrupted"
-            # However short the time, something is rendered: it is 0 until then.
+            # state.seconds is 0 before the first call, so something is rendered however short the limit.
             if self.time_limit is not None and state.seconds and time.perf_counter() - started >= self.time_limit:
                 return "time limit"
             return None
@@ -190,10 +190,10 @@ class Render:
         return self.target_error is not None and error.bound <= self.target_error
 
     def _evaluate(self) -> tuple[np.ndarray, np.ndarray, error_estimate.ImageError]:
-        """Image and its variance, (H, W, 3) each, and its error."""
+        """Return the image and its variance, (H, W, 3) each, and its error."""
         shape = (*film.image_shape(self.scene.film), 3)
         image, variance = (x.reshape(shape) for x in self.state.moments())
-        # While some pixels know nothing of their error, neither does the image.
+        # The error of the image is unknown while that of some pixels is.
         known = self.state.count.min() >= 2
         alike = float(np.square(film.correlation(self.scene.film)).sum())
         return image, variance, error_estimate.image_error(image, variance, alike) if known else UNKNOWN
@@ -228,9 +228,9 @@ def _next_spp(spp: int, error: error_estimate.ImageError, target: float | None) 
 
 @contextmanager
 def _bar(wanted: bool) -> Iterator:
-    """A function (Render, error at the end of the last round) that shows how far it is.
+    """Yield a function (Render, error at the end of the last round) that displays the progress.
 
-    Nothing that goes wrong with the display ends the render.
+    Errors of the display do not end the render.
     """
     if not wanted:
         yield lambda *_: None
