@@ -1,7 +1,7 @@
-"""What measures light: sensors, a file a kind, and the film behind them with its reconstruction filter.
+"""Sensors, one file per kind, and the film behind them with its reconstruction filter.
 
-A sensor is two classes of `sensor`: `Sensor`, what a scene file says of one, and `Camera`, the arrays that a ray is
-made of. A filter is a class of `filters`. One row in a table makes a kind exist for scene files and in kernels.
+A sensor is two classes of `sensor`: `Sensor`, its description in a scene file, and `Camera`, the arrays from which rays
+are generated. A filter is a class of `filters`. One row in a table registers a kind for scene files and kernels.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ __all__ = [
     "ThinLens",
 ]
 
-# By the name that scene files give them.
+# Kinds by their names in scene files.
 KINDS: dict[str, type[Sensor]] = {
     "perspective": Perspective,
     "thinlens": ThinLens,

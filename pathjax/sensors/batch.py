@@ -1,4 +1,4 @@
-"""Several sensors that share a film, on which they stand side by side."""
+"""Several sensors side by side on one film."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ MOST = 1 << 16
 @register_dataclass
 @dataclass(frozen=True)
 class Cameras(Camera):
-    alike: tuple[Camera, ...]  # each of these is several, of which every array has a row
-    places: Int[Array, "N 2"]  # by sensor, from the left: which of `alike`, and the row
+    alike: tuple[Camera, ...]  # each stacks several cameras of one structure, a row of every array per camera
+    places: Int[Array, "N 2"]  # per sensor, from the left: index into `alike`, and the row
 
     def sample_ray(self, position: Float[Array, "2"], u_lens: Float[Array, "2"]) -> Ray:
         count = self.places.shape[0]
@@ -43,7 +43,7 @@ class Cameras(Camera):
 
 @dataclass(frozen=True)
 class Batch(Sensor):
-    """Each has as many columns of the film as the others; films of their own have no effect."""
+    """Sensors that get equally many columns of the film each; films of their own have no effect."""
 
     inside: tuple[Sensor, ...]
 

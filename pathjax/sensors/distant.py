@@ -1,4 +1,4 @@
-"""The sensor infinitely far away: the radiance that leaves a scene in one direction."""
+"""The infinitely distant sensor: it measures the radiance that leaves a scene in one direction."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from pathjax.sensors.sensor import Sensor
 @register_dataclass
 @dataclass(frozen=True)
 class ParallelRays(OneRay):
-    """Rays that start evenly on a disk around `origin`."""
+    """Parallel rays with origins uniform on a disk around `origin`."""
 
     across: Float[Array, "2 3"]  # two radii of the disk
 
@@ -36,7 +36,7 @@ class ParallelRays(OneRay):
 @register_dataclass
 @dataclass(frozen=True)
 class ParallelsOntoShape(OneRay):
-    """Rays that would meet all points of a shape evenly; they start before the sphere around `origin`."""
+    """Parallel rays towards uniform points of a shape; they start outside the sphere around `origin`."""
 
     region: region.Region
     radius: Float[Array, ""]
@@ -49,16 +49,16 @@ class ParallelsOntoShape(OneRay):
 
 @dataclass(frozen=True)
 class Distant(Sensor):
-    """Looks in one direction: at a point, evenly at a shape, or at the disk that the sphere around the scene's box
-    covers.
+    """Sensor that looks in one direction: at a point, uniformly at a shape, or at the disk that the sphere around the
+    scene's box covers.
 
-    In files the direction, or `to_world`, which turns z to it; its scale is that of the disk.
+    Files give the direction, or `to_world`, which rotates z to it and whose scale is that of the disk.
     """
 
     direction: np.ndarray  # (3,) unit
     across: np.ndarray  # (2, 3) x and y of `to_world`
-    target: np.ndarray | object | None  # (3,), or a `description.Shape`; None: all of the scene
-    center: np.ndarray  # (3,) of that sphere
+    target: np.ndarray | object | None  # (3,), or a `description.Shape`; None: the whole scene
+    center: np.ndarray  # (3,) of the sphere around the scene's box
     radius: float
 
     one_pixel: ClassVar[bool] = True

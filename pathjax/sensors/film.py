@@ -1,4 +1,4 @@
-"""Pixels, and where in them samples look."""
+"""The film: its pixels, and the positions of samples in them."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from pathjax.sensors import filters
 from pathjax.sensors.filters import Box, Filter, Gaussian
 
 MAX_PIXELS = 10**9
-# Samples count in this many pixels to either side at most: work and program grow with the square. A filter that is
-# wider is sampled by importance, each pixel for itself.
+# Samples count in at most this many pixels to either side: work and program size grow with the square. A wider filter
+# is importance-sampled, for each pixel separately.
 MOST_REACH = 4
-# At which the filter is looked at, over the width of a pixel.
+# Points per pixel width at which the filter is evaluated.
 _POINTS = 256
 PIXEL_FORMATS = ("rgb", "rgba", "luminance", "luminance_alpha", "xyz", "xyza")
 
@@ -37,19 +37,19 @@ class Film:
     height: int = field(metadata={"static": True})
     crop: tuple[int, int, int, int] = field(metadata={"static": True})  # offset x, y, width, height
     reach: int = field(metadata={"static": True})  # pixels to either side of its own that the filter covers
-    # Whether a sample counts in all of these; else each pixel draws samples of its own, by importance of the filter.
+    # Whether a sample counts in all of these pixels; else each pixel importance-samples the filter for itself.
     shared: bool = field(metadata={"static": True})
-    border: bool = field(metadata={"static": True})  # whether what is just outside of the crop window is sampled too
-    running: jax.Array | None  # (2 reach + 2,) integral of the filter up to edges of pixels; None: not needed
+    border: bool = field(metadata={"static": True})  # whether pixels just outside the crop window are sampled too
+    running: jax.Array | None  # (2 reach + 2,) integral of the filter up to the edges of pixels; None: not needed
 
 
 @dataclass(frozen=True)
 class HDRFilm:
-    """What a scene file says of the film."""
+    """Description of the film in a scene file."""
 
     width: int = 768
     height: int = 576
-    crop: tuple[int, int, int, int] | None = None  # offset x, offset y, width, height; None: all of the film
+    crop: tuple[int, int, int, int] | None = None  # offset x, offset y, width, height; None: the whole film
     filter: Filter = Gaussian()
     sample_border: bool = False
 
@@ -86,17 +86,17 @@ class HDRFilm:
         return Film(filter, self.width, self.height, crop, reach, shared, self.sample_border, running)
 
 
-# By the name that scene files give them.
+# Kinds by their names in scene files.
 KINDS = {"hdrfilm": HDRFilm}
 
 
 def sample_position(
     film: Film, pixel: Int[Array, ""], u: Float[Array, "2"]
 ) -> tuple[Float[Array, "2"], Float[Array, ""]]:
-    """Where a sample of a pixel looks.
+    """Sample the film position of a pixel's sample.
 
     Args:
-        pixel: row by row over the crop window.
+        pixel: index, row by row over the crop window.
     Returns:
         position in [0, 1]^2 over the whole film (a wide filter reaches beyond), and weight, of mean 1.
     """
@@ -109,7 +109,7 @@ def sample_position(
 
 
 def pixels(film: Film) -> Int[Array | np.ndarray, " N"]:
-    """All pixels that are sampled for an image, row by row. NumPy numbers them where it can: that compiles nothing."""
+    """Return all pixels that are sampled for an image, row by row; by NumPy if possible, which compiles nothing."""
     module = jnp if any(map(is_traced, jax.tree.leaves(film))) else np
     return module.arange(pixel_count(of_samples(film)), dtype=np.int32)
 
@@ -119,12 +119,12 @@ def pixel_count(film: Film) -> int:
 
 
 def image_shape(film: Film) -> tuple[int, int]:
-    """Height and width of the image, that of the crop window."""
+    """Return height and width of the image, which is the crop window."""
     return film.crop[3], film.crop[2]
 
 
 def of_samples(film: Film) -> Film:
-    """The film on which the samples of one that shares them are drawn: evenly, each in its own pixel."""
+    """Return the film for drawing shared samples: box-filtered, so that each sample is uniform in its own pixel."""
     x, y, width, height = film.crop
     out = _outside(film)
     window = x - out, y - out, width + 2 * out, height + 2 * out
@@ -132,7 +132,7 @@ def of_samples(film: Film) -> Film:
 
 
 def cropped(film: Film, image: Float[Array, "R N *rest"]) -> Float[Array, "R HW *rest"]:
-    """The pixels of `of_samples(film)` that are in the film's own crop window."""
+    """Return the pixels of `of_samples(film)` that are in the film's own crop window."""
     _, _, width, height = of_samples(film).crop
     out = _outside(film)
     inside = image.reshape(len(image), height, width, *image.shape[2:])[:, out : height - out, out : width - out]
@@ -140,7 +140,7 @@ def cropped(film: Film, image: Float[Array, "R N *rest"]) -> Float[Array, "R HW 
 
 
 def extended(film: Film, image: Real[Array, "R HW"]) -> Real[Array, "R N"]:
-    """An image as `cropped` gives it, continued beyond its borders."""
+    """Extend an image from `cropped` beyond its borders, by repeating the border pixels."""
     height, width = image_shape(film)
     out = _outside(film)
     inside = image.reshape(len(image), height, width)
@@ -148,9 +148,9 @@ def extended(film: Film, image: Real[Array, "R HW"]) -> Real[Array, "R N"]:
 
 
 def correlation(film: Film) -> Float[Array | np.ndarray, "S S"]:
-    """Return the correlation of the noise of pixels (y, x) with that of the one in the middle: they share samples.
+    """Return the correlation of the noise of pixels (y, x) with that of the middle one, due to shared samples.
 
-    The light of a sample is taken to be independent of where in its pixel it lies.
+    The light of a sample is assumed to be independent of its position in the pixel.
     """
     return _correlation(film) if film.shared else np.ones((1, 1), film.filter.radius.dtype)
 
@@ -165,7 +165,7 @@ def _correlation(film: Film) -> Float[Array, "S S"]:
 
 
 def _heights(filter: Filter, reach: int) -> Float[Array, "S points"]:
-    """The filter over each pixel that it covers, at points of equal distance."""
+    """Return the filter over each pixel that it covers, at equidistant points."""
     steps = jnp.arange(-reach, reach + 1)[:, None]
     x = (jnp.arange(_POINTS) + 0.5) / _POINTS - 0.5
     return filter.evaluate((x + steps).astype(filter.radius.dtype))
@@ -178,7 +178,7 @@ def _running(filter: Filter, reach: int) -> Float[Array, " edges"]:
 
 
 def _inside(film: Film, pixel: Int[Array, ""], offset: Float[Array, "2"]) -> Float[Array, ""]:
-    """Weight of mean 1 by which a pixel looks through that part of its filter which lies in the crop window."""
+    """Return a weight of mean 1 that restricts a pixel's filter to the crop window."""
     _, _, *size = film.crop
     weight = jnp.ones_like(offset[0])
     for place, count, distance in zip((pixel % size[0], pixel // size[0]), size, offset, strict=True):
@@ -194,5 +194,5 @@ def _outside(film: Film) -> int:
 
 
 def with_own_samples(film: Film) -> Film:
-    """The film whose pixels share no samples, and so are independent of each other; the mean image is the same."""
+    """Return the film whose pixels share no samples, so are independent of each other; the mean image is the same."""
     return replace(film, shared=False)

@@ -1,4 +1,4 @@
-"""The sensor that measures how much light falls on a shape."""
+"""The sensor that measures the irradiance of a shape."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ from pathjax.sensors.sensor import Camera, Sensor
 @register_dataclass
 @dataclass(frozen=True)
 class Skin(Camera):
-    """Looks from all points of a shape, evenly, in all directions before it, by the cosine."""
+    """Rays from uniform points of a shape, in cosine-weighted directions on the side of its normals."""
 
     region: region.Region
 
-    gain: ClassVar[float] = math.pi  # the mean radiance by the cosine times pi is the irradiance
+    gain: ClassVar[float] = math.pi  # irradiance = pi times the cosine-weighted mean radiance
 
     def sample_ray(self, position: Float[Array, "2"], u_lens: Float[Array, "2"]) -> Ray:
         p, n, margin = self.region.sample(position)
@@ -37,7 +37,7 @@ class Skin(Camera):
 
 @dataclass(frozen=True)
 class IrradianceMeter(Sensor):
-    """The mean irradiance of a shape, on the side of its normals; in files it stands inside of the shape."""
+    """Sensor of the mean irradiance of a shape, on the side of its normals; in files it is nested in the shape."""
 
     shape: object  # `description.Shape`
 

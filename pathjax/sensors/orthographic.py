@@ -19,9 +19,9 @@ from pathjax.sensors.sensor import Camera, Sensor
 @register_dataclass
 @dataclass(frozen=True)
 class OrthographicCamera(Camera):
-    """`origin` is where rays of the film's upper left corner start, on the near clip plane."""
+    """Parallel rays; `origin` is the start of those of the film's upper left corner, on the near clip plane."""
 
-    across: Float[Array, "2 3"]  # from there to the film's upper right corner, and to the lower left one
+    across: Float[Array, "2 3"]  # from `origin` to the film's upper right corner, and to the lower left one
     direction: Float[Array, "3"]  # unit
     length: Float[Array, ""]  # of rays
 
@@ -32,7 +32,7 @@ class OrthographicCamera(Camera):
 
 @dataclass(frozen=True)
 class Orthographic(Sensor):
-    """Looks along +z, x to the left, y up; the film is 2 wide before `to_world`, which may scale it, as in Mitsuba."""
+    """Camera along +z, x to the left, y up; the film is 2 wide before `to_world`, which may scale it, as in Mitsuba."""
 
     to_world: np.ndarray  # (4, 4)
     near_clip: float = 1e-2

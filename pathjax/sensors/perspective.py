@@ -45,16 +45,16 @@ class PerspectiveCamera(Camera):
     def through_lens(
         self, local: Float[Array, "3"], u_lens: Float[Array, "2"]
     ) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
-        """Where on the lens a ray starts, and its direction, of any length; both in the camera's axes.
+        """Return where on the lens a ray starts, and its direction, of any length; both in the camera's axes.
 
-        local: the direction through the middle of the lens, 1 along the optical axis.
+        local: direction through the middle of the lens, with component 1 along the optical axis.
         """
         return jnp.zeros_like(local), local
 
 
 @dataclass(frozen=True)
 class Perspective(Sensor):
-    """Looks along +z, x to the left, y up, as Mitsuba's."""
+    """Camera along +z, x to the left, y up, as in Mitsuba."""
 
     to_world: np.ndarray  # (4, 4)
     fov: float  # degrees, along fov_axis
@@ -77,14 +77,14 @@ class Perspective(Sensor):
 
     @staticmethod
     def read_lens(fields: Fields, far: float) -> dict[str, float]:
-        """Further fields, of cameras that have a lens."""
+        """Read the further fields of cameras that have a lens."""
         return {}
 
     def build(self, film: HDRFilm, dtype) -> PerspectiveCamera:
         return PerspectiveCamera(*self.arrays(film, dtype))
 
     def arrays(self, film: HDRFilm, dtype):
-        """The arrays of a `PerspectiveCamera`, in order."""
+        """Return the arrays of a `PerspectiveCamera`, in order."""
         half = half_extent(self.fov, self.fov_axis, film.width / film.height)
         # The local x axis points to the left of the image.
         axes = self.to_world[:3, :3] / np.linalg.norm(self.to_world[:3, :3], axis=0)

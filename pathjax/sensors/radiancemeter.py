@@ -28,7 +28,7 @@ class OneRay(Camera):
 
 @dataclass(frozen=True)
 class RadianceMeter(Sensor):
-    """Looks from a point in one direction: in files both, or the origin and the z axis that `to_world` moves."""
+    """Sensor of one ray. Files give origin and direction, or `to_world`, which maps origin and z axis to them."""
 
     origin: np.ndarray  # (3,)
     direction: np.ndarray  # (3,) unit

@@ -1,4 +1,4 @@
-"""The surface of a shape, as sensors look at it: points of it, drawn evenly."""
+"""The surface of a shape for sensors: uniform points of it."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from pathjax.shapes.shape import SurfacePoint, Table
 @dataclass(frozen=True)
 class Region:
     table: Table  # of this shape alone
-    before: Float[Array, " N"]  # shares of the area that come before each primitive, and 1
+    before: Float[Array, " N"]  # cumulated shares of the area before each primitive, and 1
 
     def sample(self, u: Float[Array, "2"]) -> SurfacePoint:
-        """A point, drawn uniformly in area."""
+        """Sample a point, uniform in area."""
         u = jnp.clip(u, 0, float(1 - jnp.finfo(u.dtype).eps))
         row, across = search(self.before, 0, self.before.shape[0] - 1, u[0])
         return self.table.sample(row, jnp.stack([across, u[1]]))
 
 
 def build(shape, dtype) -> Region:
-    """shape: a `description.Shape`."""
+    """Build the Region of a `description.Shape`."""
     table, _ = shape.geometry.table.build([shape.geometry.primitives(shape.flip_normals)], [False], dtype, "sah", None)
     if not table.even().all():
         what = f"shape {shape.name!r} is round and scaled unevenly"

@@ -1,4 +1,4 @@
-"""What a sensor is."""
+"""Interface of sensors."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from pathjax.sensors.film import HDRFilm
 
 @dataclass(frozen=True)
 class Camera(ABC):
-    """A sensor in a scene: arrays, of the dtype of the scene. A pytree."""
+    """A sensor in a scene: a pytree of arrays of the scene's dtype."""
 
     origin: Float[Array, "3"]  # in world space
 
-    gain: ClassVar[float] = 1  # what is measured over the mean radiance of its rays
+    gain: ClassVar[float] = 1  # measured quantity over the mean radiance of the rays
 
     @abstractmethod
     def sample_ray(self, position: Float[Array, "2"], u_lens: Float[Array, "2"]) -> Ray:
@@ -35,10 +35,10 @@ class Camera(ABC):
 
 
 class Sensor(ABC):
-    """What a scene file says of a sensor, NumPy and numbers."""
+    """Description of a sensor in a scene file, of NumPy arrays and scalars."""
 
-    one_pixel: ClassVar[bool] = False  # measures one number, whatever the filter
-    parts: ClassVar[int] = 1  # of the film, side by side
+    one_pixel: ClassVar[bool] = False  # measures one value, whatever the filter
+    parts: ClassVar[int] = 1  # parts of the film, side by side
     inner: ClassVar[bool] = True  # may be such a part
     # Nothing moves while the shutter is open.
     unused: ClassVar[Mapping[str, Unused]] = {"shutter_open": Unused("float"), "shutter_close": Unused("float")}
@@ -46,11 +46,11 @@ class Sensor(ABC):
     @classmethod
     @abstractmethod
     def read(cls, loader, fields: Fields) -> Sensor:
-        """Ask for what an element may hold; its film and its sampler are the loader's."""
+        """Read the fields of an element, except film and sampler, which the loader reads."""
 
     @staticmethod
     def read_clips(fields: Fields) -> tuple[float, float]:
-        """Distances before which and beyond which nothing is seen."""
+        """Read the near and far clip distances."""
         near, far = fields.float("near_clip", 1e-2, above=0), fields.float("far_clip", 1e4, above=0)
         if near >= far:
             raise fields.error("near_clip", f"must be smaller than far_clip, {far:g}; is {near:g}")

@@ -1,4 +1,4 @@
-"""The camera with a thin lens: sharp in the plane of focus alone."""
+"""The thin-lens camera: sharp only in the plane of focus."""
 
 from __future__ import annotations
 
