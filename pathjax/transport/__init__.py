@@ -1,11 +1,11 @@
-"""Light transport as linear algebra: the operator T of a diffuse scene cut into patches, and (I - T)^-1 Le.
+"""Light transport as linear algebra: the operator T of a diffuse scene divided into patches, and (I - T)^-1 Le.
 
     op = transport.operator(scene, patches=2000)
     solution = op.solve()                                       # L = Le + T L on the patches
     image = transport.image(scene, op.radiosity(solution.L))    # through the camera, without noise
 
-`operator` says what a scene may hold, `operators.py` what is discretised and how it errs, `radiance` looks light up
-at a point of a surface within code of one ray, `Operator.control` makes paths end in it.
+`operator` documents which scenes are supported, `operators.py` the discretisation and its errors. `radiance` looks up
+light at a surface point within code for one ray, `Operator.control` lets paths end in it.
 """
 
 from pathjax.transport.control import Control

@@ -1,12 +1,12 @@
-"""A coarse solution as a control variate of the path tracer: roulette that ends paths into L0 instead of into 0.
+"""A coarse solution as a control variate of the path tracer: roulette that ends paths in L0 instead of in 0.
 
-At a vertex y of a path let S(y) = (T L)(y) be the light that it reflects, S0(y) its value on the patches, and s the
-estimate of S(y) that the rest of the path would make. With survival q, independent of s,
+At a vertex y of a path let S(y) = (T L)(y) be the reflected light, S0(y) its value on the patches, and s the estimate
+of S(y) by the rest of the path. With survival probability q, independent of s, the estimate
 
     S0(y)  if the path ends,        S0(y) + (s - S0(y)) / q  if it goes on,
 
 has the mean of s whatever S0 is, and the variance Var(s) / q + (1 / q - 1) (S(y) - S0(y))^2, where plain roulette has
-S(y)^2 in the last term. The first term remains however good S0 is: a perfect one saves time at the price of noise.
+S(y)^2 in the last term. The first term remains however good S0 is: a perfect S0 saves time at the cost of noise.
 
 Survival is proportional to the share of a path's expected light that is still to be found at y, throughput * S0(y)
 over S0 at its first vertex (Vorba and Krivanek 2016, "Adjoint-driven Russian roulette and splitting").
@@ -28,20 +28,20 @@ from pathjax.shapes.geometry import Geometry
 from pathjax.transport.patches import refuse_media
 from pathjax.transport.view import Radiosity, radiance
 
-# Pixels would show the patches if paths ended at what the camera sees.
+# First depth of roulette: pixels would show the patches if paths ended at their first vertex.
 _FIRST = 2
 
 
 @register_dataclass
 @dataclass(frozen=True)
 class Control:
-    """The control variate of `pathjax.render`, as `Operator.control` makes it."""
+    """Control variate for `pathjax.render`, built by `Operator.control`."""
 
     reflected: Radiosity  # S0
-    effort: jax.Array  # () survival where all of a path's light is still to be found
+    effort: jax.Array  # () survival where all of a path's expected light is still to be found
 
     def check(self, scene: Scene) -> None:
-        """Refuse, with an InputError, a scene of other shapes, or with media."""
+        """Refuse, with an InputError, a scene with other shapes or with media."""
         refuse_media(scene)
         cut, held = self.reflected.patches.first.shape[0], scene.geometry.shape.shape[0]
         if cut != held:
@@ -51,19 +51,19 @@ class Control:
             )
 
     def roulette(self, shapes: Geometry, path, hit, surface, u):
-        """Decide at a vertex, before its light is sampled, whether a path goes on.
+        """Decide at a vertex, before its light is sampled, whether a path continues.
 
         Args:
             path: `integrators.path.Path` that has reached the vertex, where `geometry.surface` is `surface`.
             u: () uniform.
         Returns:
-            Path, its L and throughput weighted; () bool whether it goes on.
+            The Path with L and throughput weighted; () bool whether it continues.
         """
         S0 = radiance(self.reflected, shapes, hit.primitive, surface.p, dot(surface.n, path.ray.d) > 0)
         left = path.throughput * S0
         size = left[0] + left[1] + left[2]
         expected = jnp.where(path.depth == 1, size, path.expected)
-        # Where nothing is expected, the patches know nothing.
+        # Where the patches expect no light, they give no information.
         share = jnp.where(expected > 0, safe_divide(size, expected), 1)
         survival = roulette.bounded(self.effort * share)
         survival = compute_once(jnp.where(path.depth >= _FIRST, survival, 1))

@@ -1,11 +1,12 @@
-"""Form factors of polygons: exact from points, Gauss-Legendre over the points, rays where something may hide them.
+"""Form factors of polygons: exact from points, Gauss-Legendre over the points, rays for visibility.
 
 The share of the light of a point x with normal n that goes straight to a polygon is (Lambert 1760)
 
     sum over its edges of  angle * n . axis / 2 pi,
 
-angle and axis those of the turn from one end of the edge to the other as seen from x, of the part of the polygon above
-the horizon of x. Shares of all that x sees add up to 1 exactly, so a closed scene loses no light, whatever the rule.
+with the angle and axis of the rotation from one end of the edge to the other as seen from x, for the part of the
+polygon above the horizon of x. Shares of all polygons around x sum to 1 exactly, so a closed scene loses no light,
+whatever the quadrature.
 """
 
 from __future__ import annotations
@@ -27,19 +28,19 @@ from pathjax.scene.scene import Scene
 from pathjax.shapes import geometry
 from pathjax.transport.patches import Patches, point
 
-# Points along each side of a patch, and of one whose distance is less than _NEAR times the sum of the two radii: there
-# the share bends more than a cubic can. The difference between the two directions tells what is left.
+# Quadrature points along each side of a patch: _FEW, or _MANY for pairs closer than _NEAR times the sum of their radii,
+# where a cubic does not fit the share. The difference between the two directions estimates the remaining error.
 _FEW, _MANY, _NEAR = 2, 6, 3
 # A patch that misses less of its light than this misses none: corners are rounded, to float32 in most scenes.
 _MISSED = 1e-5
-# Pairs taken at once: their numbers stay in the second cache.
+# Pairs at a time: their data stay in the second-level cache.
 _BLOCK = 1 << 15
-# More primitives than that are not asked one by one which pairs they might hide: all pairs are.
+# With more primitives than this, they are not tested one by one: any pair may be hidden.
 MOST_BLOCKERS = 64
 
 
 def are_exact(scene: Scene) -> bool:
-    """Whether the scene is made of polygons, or of one sphere, so that its form factors have a closed form."""
+    """Return whether all shapes are polygons, or one sphere, so that the form factors have a closed form."""
     return _one_sphere(scene) or all(table.polygons for table in scene.geometry.tables)
 
 
@@ -49,15 +50,15 @@ def _one_sphere(scene) -> bool:
 
 
 def form_factors(scene: Scene, patches: Patches, rays: int, seed: int) -> tuple[np.ndarray, np.ndarray, bool | None]:
-    """Form factors times the areas of their rows.
+    """Return the form factors times the areas of their rows.
 
     Args:
-        rays: between the two of each pair that something may hide from each other.
+        rays: rays per pair of patches that something may hide from each other.
     Returns:
-        A_i F_ij (U, U), symmetric; its errors (U, U), half the difference of the two directions, and that of
-        visibility; whether the scene is closed, None where that is hidden too.
+        A_i F_ij (U, U), symmetric; its errors (U, U), from half the difference of the two directions and from
+        visibility; whether the scene is closed, None if some patches may be hidden.
     Raises:
-        InputError: curved shapes, but for the inside of one sphere.
+        InputError: curved shapes, except the inside of one sphere.
     """
     if not are_exact(scene):
         raise InputError('spheres and disks, but for the inside of one sphere alone, need method="rays"')
@@ -69,7 +70,7 @@ def form_factors(scene: Scene, patches: Patches, rays: int, seed: int) -> tuple[
     primitive = np.asarray(patches.primitive)[np.asarray(patches.cell)]
     one_way = area[:, None] * _shares(corners, normals, primitive)
     exchange, error = (one_way + one_way.T) / 2, np.abs(one_way - one_way.T) / 2
-    # Coordinates are float32 in most scenes: what lies in a plane lies beside it by some roundings.
+    # Coordinates are float32 in most scenes: points of a plane are off it by a few rounding errors.
     slack = 16 * np.finfo(patches.area.dtype).eps * np.abs(corners).max()
     pairs = np.argwhere(np.triu(_maybe_hidden(*planes, corners, normals, slack) & (exchange > 0)))
     closed = np.abs(one_way.sum(1) / area - 1).max() < _MISSED
@@ -84,7 +85,7 @@ def form_factors(scene: Scene, patches: Patches, rays: int, seed: int) -> tuple[
 
 
 def _in_sphere(table, patches):
-    """Chords of a sphere meet both ends at the same angle: every patch sends an equal share to equal areas."""
+    """Form factors inside a sphere: chords meet both ends at the same angle, so equal areas get equal shares."""
     inwards = np.asarray(patches.back) != table.turned_inwards
     area = np.where(inwards, np.asarray(patches.area, float), 0)
     exchange = np.outer(area, area) / table.areas()
@@ -95,7 +96,7 @@ def _in_sphere(table, patches):
 
 
 def _planes(scene):
-    """A corner and two edges of each primitive (Q, 3, 3), whether it is a triangle (Q,), its unit normal (Q, 3)."""
+    """Return corner and two edges of each primitive (Q, 3, 3), whether it is a triangle (Q,), unit normal (Q, 3)."""
     bases, triangular, normals = [], [], []
     for table in scene.geometry.tables:
         edges, n = table.edges_and_normals()
@@ -106,18 +107,18 @@ def _planes(scene):
 
 
 def _steps(triangular):
-    """(4, N, 2) corners of a cell along its two edges; the last of a triangle twice."""
+    """Return the corners (4, N, 2) of a cell along its two edges; triangles repeat the last one."""
     square, triangle = ([[0, 0], [1, 0], [1, 1], [0, 1]], [[0, 0], [1, 0], [0, 1], [0, 1]])
     return np.where(triangular[:, None], np.array(triangle)[:, None], np.array(square)[:, None])
 
 
 def _at(bases, xy):
-    """Points (4, 3, N) at the coordinates (4, N, 2) of bases (N, 3, 3)."""
+    """Return the points (4, 3, N) at the coordinates (4, N, 2) of bases (N, 3, 3)."""
     return np.swapaxes(bases[:, 0] + xy[..., :1] * bases[:, 1] + xy[..., 1:] * bases[:, 2], 1, 2)
 
 
 def _polygons(patches, bases, triangular, normals):
-    """Corners (4, 3, U) in turn and unit normals (3, U) of the patches."""
+    """Return the corners (4, 3, U), in order, and unit normals (3, U) of the patches."""
     cell = np.asarray(patches.cell)
     primitive = np.asarray(patches.primitive)[cell]
     grid, place = np.asarray(patches.grid)[primitive], np.asarray(patches.place)[cell]
@@ -131,7 +132,7 @@ def _polygons(patches, bases, triangular, normals):
 
 
 def _points(corners, order):
-    """Nodes (order^2, 3, U) and weights (order^2, U), of sum 1, on parallelograms and triangles."""
+    """Return quadrature nodes (order^2, 3, U) and weights (order^2, U), of sum 1, on parallelograms and triangles."""
     x, w = np.polynomial.legendre.leggauss(order)
     x, w = (x + 1) / 2, w / 2
     s, t = (a.ravel()[:, None, None] for a in np.meshgrid(x, x))
@@ -145,7 +146,7 @@ def _points(corners, order):
 
 
 def _shares(corners, normals, primitive):
-    """(U, U) share of the light of each patch that goes to each of other primitives, were nothing between them."""
+    """Return the shares (U, U) of each patch's light that reach each patch of other primitives, without occlusion."""
     count = len(primitive)
     shares = np.empty((count, count))
     nodes, weights = _points(corners, _FEW)
@@ -166,7 +167,7 @@ def _shares(corners, normals, primitive):
 
 
 def _near(corners):
-    """(U, U) bool: close for their size."""
+    """Return (U, U) bool: whether two patches are close relative to their size."""
     center = corners.mean(0)
     radius = np.linalg.norm(corners - center, axis=1).max(0)
     squared = sum((x[:, None] - x) ** 2 for x in center)
@@ -174,10 +175,11 @@ def _near(corners):
 
 
 def _share(x, n, corners, facing):
-    """Share of the light of points that goes to polygons, Lambert's formula; arguments broadcast.
+    """Return the share of the light of points that goes to polygons, by Lambert's formula; arguments broadcast.
 
     Args:
-        x, n: (3, ...) points and their normals; corners: (4, 3, ...); facing: (3, ...) normals of the polygons.
+        x, n: (3, ...) points and their normals.
+        corners: (4, 3, ...) of the polygons; facing: (3, ...) their normals.
     """
     r = [[corner[axis] - x[axis] for axis in range(3)] for corner in corners]
     heights = [_dot(n, a) for a in r]
@@ -199,7 +201,7 @@ def _edges(r, n):
 
 
 def _edges_above(r, n):
-    """Edges of the part above the horizon: those of the polygon, cut, and the one on the horizon that closes it."""
+    """Return the edges of the part above the horizon: the polygon's edges, clipped, and the closing one on it."""
     edges, leave, enter = [], [0, 0, 0], [0, 0, 0]
     for a, b in _edges(r, n):
         ha, hb = _dot(n, a), _dot(n, b)
@@ -218,7 +220,7 @@ def _edges_above(r, n):
 
 
 def _turn(n, a, b):
-    """Angle from a to b times the part of its axis along n; 0 where one of them is."""
+    """Return the angle from a to b times the component of its axis along n; 0 if a or b is 0."""
     axis = [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
     length = np.sqrt(_dot(axis, axis))
     return np.arctan2(length, _dot(a, b)) * _dot(n, axis) / np.where(length > 0, length, 1)
@@ -228,14 +230,15 @@ def _dot(a, b):
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-# ---- who may hide whom ----------------------------------------------------------------------------------------------
+# ---- visibility -----------------------------------------------------------------------------------------------------
 
 
 def _maybe_hidden(bases, triangular, planes, corners, normals, slack):
-    """(U, U) bool: false where no primitive can come between two patches, as a plane tells that parts them from it.
+    """Return (U, U) bool: false if, for every primitive, a plane shows that it cannot come between two patches.
 
     Args:
-        bases, triangular, planes: of `_planes`; corners, normals: of `_polygons`.
+        bases, triangular, planes: from `_planes`.
+        corners, normals: from `_polygons`.
     """
     count = corners.shape[2]
     if len(bases) > MOST_BLOCKERS:
@@ -243,7 +246,7 @@ def _maybe_hidden(bases, triangular, planes, corners, normals, slack):
     low, high = corners.min(0), corners.max(0)
     maybe = np.zeros((count, count), bool)
     for points, plane in zip(np.moveaxis(_at(bases, _steps(triangular)), 2, 0), planes, strict=True):
-        # The primitive lies behind one of the two, or both lie on one side of it or of a plane across an axis.
+        # The primitive is behind one of the two, or both are on one side of its plane or of its box along an axis.
         behind = (np.tensordot(points, normals, 1) - _dot(normals, corners[0]) <= slack).all(0)
         clear = behind[:, None] | behind
         heights = np.tensordot(plane, corners, (0, 1)) - plane @ points[0]
@@ -257,9 +260,9 @@ def _maybe_hidden(bases, triangular, planes, corners, normals, slack):
 
 
 def _visible(scene, patches, pairs, rays, seed):
-    """(K,) share of the light between the two patches of each pair (K, 2) that nothing blocks, and its standard error.
+    """Return the unoccluded share (K,) of the light between the patches of each pair (K, 2), and its standard error.
 
-    What all rays say is not certain: of m rays, v m seen, the error is that of the share (v m + 1) / (m + 2).
+    Even a unanimous result is not certain: if v m of m rays are seen, the error is that of a share (v m + 1) / (m + 2).
     """
     i, j = np.asarray(pairs, np.int32).T
     sums = _visibility(scene.geometry, patches, i, j, np.int32(rays), np.uint32(seed))
@@ -276,7 +279,7 @@ def _visibility(shapes, patches, i, j, rays, seed):
 
 
 def _pair_visibility(work, shapes, patches, rays, seed):
-    """Sums over the rays between two patches of what they carry and is seen, of what they carry, and of its square."""
+    """Sum, over rays between two patches, the unoccluded light, the light without occlusion, and the latter squared."""
     i, j = work
     stream = sampler.combine(sampler.pixel_stream(seed, i), j)
 

@@ -1,14 +1,14 @@
-"""The transport operator of a diffuse scene cut into patches, and what solves L = Le + T L with it.
+"""The transport operator of a diffuse scene divided into patches, and solvers of L = Le + T L.
 
-Radiance is taken as constant on each patch (Galerkin's method with constants; Goral et al. 1984): with the form factors
+Radiance is constant on each patch (Galerkin's method with constants; Goral et al. 1984). With the form factors
 
     F_ij = 1 / A_i  integral over i and j of  cos cos visible / (pi r^2),        A_i F_ij = A_j F_ji,
 
 the light that leaves patch i is L_i = Le_i + rho_i sum_j F_ij L_j, so (T L)_i = rho_i (F L)_i.
 
-Two errors, apart from each other: that of the form factors, which `Operator.error` states, and that of the patches,
-which falls with their size h: by h in a point, by h^2 in means over many patches where the light is smooth. Refine and
-compare to know it; no number here holds it.
+There are two separate errors: that of the form factors, which `Operator.error` estimates, and that of the patches,
+which falls with their size h: as h at a point, as h^2 in means over many patches where the light is smooth. The latter
+is not estimated here; refine and compare to measure it.
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ from pathjax.transport.control import Control
 from pathjax.transport.patches import Patches, cut_scene
 from pathjax.transport.view import Radiosity, radiosity
 
-# How form factors are found, and with how many rays: of a pair, of a patch.
+# Methods for form factors, and their default number of rays: per pair of patches, per patch.
 METHODS = {"dense": 32, "rays": 256}
-# A dense matrix of more patches than that takes long to fill.
+# A dense matrix of more patches than this takes long to fill.
 _DENSE_PATCHES = 2048
-# Rays that ask whether a scene is closed, per patch.
+# Rays per patch that test whether a scene is closed.
 _PROBES = 64
 _SCALINGS = 100
 _RESTART = 20
@@ -67,9 +67,9 @@ class Dense:
 @register_dataclass
 @dataclass(frozen=True)
 class Sparse:
-    """Form factors of the pairs that some ray joins, by row: they take the space of rays, not of pairs.
+    """Form factors of the pairs that some ray joins, by row: memory grows with the number of rays, not of pairs.
 
-    Errors are those of counts; of pairs that no ray joins, none is known.
+    Errors are those of the ray counts; pairs that no ray joins have no error estimate.
     """
 
     row: jax.Array  # (K,) int32, ascending
@@ -96,7 +96,7 @@ class Solution(NamedTuple):
 @register_dataclass
 @dataclass(frozen=True)
 class Operator:
-    """T of a scene, U patches and 3 channels; a pytree, which may be passed to jitted functions."""
+    """T of a scene with U patches and 3 channels; a pytree, which may be passed to jitted functions."""
 
     patches: Patches
     factors: Dense | Sparse
@@ -110,7 +110,7 @@ class Operator:
 
     @property
     def F(self) -> lx.AbstractLinearOperator:
-        """Form factors, an operator on (U,); `as_matrix()` shows those of few patches."""
+        """Form factors, an operator on (U,); for few patches, `as_matrix()` shows them."""
         if isinstance(self.factors, Dense):
             return lx.MatrixLinearOperator(self.factors.matrix)
         structure = jax.ShapeDtypeStruct(self.area.shape, self.area.dtype)
@@ -118,12 +118,12 @@ class Operator:
 
     @property
     def T(self) -> lx.FunctionLinearOperator:
-        """One bounce, an operator on (U, 3): light that leaves the patches to light that they then reflect."""
+        """One bounce, an operator on (U, 3): maps light that leaves the patches to light that they then reflect."""
         return self._function(lambda L: self.albedo * self.factors.mv(L))
 
     @property
     def adjoint(self) -> lx.FunctionLinearOperator:
-        """T*, with <T f, g> = <f, T* g> for <f, g> = sum over patches of A f g: importance goes backwards by it."""
+        """T*, with <T f, g> = <f, T* g> for <f, g> = sum over patches of A f g: it transports importance backwards."""
         return self._function(lambda g: self.factors.mv(self.albedo * g))
 
     def _function(self, f):
@@ -131,50 +131,50 @@ class Operator:
 
     @usual_promotion
     def with_scene(self, scene: Scene) -> Operator:
-        """The same form factors with the reflectances and radiances of a scene of the same shapes; may be traced."""
+        """Return the operator with the reflectances and radiances, perhaps traced, of a scene of the same shapes."""
         return replace(self, **dict(zip(("albedo", "Le"), _albedos_and_lights(scene, self.patches), strict=True)))
 
     def radiosity(self, L) -> Radiosity:
-        """Light L (U, 3) on the patches, for `transport.image` and `transport.radiance`."""
+        """Return light L (U, 3) on the patches for `transport.image` and `transport.radiance`."""
         return radiosity(self.patches, L)
 
     @usual_promotion
     def control(self, L, effort: float = 2.0) -> Control:
-        """Light L (U, 3), best the solution, as a control variate for `pathjax.render`; see `control`.
+        """Return light L (U, 3), ideally the solution, as a control variate for `pathjax.render`; see `control`.
 
-        effort: survival where all of a path's light is still to be found; more makes paths longer and less noisy.
+        effort: survival where all of a path's light is still to be found; a higher one gives longer, less noisy paths.
         """
         return Control(self.radiosity(self.T.mv(L)), jnp.asarray(effort, self.Le.dtype))
 
     @usual_promotion
     def error(self, L) -> jax.Array:
-        """Standard error (U, 3) that the errors of the form factors leave in T L, for light L (U, 3)."""
+        """Return the standard error (U, 3) of T L due to the errors of the form factors, for light L (U, 3)."""
         return self.albedo * jnp.sqrt(self.factors.squared_errors_mv(L**2))
 
     @usual_promotion
     def terms(self, depth: int) -> jax.Array:
-        """Le, T Le, T^2 Le, ...: (depth, U, 3), the light that was reflected 0, 1, ... times. depth: at least 1."""
+        """Return Le, T Le, T^2 Le, ... as (depth, U, 3): light reflected 0, 1, ... times. depth: at least 1."""
         _check_depth(depth)
         return lax.scan(lambda term, _: (self.T.mv(term), term), self.Le, length=depth)[1]
 
     @usual_promotion
     def spectral_radius(self) -> jax.Array:
-        """(3,) largest eigenvalue of T by channel, by the power method: below 1 if the light dies out."""
+        """Return the largest eigenvalue of T per channel (3,), by the power method; below 1 if the light dies out."""
         return _spectral_radius(self)
 
     @usual_promotion
     def solve(self, method: str = "gmres", depth: int | None = None, tolerance: float | None = None) -> Solution:
-        """L = (I - T)^-1 Le.
+        """Solve for L = (I - T)^-1 Le.
 
         Args:
             method: "gmres" (all bounces, by lineax) or "neumann" (the first `depth` terms of Le + T Le + ...).
-            depth: number of terms, as `max_depth` counts them; None: as many as leave less than `tolerance`.
-            tolerance: of the residual, relative to the largest radiance emitted; None: 16 roundings.
+            depth: number of terms, counted as in `max_depth`; None: as many as leave less than `tolerance`.
+            tolerance: of the residual, relative to the largest radiance emitted; None: 16 rounding errors.
         Returns:
-            Solution. Where rounding rules, `residual` tells how far the solver came.
+            Solution. If rounding limits the accuracy, `residual` shows what the solver reached.
         Raises:
-            InputError: unknown method, a depth below 1, or light that does not die out: a spectral radius of 1 (which
-                is not looked for where albedos are traced).
+            InputError: unknown method, a depth below 1, or light that does not die out: a spectral radius of 1 (not
+                checked if albedos are traced).
         Differentiable in albedo and Le in both modes, for "gmres" by differentiating the equation, not the solver.
         """
         tolerance = 16 * float(jnp.finfo(self.Le.dtype).eps) if tolerance is None else tolerance
@@ -199,11 +199,11 @@ class Operator:
         return min(max(terms, 1), _MOST_TERMS)
 
     def _check_radius(self) -> float | None:
-        """Largest spectral radius; None: not known while traced."""
+        """Return the largest spectral radius, None if traced; refuse one of 1, with an InputError."""
         if any(is_traced(x) for x in jax.tree.leaves((self.factors, self.albedo))):
             return None
         radius = float(self.spectral_radius().max())
-        # Closer to 1 and rounding makes up the solution.
+        # Closer to 1, the solution is mostly rounding error.
         if radius > 1 - 100 * float(jnp.finfo(self.Le.dtype).eps):
             raise InputError(
                 f"the spectral radius of the operator is {radius:.6f}: light in this scene does not die out, and "
@@ -213,9 +213,9 @@ class Operator:
 
     @usual_promotion
     def residual_history(self, steps: int, method: str = "gmres") -> np.ndarray:
-        """|Le + T L - L| / |Le| for the best L made of Le, T Le, ..., T^(k-1) Le, k = 0, ..., steps: (steps + 1,).
+        """Return |Le + T L - L| / |Le| for L composed of Le, T Le, ..., T^(k-1) Le, k = 0, ..., steps: (steps + 1,).
 
-        method: "gmres", best by least squares, without restarts; or "neumann", their sum.
+        method: "gmres": the best L by least squares, without restarts; or "neumann": their sum.
         """
         _check_depth(steps)
         if method == "neumann":
@@ -235,20 +235,21 @@ def operator(
     seed: int = 0,
     faceted: bool = False,
 ) -> Operator:
-    """The transport operator of a diffuse scene.
+    """Build the transport operator of a diffuse scene.
 
     Args:
-        patches: about how many cells of about equal area the scene is cut into; each primitive is at least one.
+        patches: approximate number of cells of about equal area that the scene is divided into; each primitive is at
+            least one.
         method: "dense" (polygons, or the inside of one sphere: exact form factors, up to some thousand patches), "rays"
-            (any shapes; form factors by ray casting, kept for the pairs that rays join), or None: what suits.
-        rays: for "dense" between the two patches of each pair that something may hide from each other, 32 if None; for
-            "rays" from each patch on the mean, 256 if None.
+            (any shapes; form factors by ray casting, kept for the pairs that rays join), or None: chosen by the scene.
+        rays: for "dense", rays per pair of patches that something may hide from each other, 32 if None; for "rays",
+            mean number of rays per patch, 256 if None.
         seed: other seeds give independent rays.
-        faceted: take meshes of smooth normals as the triangles that they are, instead of refusing them.
+        faceted: treat meshes with smooth normals as flat triangles, instead of refusing them.
     Raises:
-        InputError: what is not diffuse or has area 0, named; numbers out of range.
-    One-sided surfaces are black from behind, as in the renderer. Not for jitted functions, as shapes are not traced;
-    `Operator.with_scene` changes the colours within them.
+        InputError: a shape, which is named, is not diffuse or has area 0; an argument is out of range.
+    One-sided surfaces are black from behind, as in the renderer. Do not call it in jitted functions, since shapes
+    cannot be traced; use `Operator.with_scene` there to change colours.
     """
     cells = cut_scene(scene, patches, faceted)
     if method is None:
@@ -279,9 +280,10 @@ def operator(
 
 
 def _closing(exchange, area):
-    """(U,) factors of rows and columns after which the rows of a symmetric matrix sum to the areas: no light is lost.
+    """Return factors (U,) of rows and columns that make the rows of a symmetric matrix sum to the areas.
 
-    For a closed scene, whose form factors' errors would make light or lose it (van Leersum 1989, for two such sums).
+    For a closed scene, where errors of the form factors would create or lose light (van Leersum 1989, for two such
+    sums).
     """
     scale = np.ones_like(area)
     for _ in range(_SCALINGS):
@@ -293,7 +295,7 @@ def _closing(exchange, area):
 
 
 def _albedos_and_lights(scene: Scene, patches: Patches):
-    """Albedo (U, 3) and emitted radiance (U, 3) of the patches."""
+    """Return albedo (U, 3) and emitted radiance (U, 3) of the patches."""
     scene = attached(scene)
     _, column = bsdfs.reflectances(scene.materials) or (None, None)
     lights = emitters.even_lights(scene.emitters)
@@ -304,7 +306,7 @@ def _albedos_and_lights(scene: Scene, patches: Patches):
 
 @jax.jit
 def _rows(table, rows):
-    # A row of black at the end stands for none.
+    # Row -1, none, is the black row at the end.
     return jnp.concatenate([table, jnp.zeros_like(table[:1])])[rows]
 
 
@@ -324,8 +326,8 @@ def _residual(op: Operator, L):
 
 @jax.jit
 def _spectral_radius(op: Operator):
-    # T is symmetric in the inner product with weights A / albedo. In it the norms of T^k L grow by ever larger factors,
-    # towards the radius, also where -radius is an eigenvalue (two plates that see but each other).
+    # T is symmetric in the inner product with weights A / albedo. There the norms of T^k L grow by increasing factors,
+    # towards the radius, even if -radius is an eigenvalue (two plates that see only each other).
     tiny = jnp.finfo(op.Le.dtype).tiny
 
     def norm(x):  # of albedo * x
@@ -359,7 +361,7 @@ def _add_terms(op: Operator, count):
 
 @jax.jit
 def _gmres(op: Operator, tolerance):
-    # Radiances of order 1 in each channel: the tolerance is then relative, and counts for patches that emit nothing.
+    # Scale radiances to order 1 per channel: the tolerance is then relative, and valid for patches that emit nothing.
     scale = lax.stop_gradient(jnp.max(op.Le, 0))
     scale = jnp.where(scale > 0, scale, 1)
     equation = op._function(lambda L: L - op.T.mv(L))
@@ -368,7 +370,7 @@ def _gmres(op: Operator, tolerance):
 
 
 def _krylov_residuals(op: Operator, steps):
-    """Arnoldi's process (Saad and Schultz 1986), its small matrix in float64."""
+    """Run Arnoldi's process (Saad and Schultz 1986), with its small matrix in float64."""
     apply = jax.jit(lambda op, L: L - op.T.mv(L))
     size = float(_norm(op.Le))
     basis = [op.Le / size]
@@ -376,7 +378,7 @@ def _krylov_residuals(op: Operator, steps):
     residuals = [1.0]
     for k in range(steps):
         v = apply(op, basis[k])
-        for _ in range(2):  # again, for what rounding left
+        for _ in range(2):  # twice, against rounding errors
             for i, q in enumerate(basis):
                 along = jnp.vdot(q, v)
                 H[i, k] += along

@@ -1,7 +1,7 @@
-"""Patches: every primitive cut into cells of equal area, and which cell a point of it lies in.
+"""Patches: every primitive divided into cells of equal area, and a look-up of the cell of a point.
 
-A side of a cell is a patch if it reflects or emits; other sides are black, as they are to the renderer. Rectangles are
-cut into parallelograms, disks by radius squared and angle, spheres by angle and height, triangles into similar ones.
+A side of a cell is a patch if it reflects or emits; other sides are black, as in the renderer. Rectangles are divided
+into parallelograms, disks by radius squared and angle, spheres by angle and height, triangles into similar ones.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from pathjax.shapes import Geometry, geometry
 @register_dataclass
 @dataclass(frozen=True)
 class Patches:
-    """U patches, the sides that are not black of C cells of Q primitives."""
+    """U patches: the non-black sides of C cells of Q primitives."""
 
     first: jax.Array  # (Q,) int32 first cell of each primitive
-    grid: jax.Array  # (Q, 2) int32 cells along its two coordinates; of a triangle: cells along an edge, twice
+    grid: jax.Array  # (Q, 2) int32 cells along its two coordinates; for a triangle cells along an edge, twice
     primitive: jax.Array  # (C,) int32
-    place: jax.Array  # (C, 2) int32 in the grid; of a triangle: strip, and place in the strip
+    place: jax.Array  # (C, 2) int32 position in the grid; for a triangle strip, and position in the strip
     patch: jax.Array  # (2, C) int32 patch of the front and of the back of each cell; U: black
     cell: jax.Array  # (U,) int32
     back: jax.Array  # (U,) bool: the patch lies on the side that the normal points away from
@@ -44,10 +44,10 @@ class Patches:
 
 
 def cut_scene(scene: Scene, count: int, faceted: bool = False) -> Patches:
-    """Cut a scene into about `count` cells of about equal area, at least one for each primitive.
+    """Divide a scene into about `count` cells of about equal area, at least one for each primitive.
 
     Raises:
-        InputError: nothing to cut, a primitive of zero area, or something that is not diffuse: named.
+        InputError: there is nothing to divide, or a shape, which is named, has a part of area 0 or is not diffuse.
     """
     if not isinstance(count, int) or count < 1:
         raise InputError(f"patches = {count!r}; it is the number of patches, an integer of at least 1")
@@ -76,7 +76,7 @@ def cut_scene(scene: Scene, count: int, faceted: bool = False) -> Patches:
     primitive = np.repeat(np.arange(len(cells)), cells)
     local = np.arange(cells.sum()) - first[primitive]
     place = np.stack([local // grid[primitive, 1], local % grid[primitive, 1]], -1)
-    # Strip a of a triangle cut k times holds 2 (k - a) - 1 cells, those before it a (2 k - a).
+    # Strip a of a triangle with k cells per edge holds 2 (k - a) - 1 cells; the strips before it hold a (2 k - a).
     k = grid[primitive, 0]
     strip = k - np.ceil(np.sqrt(np.maximum(k * k - local, 0))).astype(int)
     place = np.where(triangular[primitive, None], np.stack([strip, local - strip * (2 * k - strip)], -1), place)
@@ -97,7 +97,7 @@ def cut_scene(scene: Scene, count: int, faceted: bool = False) -> Patches:
 
 
 def refuse_media(scene: Scene) -> None:
-    """Refuse a scene with media, in which light does not go from patch to patch undimmed."""
+    """Refuse, with an InputError, a scene with media, which attenuate light between patches."""
     if scene.media is not None:
         raise InputError(
             "the scene has participating media, and light between patches goes through nothing. Use pathjax.render, or "
@@ -112,7 +112,7 @@ def _name(scene, shape) -> str:
 
 
 def _diffuse_rows(scene: Scene, faceted) -> np.ndarray:
-    """(S, 2) row of the reflectance of the front and the back of each shape; -1: reflects nothing."""
+    """Return rows (S, 2) of the reflectances of the front and the back of each shape; -1: reflects nothing."""
     materials = scene.materials
     diffuse, column = bsdfs.reflectances(materials) or (None, None)
     sides = np.asarray(materials.sides)
@@ -142,20 +142,22 @@ def _diffuse_rows(scene: Scene, faceted) -> np.ndarray:
 
 
 def _grid(table, size) -> np.ndarray:
-    """(P, 2) cells along the two coordinates of each primitive, whose sides are then about `size` long."""
+    """Return the numbers of cells (P, 2) along the coordinates of each primitive, for sides of about `size`."""
     return np.maximum(np.rint(table.cell_lengths(size) / size), 1).astype(int)
 
 
-# ---- of one point ---------------------------------------------------------------------------------------------------
+# ---- look-ups for one point -----------------------------------------------------------------------------------------
 
 
 def patch_at(patches: Patches, shapes: Geometry, primitive, p, back):
-    """Patch that a point of a surface belongs to.
+    """Return the patch of a surface point.
 
     Args:
-        primitive: () int32, of a hit; p: (3,) the point; back: () bool, the side that the normal points away from.
+        primitive: () int32, of a hit.
+        p: (3,) the point.
+        back: () bool, true for the side that the normal points away from.
     Returns:
-        () int32; `patches.count` where that side is black.
+        () int32; `patches.count` if that side is black.
     """
     grid = at(patches.grid, primitive)
 
@@ -175,10 +177,11 @@ def patch_at(patches: Patches, shapes: Geometry, primitive, p, back):
 
 
 def point(patches: Patches, shapes: Geometry, patch, u):
-    """Uniform point of a patch.
+    """Sample a uniform point of a patch.
 
     Args:
-        patch: () int32; u: (2,).
+        patch: () int32.
+        u: (2,) uniform.
     Returns:
         primitive () int32, point (3,), unit normal (3,) on the patch's side, rounding error of the point along it ().
     """
@@ -189,7 +192,7 @@ def point(patches: Patches, shapes: Geometry, patch, u):
     def place_of(table, row):
         if not table.triangular:
             return table.from_square(row, (place + u) / grid)
-        # Cells of odd place are turned around.
+        # Every other cell of a strip is turned around.
         corner = jnp.stack([place[0], place[1] // 2])
         b, turned = square_to_triangle(u), place[1] % 2 == 1
         return table.from_square(row, (corner + jnp.where(turned, 1 - b, b)) / grid)
@@ -199,7 +202,7 @@ def point(patches: Patches, shapes: Geometry, patch, u):
 
 
 def _of_table(shapes, primitive, f):
-    """f(table, row) of the table that holds the primitive."""
+    """Return f(table, row) for the table that holds the primitive."""
     first = geometry.firsts(shapes)
 
     def of(table, start):

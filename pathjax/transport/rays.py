@@ -1,4 +1,4 @@
-"""Form factors by ray casting: for any shapes, and without a number for each pair of patches."""
+"""Form factors by ray casting, for any shapes, without storing a value for each pair of patches."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from pathjax.scene.scene import Scene
 from pathjax.shapes import geometry
 from pathjax.transport.patches import Patches, patch_at, point
 
-# Rays of one call of the kernel: what they hit takes some tens of megabytes.
+# Rays per call of the kernel: their results take some tens of megabytes.
 _RAYS_PER_CALL = 1 << 22
 
 
 def cast(scene: Scene, patches: Patches, rays: int, seed: int) -> tuple[sparse.csr_array, np.ndarray, np.ndarray]:
-    """How many of the rays that each patch sends, uniform in area and by the cosine in direction, meet each other one.
+    """Count the rays from each patch, uniform in area and cosine-weighted in direction, that meet each other patch.
 
     Args:
-        rays: on the mean of all patches, of which each sends half, and more of the other half the larger it is: so that
-            those of a fine mesh do not take all.
+        rays: mean number per patch. Half of them are distributed equally and half in proportion to area, so that the
+            patches of a fine mesh do not take all.
     Returns:
         counts (U, U) sparse, of rays from the patch of the row to that of the column; sent (U,), rays of each patch;
-        and lost (U,), those that met nothing or a side that is black.
+        and lost (U,), those that met nothing or a black side.
     """
     count, area = patches.count, np.asarray(patches.area, float)
     sent = np.maximum(np.rint(rays / 2 * (1 + area / area.mean())), 1).astype(int)
@@ -55,7 +55,7 @@ def _cast(shapes, patches, sender, number, seed):
 
 
 def _one(work, shapes, patches, seed):
-    """Patch that ray `number` of the patch `sender` meets."""
+    """Return the patch that ray `number` of the patch `sender` meets; `patches.count` for none."""
     sender, number = work
     stream = sampler.pixel_stream(seed, sender)
     numbers = compute_once(sampler.lattice_point(stream, number, 0).astype(patches.area.dtype))
@@ -70,10 +70,10 @@ def _one(work, shapes, patches, seed):
 
 
 def exchange(counts: sparse.csr_array, density: np.ndarray) -> tuple[sparse.coo_array, np.ndarray]:
-    """A_i F_ij, symmetric, from the rays of both patches, and its standard errors at the same places.
+    """Return A_i F_ij, symmetric, from the rays of both patches, and the standard errors of its entries.
 
-    Rays from i to j estimate A_i F_ij as do those from j to i. With n_i = rays / A_i, the density (U,),
-    (counts_ij + counts_ji) / (n_i + n_j) is unbiased and, as counts are Poisson's, of the least variance.
+    Rays from i to j and rays from j to i both estimate A_i F_ij. With n_i = rays / A_i, the density (U,),
+    (counts_ij + counts_ji) / (n_i + n_j) is unbiased and, since counts are Poisson-distributed, of least variance.
     """
     both = sparse.coo_array(counts + counts.T)
     scale = 1 / (density[both.row] + density[both.col])

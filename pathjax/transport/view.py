@@ -1,4 +1,4 @@
-"""Light on patches, looked up: at a point of a surface, and through the camera."""
+"""Look up light on patches: at a surface point, and through the camera."""
 
 from __future__ import annotations
 
@@ -27,24 +27,25 @@ from pathjax.transport.patches import Patches, patch_at, refuse_media
 @register_dataclass
 @dataclass(frozen=True)
 class Radiosity:
-    """Light on the patches of a scene, to be looked up within kernels: pass it to them whole, as the scene."""
+    """Light on the patches of a scene, for look-ups within kernels; pass it to them whole, like the scene."""
 
     patches: Patches
-    L: jax.Array  # (U + 1, 3) radiance that leaves each patch; the last, black, stands for what is no patch
+    L: jax.Array  # (U + 1, 3) radiance that leaves each patch; the last row, black, is for points of no patch
 
 
 @usual_promotion
 def radiosity(patches: Patches, L) -> Radiosity:
-    """Return light L (U, 3) on the patches, to be looked up."""
+    """Return light L (U, 3) on the patches as a Radiosity, for look-ups."""
     return Radiosity(patches, jnp.concatenate([L, jnp.zeros_like(L[:1])]))
 
 
 def radiance(light: Radiosity, shapes: Geometry, primitive, p, back):
-    """Radiance (3,) that leaves a point of a surface, emission included; a look-up, for code of one ray.
+    """Look up the radiance (3,) that leaves a surface point, including emission; for code of one ray.
 
     Args:
-        shapes: geometry of the scene that was cut into patches, or of one with other colours.
-        primitive: () int32, of a hit; p: (3,) the point of `geometry.surface`.
+        shapes: geometry of the scene that was divided into patches, or of one with other colours.
+        primitive: () int32, of a hit.
+        p: (3,) the point of `geometry.surface`.
         back: () bool, seen from the side that the geometric normal points away from: dot(surface.n, ray.d) > 0.
     """
     return at(light.L, patch_at(light.patches, shapes, primitive, p, back))
@@ -52,10 +53,10 @@ def radiance(light: Radiosity, shapes: Geometry, primitive, p, back):
 
 @usual_promotion
 def image(scene: Scene, light: Radiosity, spp: int = 16, seed: int = 0) -> jax.Array:
-    """What the camera sees of the light on patches: (H, W, 3).
+    """Render the light on patches through the camera: (H, W, 3).
 
-    Rays are those of `pathjax.render` of the same spp and seed, so the two images share what the film's sampling does;
-    nothing else is random. Linear in `light.L`, and differentiable in it.
+    Camera rays are those of `pathjax.render` with the same spp and seed, so the two images share the noise of film
+    sampling; nothing else is random. Linear in `light.L`, and differentiable in it.
 
     Raises:
         InputError: spp or seed out of range; a scene that hides its emitters, or has media.
@@ -77,7 +78,7 @@ def image(scene: Scene, light: Radiosity, spp: int = 16, seed: int = 0) -> jax.A
 
 @partial(jax.jit, static_argnames="spp")
 def _shared(scene, light, pixels, seed, *, spp):
-    """The image through a filter under which pixels share their samples."""
+    """Render the image through a filter under which pixels share their samples."""
     sampled = replace(scene, film=film.of_samples(scene.film))
     numbers = jnp.broadcast_to(jnp.arange(spp, dtype=jnp.uint32)[:, None], (spp, len(pixels)))
     seen = [_seen(sampled, light.patches, pixels, numbers[number, 0], seed)[0] for number in range(spp)]
@@ -97,7 +98,7 @@ def _seen(scene, patches, pixels, number, seed):
 
 
 def _one(pixel, scene, patches, number, seed):
-    """Patch that the ray of a sample meets, and the sample's weight."""
+    """Return the patch that the ray of a sample meets, and the sample's weight."""
     ray, weight = camera_ray(scene, pixel, sampler.pixel_stream(seed, pixel), number)
     hit = geometry.closest_hit(scene.geometry, ray)
     surface = geometry.surface(scene.geometry, ray, hit)
