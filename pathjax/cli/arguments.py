@@ -85,7 +85,7 @@ def parser() -> argparse.ArgumentParser:
         help="how an image differs from a reference",
         description="Of image A against reference B, in linear light: MSE; relMSE = mean((A - B)^2 / (B^2 + 0.01)); "
         "error, which `render --error` aims at: sqrt(relMSE) if images are exposed so that B has the level 1; PSNR, "
-        "whose peak is B's maximum; HDR-FLIP. If one is PNG or JPEG, the peak is 1 and FLIP is LDR-FLIP.",
+        "whose peak is B's maximum; HDR-FLIP. Unless both are OpenEXR or Radiance HDR, the peak is 1; LDR-FLIP.",
         epilog="Exit status: 0 the images agree, or no limit was set; 1 they differ: a measure is above its "
         "limit, or with --errors p is below ALPHA; 2 the command or a file is wrong.",
     )
