@@ -1,9 +1,9 @@
-"""How surfaces scatter: a file a kind, the table of kinds, and the dispatch over those that a scene holds.
+"""How surfaces scatter light: one file per kind, the table of kinds, and the dispatch over the kinds in a scene.
 
-A bsdf is a subclass of `BSDF`, which says what it must offer and what it may be capable of. A material has a front and
-a back, each a bsdf or nothing, which absorbs: a kind, which is the place of a table, and a row in that table. Where
-settings of bsdfs differ, they are in tables of their own. Where bsdfs hold others, a material is a tree, and `leaf`
-finds what scatters.
+A bsdf is a subclass of `BSDF`, which defines the methods that it implements and the capabilities that it may have. A
+material has a front and a back. Each is a bsdf, given by its kind (the index of a table) and its row in that table, or
+nothing, which absorbs. Bsdfs of one class with different settings are in different tables. Where bsdfs hold others, a
+material is a tree, and `leaf` walks to the bsdf that scatters.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ __all__ = [
     "register",
 ]
 
-# By the name that scene files give them.
+# Kinds by their names in scene files.
 KINDS: dict[str, type[BSDF]] = {
     "diffuse": Diffuse,
     "conductor": Conductor,
@@ -97,15 +97,15 @@ KINDS: dict[str, type[BSDF]] = {
     "bumpmap": BumpMap,
     "normalmap": NormalMap,
 }
-# Place of the table of a kind, row in it, or place of a shape; -1: none.
+# Index of the table of a kind, of a row in it, or of a shape; -1: none.
 Index = Int[Array, ""]
-# For each of `Table.textured`, what was looked up there.
+# The colour looked up for each entry of `Table.textured`.
 Colors = tuple[Float[Array, "3"], ...]
 FRESNEL = Dielectric.fresnel.options
 
 
 def register(name: str):
-    """A decorator that makes a subclass of `BSDF` a kind, which scene files name by `name`."""
+    """Return a decorator that registers a subclass of `BSDF` as a kind, which scene files call `name`."""
     return register_kind(KINDS, BSDF, name, "bsdfs")
 
 
@@ -113,28 +113,31 @@ def register(name: str):
 @dataclass(frozen=True)
 class Materials:
     tables: tuple[Table, ...]  # one for each kind of bsdf present
-    sides: Int[Array, "S 2 code"]  # of each shape: front and back; kind (-1: absorbs), row; of trees a `tree.Node`
-    textures: Textures | None  # in the place of parameters; None: there are none
-    # Of kinds that hold others, and which of them, by place, may be met after so many others on the way to a leaf, and
-    # on the way to what lets light pass. None of it in scenes without.
+    sides: Int[Array, "S 2 code"]  # front, back per shape: kind (-1: absorbs) and row; with wrappers a `tree.Node`
+    textures: Textures | None  # of textured parameters; None: there are none
+    # Tables of the kinds that hold others. For each depth of the trees, the indices of the wrappers that may occur
+    # there on the way to any leaf (`levels`), and to a leaf that passes light (`passing`). All empty without wrappers.
     wrappers: tuple[Table, ...] = ()
     levels: tuple[tuple[int, ...], ...] = field(default=(), metadata={"static": True})
     passing: tuple[tuple[int, ...], ...] = field(default=(), metadata={"static": True})
-    # Of derivatives: where the numbers of textures that are differentiated begin in their list, of `Textures.entries`.
+    # For derivatives: `first` of `Textures.entries`, as items: where the entries of differentiated textures begin.
     listed: tuple[tuple[tuple[int, int | str], int], ...] = field(default=(), metadata={"static": True})
-    # By wrapper, places of the columns in whose numbers `leaf` tells the derivative of its weight; empty: in none.
+    # For derivatives: per wrapper, the columns in which `leaf` returns the derivative of its weight; empty: none.
     recorded: tuple[tuple[int | None, ...], ...] = field(default=(), metadata={"static": True})
-    # For derivatives: which of the surfaces that a shadow ray passes has its `passing` nudged, and by what.
+    # For derivatives: index of the surface along a shadow ray whose `passing` is nudged, and the nudges.
     nudged: tuple[Int[Array, ""], Float[Array, "held columns"]] | None = None
 
 
 def build(
     bsdfs: list[Instance], dtype, path: tuple, parameters: Parameters, free_passes: bool = False
 ) -> Materials:
-    """Materials of the shapes whose bsdfs are given.
+    """Build the materials of shapes.
 
-    path: where the materials will be in the scene; parameters: to enter those of bsdfs and textures.
-    free_passes: whether going straight on through a surface is no bounce.
+    Args:
+        bsdfs: one per shape.
+        path: location of the materials in the scene.
+        parameters: receives the parameters of bsdfs and textures.
+        free_passes: whether going straight on through a surface is no bounce.
     """
     if free_passes:
         made = {each: each.kind.with_free_passes(each) for each in bsdfs}
@@ -158,7 +161,7 @@ def build(
     ]
 
     def places(of):
-        """By level, the wrappers among these."""
+        """Return the indices of the wrappers that satisfy `of`, by level; empty levels are left out."""
         found = [{number[each][0] - len(tables) for each in level if of(each)} for level in levels]
         return tuple(tuple(sorted(level)) for level in found if level)
 
@@ -170,12 +173,12 @@ def build(
 
 
 def occurs(materials: Materials, capability: str) -> bool:
-    """Whether some kind present is capable of it: "smooth", "delta", ... of `BSDF`, or "moves_paths"."""
+    """Return whether some kind present has a capability: "smooth", "delta", ... of `BSDF`, or "moves_paths"."""
     return any(_is(table, capability) for table in (*materials.tables, *materials.wrappers))
 
 
 def has(materials: Materials, kind: Index, capability: str) -> Bool[Array, ""]:
-    """Whether this kind is capable of it, as in `occurs`; where there is no bsdf nothing is."""
+    """Return whether a kind has a capability, as in `occurs`; False where there is no bsdf."""
     flags = [_is(table, capability) for table in materials.tables]
     if not any(flags):
         return jnp.bool_(False)
@@ -191,32 +194,32 @@ def _is(table: Table, capability: str) -> bool:
 
 
 def moving_bit(materials: Materials, kind: Index, row: Index) -> Index:
-    """Bit row % 31 where parameters of the bsdf move paths, else 0."""
+    """Return a mask with bit row % 31 set where parameters of the bsdf move paths, else 0."""
     return jnp.where(has(materials, kind, "moves_paths"), jnp.left_shift(jnp.int32(1), row % 31), 0)
 
 
 def name(materials: Materials, kind: int) -> str:
-    """What scene files call a kind that is present, those that hold others after the rest."""
+    """Return the name in scene files of a kind present; wrappers are numbered after the other tables."""
     names = {each: name for name, each in KINDS.items()}
-    # A kind that a file does not name is a form of one that it does.
+    # A kind without a name of its own is a subclass of one that has a name.
     table = (*materials.tables, *materials.wrappers)[kind]
     return next(names[each] for each in table.kind.__mro__ if each in names)
 
 
 def reflectances(materials: Materials) -> tuple[int, Column] | None:
-    """Kind and reflectances (R, 3) of what sends the same radiance in all directions; None where nothing does."""
+    """Return kind and reflectances (R, 3) of the bsdfs whose radiance is the same in all directions; None: no such."""
     found = [(i, t.column("reflectance")) for i, t in enumerate(materials.tables) if t.kind is Diffuse]
     return found[0] if found else None
 
 
 def with_fresnel(materials: Materials, fresnel: str) -> Materials:
-    """The same, whose kinds that have a choice of `fresnel` reflect by that of FRESNEL."""
+    """Return the materials with the setting `fresnel`, one of FRESNEL, in all kinds that have this setting."""
     tables = (t.with_setting("fresnel", fresnel) if "fresnel" in dict(t.settings) else t for t in materials.tables)
     return replace(materials, tables=tuple(tables))
 
 
 def select(materials: Materials, shape: Index, front: Bool[Array, ""]) -> Int[Array, " code"]:
-    """Kind and row of the side of a shape, or its node; where there is none, -1, those of some shape."""
+    """Return kind and row of a side of a shape, or its node; for shape -1 (none) those of an arbitrary shape."""
     return at(materials.sides, jnp.maximum(shape, 0), jnp.where(front, 0, 1))
 
 
@@ -229,7 +232,7 @@ def leaf(
     u: Float[Array, ""] | None,
     differentiated: bool = False,
 ) -> tree.Leaf:
-    """What scatters at a point of a shape; see `tree.leaf`. u: None where no bsdf holds others."""
+    """Return the bsdf that scatters at a point of a shape; see `tree.leaf`. u: None where no bsdf holds others."""
     code = select(materials, shape, wi[2] > 0)
     if materials.wrappers:
         return tree.leaf(materials, code, surface, frame, wi, u, differentiated)
@@ -244,7 +247,7 @@ def passing(
     cos: Float[Array, ""],
     nudges: Float[Array, "held columns"] | None = None,
 ) -> Float[Array, ""]:
-    """Share of light that a side of a shape lets straight on. cos, nudges: of `tree.passing`."""
+    """Return the share of light that a side of a shape lets straight on. cos, nudges: those of `tree.passing`."""
     passes = partial(has, materials, capability="passes")
     code = select(materials, shape, cos > 0)
     if materials.wrappers:
@@ -253,17 +256,20 @@ def passing(
 
 
 def is_tree(materials: Materials, shape: Index, front: Bool[Array, ""]) -> Bool[Array, ""]:
-    """Whether a side of a shape is a bsdf that holds others."""
+    """Return whether the bsdf on a side of a shape holds others."""
     return select(materials, shape, front)[0] >= len(materials.tables)
 
 
 def colors(
     materials: Materials, kind: Index, row: Index, surface: Surface
 ) -> tuple[Colors | None, tuple[Pairs, ...] | None]:
-    """Colours of the textures that a bsdf has at a point, as `Row` takes them; None where no bsdf has any.
+    """Look up the textures of a bsdf at a point.
 
-    A path asks for them several times, and of all kinds together there are seldom more than one or two. With them, of
-    each one, the `Textures.entries`; None where no texture is differentiated.
+    A path reads the colours several times. All kinds together seldom need more than one or two.
+
+    Returns:
+        The colours, as `Row` takes them; None where no bsdf has textures.
+        The `Textures.entries` of each colour; None where no texture is differentiated.
     """
     textured = [table.textured for table in materials.tables]
 
@@ -291,7 +297,12 @@ def evaluate(
     wo: Float[Array, "3"],
     colors: Colors | None = None,
 ) -> tuple[Float[Array, "3"], Float[Array, ""]]:
-    """f |cos theta_o| and pdf of a smooth bsdf; 0 for the others. colors: of `colors`, if they are known already."""
+    """Return f |cos theta_o| and pdf of a smooth bsdf.
+
+    For other kinds the values are arbitrary; they are 0 if no smooth kind is present.
+
+    colors: from `colors`, if they are known already.
+    """
     smooth = [(i, table) for i, table in enumerate(materials.tables) if table.kind.smooth]
 
     def of(table):
@@ -314,9 +325,11 @@ def sample(
     u: Float[Array, " numbers"],
     colors: Colors | None = None,
 ) -> BSDFSample:
-    """Draw `wo` and its weight from the bsdf.
+    """Sample `wo` and its weight.
 
-    u: 2 numbers, or 3 where a kind with `lobes` is present; colors: of `colors`, if they are known already.
+    Args:
+        u: 2 numbers, or 3 where a kind with `lobes` is present.
+        colors: from `colors`, if they are known already.
     """
 
     def of(table):
@@ -330,11 +343,11 @@ def sample(
 def sample_other(
     materials: Materials, row: Index, surface: Surface, wi: Float[Array, "3"], u: Float[Array, " numbers"]
 ) -> BSDFSample:
-    """The branch that `sample` leaves out, of a kind that `branches`."""
+    """Return the branch that `sample` does not draw, of the kind that `branches`."""
     table = next(table for table in materials.tables if table.kind.branches)
     return table.kind.sample(Row(table, row, surface, materials.textures), wi, _numbers(table, u), other=True)
 
 
 def _numbers(table: Table, u: Float[Array, " numbers"]) -> Float[Array, " its_numbers"]:
-    """Those that a kind takes: 2, or 3 of one that has `lobes`."""
+    """Return the random numbers that a kind takes: 2, or 3 if it has `lobes`."""
     return u if table.kind.lobes or len(u) == 2 else u[:2]

@@ -7,7 +7,7 @@ from pathjax.kinds import Number, Row
 
 
 class BlendBSDF(Choosing):
-    """The first bsdf inside where the weight is 0, the second one where it is 1."""
+    """The first nested bsdf at weight 0, the second at weight 1, in between their mixture."""
 
     nested = 2
     weight = Number(bounds=(0, 1), textured=True, required=True)

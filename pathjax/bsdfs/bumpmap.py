@@ -1,4 +1,4 @@
-"""Textures of heights."""
+"""Bump maps."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pathjax.kinds import Number, Row
 
 
 class BumpMap(Mapped):
-    """Shading as if the surface had the heights of a texture, times `scale`, on it (Blinn 1978)."""
+    """Shading as if the surface were raised by the heights of a texture times `scale` (Blinn 1978)."""
 
     heights = Heights()
     scale = Number(1.0, listed=False)
@@ -20,7 +20,7 @@ class BumpMap(Mapped):
 
     @staticmethod
     def normal(p: Row, surface: Surface, to_local) -> Float[Array, "3"]:
-        """The normal of the raised surface, but for how the normal below changes from place to place."""
+        """Return the normal of the raised surface, without the term from the curvature of the surface below."""
         by_u, by_v = p.scale * p.gradient("heights")
         (u_x, u_y, _), (v_x, v_y, _) = (to_local(d) for d in surface.along)
         n = cross(jnp.stack([u_x, u_y, by_u]), jnp.stack([v_x, v_y, by_v]))

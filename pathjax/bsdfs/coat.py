@@ -1,13 +1,13 @@
-"""How much light passes a rough coat: of each coat a short series, made by quadrature on the host.
+"""How much light passes a rough coat: a short series per coat, computed by quadrature on the host.
 
-Of light that meets a rough interface at the cosine mu, T(mu) = E[(1 - F(m . wi)) G1(wo)] is refracted, the mean being
-that over the normals m that wi sees (Walter et al. 2007). What comes from below as from a diffuse surface is reflected
-by the share 2 integral R(mu) mu dmu, R(mu) = E[F(m . wi) G1(wo)] being that of the interface from inside.
+At the cosine mu of incidence, a rough interface refracts the share T(mu) = E[(1 - F(m . wi)) G1(wo)] of light, a mean
+over the visible normals m (Walter et al. 2007). It reflects the share 2 integral R(mu) mu dmu of diffuse light from
+below, where R(mu) = E[F(m . wi) G1(wo)] is the reflectance from inside.
 
-T is a sum of Chebyshev polynomials, in a variable that grows fastest where T does: at grazing angles, or where eta is
-below 1 about the cosine from which on light is not reflected totally. It is right to 0.003, to 0.01 where alpha is
-below 0.05 or eta below 1, and to 0.02 where alpha is below 0.01, too, but at the very edge of total reflection. Its
-terms are made for one alpha and one relative IOR eta, and are linear in them with the right derivatives, for kernels.
+T is a sum of Chebyshev polynomials in a variable that varies fastest where T does: at grazing angles or, where eta is
+below 1, around the cosine above which light is not reflected totally. Its error is 0.003; 0.01 where alpha is below
+0.05 or eta below 1; and 0.02 where alpha is below 0.01, except at the very edge of total reflection. The terms are
+computed for one alpha and one relative IOR eta, and are linear in both with the right derivatives, for kernels.
 """
 
 from __future__ import annotations
@@ -23,21 +23,21 @@ from pathjax.compile import is_traced
 from pathjax.core.math import larger, smaller
 
 TERMS = 12
-# Constants, factors of alpha and factors of eta: of the share that is reflected inside, and of the terms of T; and the
-# four numbers of `_place`.
+# Constants, factors of alpha and factors of eta, each for the share reflected inside and the terms of T; then the four
+# numbers of `_place`.
 SHAPE = (3 * (1 + TERMS) + 4,)
-# How far the variable goes as the cosine does: without total reflection, where what is rougher is smoother at grazing
-# angles; and about the edge of that, some alpha eta wide. A smooth coat has an edge without width, and a root behind:
-# this alpha is for both.
+# Width in the cosine over which the variable is about linear. Without total reflection it is REACH + alpha, since T of
+# rougher coats is smoother at grazing angles; else REACH_OF_EDGE alpha eta, around the edge of total reflection. That
+# edge has no width for a smooth coat, and a square root follows it: LEAST_EDGE, the least alpha here, widens both.
 REACH, REACH_OF_EDGE, LEAST_EDGE = 0.5, 2, 0.01
-# Points of the quadrature, in slopes of facets and in their azimuth, by which T and R are right to some 1e-4.
+# Points of the quadrature in the slopes of facets, and in their azimuth; the errors of T and R are about 1e-4.
 POINTS = 48
-# Relative step of differences: over less, the points at the edges of what is seen and what is reflected totally make
-# noise of some percent.
+# Relative step of finite differences. With a smaller one, points of the quadrature at the edges of visibility and of
+# total reflection cause noise of some percent.
 STEP = 0.03
-# Mitsuba's cosines, of which the mean of R(mu) mu stands for its integral: too low by 1/64 or so.
+# Mitsuba's cosines: it takes the mean of R(mu) mu over them for the integral, which is too low by about 1/64.
 COSINES_INSIDE = np.maximum(np.arange(64) / 63, 1e-6)
-# Of the roots of the polynomial behind the last, where T is computed.
+# Angles of the roots of the first polynomial left out, where T is computed.
 _ANGLES = np.pi * (np.arange(TERMS) + 0.5) / TERMS
 _TO_TERMS = np.cos(np.outer(np.arange(TERMS), _ANGLES)) * np.where(np.arange(TERMS) == 0, 1, 2)[:, None] / TERMS
 
@@ -45,7 +45,7 @@ _TO_TERMS = np.cos(np.outer(np.arange(TERMS), _ANGLES)) * np.where(np.arange(TER
 def coats(
     distribution: str, alpha: Float[Array | np.ndarray, " R"], eta: Float[Array | np.ndarray, " R"]
 ) -> Float[Array | np.ndarray, "R numbers"]:
-    """What `SHAPE` says of each row, detached; eta: IOR of the coat over that outside."""
+    """Return the numbers of `SHAPE` for each row, detached. eta: IOR of the coat over that outside."""
     shape = jax.ShapeDtypeStruct((*alpha.shape, *SHAPE), alpha.dtype)
 
     def on_host(alpha, eta):
@@ -59,14 +59,14 @@ def coats(
 
 
 def at(coat: Float[Array, " numbers"], alpha: Float[Array, ""], eta: Float[Array, ""]):
-    """T, for `passes`, and the share that is reflected inside, of a coat made for this alpha and eta."""
+    """Return T, for `passes`, and the share reflected inside, for a coat computed at this alpha and eta."""
     k = TERMS + 1
     share_and_terms = coat[:k] + coat[k : 2 * k] * alpha + coat[2 * k : 3 * k] * eta
     return (share_and_terms[1:], coat[3 * k :]), share_and_terms[0]
 
 
 def passes(T: tuple[Float[Array, " terms"], Float[Array, "4"]], mu: Float[Array, ""]) -> Float[Array, ""]:
-    """T(mu) for mu >= 0: Clenshaw's sum of the series."""
+    """Return T(mu) for mu >= 0, by Clenshaw's summation of the series."""
     terms, (edge, squared, scale, shift) = T
     z = scale * ((mu - edge) * lax.rsqrt((mu - edge) * (mu - edge) + squared)) + shift
     ahead = behind = jnp.zeros_like(z)
@@ -93,10 +93,10 @@ def _coat(distribution, alpha, eta):
 
 
 def _place(alpha, eta):
-    """The variable z from -1 to 1 in which T is a polynomial, as `passes` has it of the cosine; and the cosines that it
-    has at the roots.
+    """Return the four numbers by which `passes` maps a cosine to the variable z in [-1, 1], in which T is a polynomial;
+    and the cosines at the roots.
     """
-    edge = np.sqrt(max(1 - eta * eta, 0))  # smaller cosines are reflected totally by what is smooth
+    edge = np.sqrt(max(1 - eta * eta, 0))  # a smooth coat reflects smaller cosines totally
     width = REACH_OF_EDGE * max(alpha, LEAST_EDGE) * eta if eta < 1 else REACH + alpha
     low, high = (x / np.hypot(x, width) for x in (-edge, 1 - edge))
     scale = 2 / (high - low)
@@ -106,12 +106,12 @@ def _place(alpha, eta):
 
 
 def _mean(distribution, alpha, mu, eta, inside):
-    """T (N,) from outside, or R from inside, at cosines mu (N,): the mean over slopes of facets, of those that wi sees.
+    """Return T (N,) from outside, or R from inside, at cosines mu (N,): means over the slopes of visible facets.
 
-    A facet's normal is (-x, -y, 1) over its length; wi sees the area max(wi . (-x, -y, 1), 0) of it.
+    A facet's normal is (-x, -y, 1), normalised; wi sees the area max(wi . (-x, -y, 1), 0) of it.
     """
     nodes, weights = np.polynomial.legendre.leggauss(POINTS)
-    # Steep facets are rare in GGX, yet seen from afar: in this variable what is seen of them stays smooth.
+    # Steep facets are rare in GGX, but widely visible; in this variable their visible area stays smooth.
     rest = ((1 - nodes) / 2) ** 2
     r = np.sqrt(-np.log(rest) if distribution == "beckmann" else 1 / rest - 1)
     weights = weights * (1 - nodes) / 2
@@ -120,7 +120,7 @@ def _mean(distribution, alpha, mu, eta, inside):
     z = 1 / np.sqrt(1 + x * x + y * y)
     mu = mu[:, None, None]
     area = np.maximum(mu + np.sqrt(1 - mu * mu) * x, 0)
-    cos_i = np.clip(area * z, 1e-9, 1)  # of no area: any but 0
+    cos_i = np.clip(area * z, 1e-9, 1)  # where the area is 0: any value but 0
     F, cos_t = _fresnel(cos_i, eta)
     cos_o = 2 * cos_i * z - mu if inside else mu / eta - z * (cos_i / eta - cos_t)
     value = area * (F if inside else 1 - F) * _seen(distribution, alpha, np.clip(cos_o, 0, 1))
@@ -128,7 +128,7 @@ def _mean(distribution, alpha, mu, eta, inside):
 
 
 def _fresnel(cos_i, eta):
-    """`fresnel.dielectric`."""
+    """`fresnel.dielectric` in NumPy."""
     cos2_t = 1 - (1 - cos_i * cos_i) / eta**2
     cos_t = np.sqrt(np.maximum(cos2_t, 0))
     s = (cos_i - eta * cos_t) / (cos_i + eta * cos_t)
@@ -137,7 +137,7 @@ def _fresnel(cos_i, eta):
 
 
 def _seen(distribution, alpha, cos):
-    """G1 of `microfacet`."""
+    """G1 of `microfacet` in NumPy."""
     slope = alpha * np.sqrt(1 - cos * cos)
     if distribution == "ggx":
         return 2 * cos / (cos + np.sqrt(cos * cos + slope * slope))

@@ -21,7 +21,7 @@ class Conductor(BSDF):
 
     specular_reflectance = Color(1.0)
     eta = Color(None, bounds=(0, math.inf))
-    k = Color(None, bounds=(0, math.inf), absent=1.0)  # of ideal mirrors among metals, whose eta is 0
+    k = Color(None, bounds=(0, math.inf), absent=1.0)  # absent: an ideal mirror among metals, whose eta is 0
     delta = True
 
     @classmethod
@@ -37,13 +37,13 @@ class Conductor(BSDF):
                 raise fields.error(given[0], "cannot stand beside material; give either eta and k, or material")
             defaults = dict(zip(("eta", "k"), map(np.array, METALS[material]), strict=True))
         else:
-            # "none" has the eta 0 and the k 1: all is reflected.
+            # "none" has eta = 0 and k = 1, which reflects all light.
             defaults = {"eta": np.zeros(3), "k": np.ones(3)} if given else {}
         return cls.instance(name, **{key: defaults.get(key) if v is None else v for key, v in values.items()})
 
     @staticmethod
     def reflectance(p: Row, cos: Float[Array, ""]) -> Float[Array, "3"]:
-        """Fresnel reflectance times `specular_reflectance`. cos: in [0, 1], of the angle of incidence."""
+        """Return the Fresnel reflectance times `specular_reflectance`. cos: in [0, 1], of the angle of incidence."""
         share = p.specular_reflectance
         if (eta := p.eta) is not None:
             share = share * fresnel.conductor(cos, eta, p.k)
@@ -51,6 +51,6 @@ class Conductor(BSDF):
 
     @staticmethod
     def sample(p: Row, wi: Float[Array, "3"], u: Float[Array, " numbers"]) -> BSDFSample:
-        """Mirror direction; the weight is the reflectance."""
+        """Return the mirror direction; the weight is the reflectance."""
         weight, one = Conductor.reflectance(p, wi[2]), jnp.ones_like(wi[2])
         return BSDFSample(jnp.stack([-wi[0], -wi[1], wi[2]]), weight, one, jnp.bool_(True), one)

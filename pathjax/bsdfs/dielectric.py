@@ -18,14 +18,14 @@ from pathjax.description.elements import nearest
 from pathjax.kinds import Internal, Number, Row, Setting, Table
 
 REFLECTANCES = {"exact": fresnel.dielectric, "schlick": fresnel.schlick}
-# Least probability of either branch where the choice is by another IOR: with one that vanishes as Fresnel's terms do,
-# derivatives near the critical angle have infinite variance; with a constant it grows as a logarithm.
+# Least probability of either branch where another IOR decides the choice. With a probability that vanishes as Fresnel's
+# terms do, derivatives near the critical angle have infinite variance; with this bound it grows as a logarithm.
 MIN_BRANCH = 0.1
 
 
 @dataclass(frozen=True)
 class IndexOfRefraction(Number):
-    """A positive number, or in files the name of a material."""
+    """A positive number; files may name a material instead."""
 
     bounds: tuple[float, float] = (LEAST_IOR, math.inf)
 
@@ -44,21 +44,22 @@ class Dielectric(Interface):
 
     int_ior = IndexOfRefraction(IOR["bk7"], moves_paths=True)
     ext_ior = IndexOfRefraction(IOR["air"], moves_paths=True)
-    # int_ior / ext_ior by which rows choose between reflection and refraction while their own IOR varies, for
-    # derivatives; 0: this row chooses by its own. None, outside derivatives: all do.
+    # For derivatives: int_ior / ext_ior by which a row chooses between reflection and refraction while its own IOR
+    # varies; 0: it chooses by its own. None, outside derivatives: all rows choose by their own.
     choose_by = Internal()
     fresnel = Setting("exact", options=tuple(REFLECTANCES))
     delta = branches = True
 
     @staticmethod
     def sample(p: Row, wi: Float[Array, "3"], u: Float[Array, " numbers"], other: bool = False) -> BSDFSample:
-        """Reflect with probability R, else refract; by the probabilities of `choose_by` where a row has it.
+        """Reflect with probability R, else refract; where a row has `choose_by`, with the probability at that IOR.
 
-        other: what would not have been drawn, of pdf 0 where it cannot be. For both, pdf * weight is the share of
-            light.
-
-        wi may lie on either side: wi.z < 0 comes from inside. Radiance is scaled by 1/eta^2 on refraction, eta being
-        the IOR of the far side over that of the near side (PBRT 4 ed., 9.5.2).
+        Args:
+            wi: on either side; wi.z < 0 comes from inside.
+            other: return the branch that is not drawn; its pdf is 0 where it is impossible.
+        Returns:
+            The sample. For both branches, pdf * weight is the share of light. Refraction scales radiance by 1/eta^2,
+            with eta the IOR of the far side over that of the near side (PBRT 4 ed., 9.5.2).
         """
         ratio = fresnel.relative(p.int_ior, p.ext_ior)
         outside = wi[2] > 0
@@ -83,48 +84,48 @@ class Dielectric(Interface):
 
 
 def _frozen_choice(reflectance, cos_i, ratio, outside, r):
-    """Probability of reflection by another IOR `ratio`, for a path whose own reflectance is r: 1 where that is."""
+    """Return the probability of reflection at the IOR `ratio`; 1 where the reflectance r at the own IOR is 1."""
     p, _ = reflectance(cos_i, jnp.where(outside, ratio, 1 / ratio))
     return jnp.where(r < 1, jnp.clip(p, MIN_BRANCH, 1 - MIN_BRANCH), 1)
 
 
-# ---- for derivatives: what moves paths is the relative IOR, int_ior / ext_ior --------------------------------------
+# ---- for derivatives: paths move with the relative IOR, int_ior / ext_ior -------------------------------------------
 
 
 def place(materials) -> int:
-    """Which of the tables is that of the dielectrics."""
+    """Return the index of the table of the dielectrics."""
     return next(i for i, table in enumerate(materials.tables) if table.kind is Dielectric)
 
 
 def iors(table: Table) -> tuple[Float[Array, " R"], Float[Array, " R"]]:
-    """int_ior, ext_ior."""
+    """Return int_ior and ext_ior."""
     return table.column("int_ior").values, table.column("ext_ior").values
 
 
 def relative_ior(table: Table) -> Float[Array, " R"]:
-    """int_ior / ext_ior."""
+    """Return int_ior / ext_ior."""
     inside, outside = iors(table)
     return inside / outside
 
 
 def with_relative_ior(table: Table, ratio: Float[Array, "*#R"], rows: Bool[Array, " R"]) -> Table:
-    """The table with `ratio`, one or one of each row, in some rows."""
+    """Return the table with the relative IOR `ratio` (one, or one per row) in the selected rows."""
     inside, outside = iors(table)
     return table.with_column("int_ior", jnp.where(rows, ratio * outside, inside))
 
 
 def choosing_by(table: Table, ratio: Float[Array, " R"], rows: Bool[Array, " R"]) -> Table:
-    """The table of which some rows choose their branches as if their relative IOR were `ratio`."""
+    """Return the table in which the selected rows choose branches as if their relative IOR were `ratio`."""
     return table.with_column("choose_by", jnp.where(rows, ratio, 0))
 
 
 def relative_ior_by(table: Table, row: int, field: str) -> Float[Array, ""]:
-    """Derivative of the relative IOR of a row in one of its parameters."""
+    """Return the derivative of the relative IOR of a row in one of its parameters."""
     inside, outside = (values[row] for values in iors(table))
     return 1 / outside if field == "int_ior" else -inside / (outside * outside)
 
 
 def ior_at(table: Table, row: int, field: str, ratio: float) -> Float[Array, ""]:
-    """Value of one of the parameters of a row at which its relative IOR is `ratio`."""
+    """Return the value of a parameter of a row at which its relative IOR is `ratio`."""
     inside, outside = (values[row] for values in iors(table))
     return ratio * outside if field == "int_ior" else inside / ratio

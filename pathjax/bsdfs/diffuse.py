@@ -25,7 +25,7 @@ class Diffuse(BSDF):
 
     @staticmethod
     def sample(p: Row, wi: Float[Array, "3"], u: Float[Array, " numbers"]) -> BSDFSample:
-        """Cosine-distributed `wo`; the weight is the albedo."""
+        """Sample `wo` from the cosine distribution; the weight is the albedo."""
         wo = square_to_cosine_hemisphere(u)
         one = jnp.ones_like(wo[2])
         return BSDFSample(wo, p.reflectance, square_to_cosine_hemisphere_pdf(wo), jnp.bool_(False), one)

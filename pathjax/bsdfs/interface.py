@@ -1,4 +1,4 @@
-"""What interfaces between two media have in common: both of their sides are seen, and their lobes may be tinted."""
+"""Base of interfaces between two media: both sides are seen, and the lobes may be tinted."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from pathjax.kinds import Color, Row
 
 
 class Interface(BSDF):
-    """Glass and its kin, which reflect some light and let the rest pass.
+    """Glass and similar interfaces, which reflect some light and let the rest pass.
 
-    A colour of a lobe is 1 where a file gives none. It is compiled, and is a parameter, only where one is given.
+    The colour of a lobe is 1 by default. It is compiled, and is a parameter, only where a file gives one.
     """
 
     specular_reflectance = Color(None, absent=1.0)
@@ -21,7 +21,7 @@ class Interface(BSDF):
 
     @staticmethod
     def tinted(p: Row, value: Float[Array, ""], reflects: Bool[Array, ""]) -> Float[Array, "3"]:
-        """A value of the lobe that reflects, or else of the other one, times its colour."""
+        """Return a value of the reflecting lobe, or else of the transmitting one, times the colour of that lobe."""
         reflected, transmitted = p.specular_reflectance, p.specular_transmittance
         value = jnp.broadcast_to(value, (3,))
         if reflected is not None:

@@ -1,9 +1,9 @@
-"""Indices of refraction by name, in the visible and under normal conditions: the names and numbers of Mitsuba."""
+"""Indices of refraction by name, for visible light under normal conditions, with Mitsuba's names and values."""
 
 import numpy as np
 
-# The least one, below that of any medium. Derivatives hold ninth powers of the ratio of two: the seventh in Fresnel's
-# terms, and the square in that of the ratio itself. Up to an IOR of 80 on the other side float32 holds these.
+# Least IOR, below that of any medium. Derivatives contain ninth powers of the ratio of two IORs: the seventh from
+# Fresnel's terms, and the square from the ratio itself. float32 holds these up to an IOR of 80 on the other side.
 LEAST_IOR = float(np.finfo(np.float32).tiny) ** (1 / 16)
 
 IOR = {

@@ -1,4 +1,4 @@
-"""Surfaces of which a part is cut out, or that let a share of the light through."""
+"""Surfaces with cut-outs, or that let a share of the light through."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathjax.kinds import Number, Row
 
 
 class Mask(Choosing):
-    """What stands inside for the share `opacity`, nothing for the rest."""
+    """The nested bsdf with the probability `opacity`, else nothing."""
 
     opacity = Number(0.5, bounds=(0, 1), textured=True)
 

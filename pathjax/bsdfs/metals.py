@@ -1,11 +1,11 @@
-"""Complex indices of refraction by name: the names that Mitsuba documents, and the numbers of its RGB mode.
+"""Complex indices of refraction by name: the names that Mitsuba documents, and the values of its RGB mode.
 
 Read off Mitsuba 3.9.1 (`mi.traverse` of a `conductor` of each name, variant scalar_rgb), which integrates measured
 spectra (Palik 1985, "Handbook of Optical Constants of Solids", and the tables of luxpop.com) against the matching
-functions of CIE 1931 and clamps what lies outside of the gamut.
+functions of CIE 1931 and clamps colours outside of the gamut.
 """
 
-# eta, k; in each red, green, blue.
+# eta and k, each for red, green, blue.
 METALS = {
     "a-C": ((2.94405, 2.22714, 1.96816), (0.887465, 0.799299, 0.81529)),
     "Ag": ((0.155276, 0.116728, 0.138388), (4.82835, 3.12222, 2.1469)),
@@ -50,7 +50,7 @@ METALS = {
     "W": ((4.37082, 3.30025, 2.99841), (3.50064, 2.60487, 2.27323)),
 }
 
-# Palik's are known by a second name.
+# Palik's data have a second name.
 _PALIK = """
     AlAs AlSb Be CsI Cu2O CuO d-C Hg HgTe Ir K Li MgO Mo Nb Rh Se-e Se SiC SnTe Ta Te-e Te ThF4 TiC TiN
     TiO2-e TiO2 VC VN

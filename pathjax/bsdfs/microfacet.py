@@ -1,11 +1,11 @@
-"""Rough surfaces as facets too small to see: how their normals are distributed, seen, and drawn.
+"""Microfacet distributions of rough surfaces: density, visibility and sampling of the normals of facets.
 
-A distribution gives the area of facets by their normal m, D(m), and the share of them that a direction v sees, G1(v).
-Its two roughnesses lie along x and y of the local frame. Directions are unit, `v` and `wi` lie on the side of +z,
-and so do all normals. Facets see light and eye independently, G = G1(wi) G1(wo), as in Mitsuba. (Walter et al. 2007,
+A distribution gives the area of facets by their normal m, D(m), and the share of them visible from a direction v,
+G1(v). Its two roughnesses are along x and y of the local frame. Directions are unit; `v`, `wi` and all normals lie on
+the side of +z. Masking and shadowing are independent, G = G1(wi) G1(wo), as in Mitsuba. (Walter et al. 2007,
 "Microfacet models for refraction through rough surfaces", EGSR; Heitz 2014, JCGT 3(2).)
 
-Densities are those of visible normals, D(m) G1(wi) (m . wi) / wi.z, and of what is reflected by them.
+Densities are those of visible normals, D(m) G1(wi) (m . wi) / wi.z, and of reflections at them.
 """
 
 from __future__ import annotations
@@ -21,52 +21,52 @@ from jaxtyping import Array, Float
 from pathjax.compile import compute_once
 from pathjax.core.math import cos_sin_turns, dot, larger, normalize, safe_sqrt, smaller
 
-# Mitsuba's least roughness: what is smoother has this one.
+# Mitsuba's least alpha; smaller values count as this one.
 MIN_ALPHA = 1e-4
 
 
 @dataclass(frozen=True)
 class Distribution(ABC):
-    """Normals of a rough surface. Not kept: made of the parameters at a point."""
+    """Normals of a rough surface. Built from the parameters at a point, never stored."""
 
-    alpha_u: Float[Array, ""]  # along x; root mean square slope of the facets, over sqrt(2), where there is one
+    alpha_u: Float[Array, ""]  # along x; sqrt(2) times the root mean square slope of the facets, where finite
     alpha_v: Float[Array, ""]  # along y
 
     @classmethod
     def of(cls, alpha_u: Float[Array, ""], alpha_v: Float[Array, ""]) -> Distribution:
-        """A distribution that is as rough as MIN_ALPHA at least."""
+        """Return a distribution whose roughnesses are at least MIN_ALPHA."""
         return cls(larger(alpha_u, MIN_ALPHA), larger(alpha_v, MIN_ALPHA))
 
     def detached(self) -> Distribution:
-        """The same without derivatives, to draw from."""
+        """Return the distribution without derivatives, for sampling."""
         return type(self)(lax.stop_gradient(self.alpha_u), lax.stop_gradient(self.alpha_v))
 
     @abstractmethod
     def area(self, m: Float[Array, "3"]) -> Float[Array, ""]:
-        """D(m) [1/sr], whose integral times m.z is 1; 0 below the horizon."""
+        """Return D(m) [1/sr]; the integral of D(m) m.z is 1. It is 0 below the horizon."""
 
     @abstractmethod
     def seen(self, v: Float[Array, "3"]) -> Float[Array, ""]:
-        """G1(v) / v.z, which is finite at grazing angles too. For v.z >= 0; at v.z = 0 it is the limit."""
+        """Return G1(v) / v.z for v.z >= 0, which is finite at grazing angles too; at v.z = 0 it is the limit."""
 
     @abstractmethod
     def sample(self, wi: Float[Array, "3"], u: Float[Array, "2"]) -> Float[Array, "3"]:
-        """A normal that wi sees, m . wi > 0 but for rounding; its density is `pdf`. u: in [0, 1)."""
+        """Sample a visible normal, m . wi > 0 up to rounding, with the density `pdf`. u: in [0, 1)."""
 
     def pdf(self, wi: Float[Array, "3"], m: Float[Array, "3"]) -> Float[Array, ""]:
-        """Density [1/sr] of normals in `sample`."""
+        """Return the density [1/sr] of normals in `sample`."""
         return self.area(m) * self.drawn(wi) * larger(dot(wi, m), 0)
 
     def drawn(self, wi: Float[Array, "3"]) -> Float[Array, ""]:
-        """1 / integral of D(m) max(m . wi, 0): `seen`, as `sample` has it."""
+        """Return 1 / integral of D(m) max(m . wi, 0): the value of `seen` that matches `sample` exactly."""
         return self.seen(wi)
 
     # ---- reflection ---------------------------------------------------------------------------------------------
 
     def reflected(self, wi: Float[Array, "3"], wo: Float[Array, "3"]) -> tuple[Float[Array, ""], Float[Array, "3"]]:
-        """f |cos theta_o| of facets that reflect all, and the normal of those that reflect wi to wo.
+        """Return f |cos theta_o| of perfectly reflecting facets, and the normal of those that reflect wi to wo.
 
-        0 where either lies below the horizon.
+        f is 0 where either direction lies below the horizon.
         """
         m = normalize(wi + wo)
         above = (wi[2] > 0) & (wo[2] > 0)
@@ -74,28 +74,28 @@ class Distribution(ABC):
         return jnp.where(above, value, 0), m
 
     def reflected_pdf(self, wi: Float[Array, "3"], wo: Float[Array, "3"]) -> Float[Array, ""]:
-        """Density [1/sr] of wi mirrored at normals of `sample`; 0 where either lies below the horizon."""
+        """Return the density [1/sr] of wi mirrored at normals of `sample`; 0 if wi or wo is below the horizon."""
         m = normalize(wi + wo)
         return jnp.where((wi[2] > 0) & (wo[2] > 0), self.area(m) * self.drawn(wi) / 4, 0)
 
-    # ---- of one roughness ---------------------------------------------------------------------------------------
+    # ---- stretching to roughness 1 ------------------------------------------------------------------------------
 
     def _slope(self, v: Float[Array, "3"]) -> Float[Array, ""]:
-        """The ratio of v.z to this decides what v sees: alpha sin(theta) where alpha_u = alpha_v."""
+        """Return the value whose ratio to v.z decides G1(v): alpha sin(theta) where alpha_u = alpha_v."""
         x, y = self.alpha_u * v[0], self.alpha_v * v[1]
         return safe_sqrt(x * x + y * y)
 
     def _stretched(self, wi: Float[Array, "3"]) -> Float[Array, "3"]:
-        """wi as it sees a surface of roughness 1."""
+        """Return wi relative to a stretched surface of roughness 1."""
         return normalize(jnp.stack([self.alpha_u * wi[0], self.alpha_v * wi[1], wi[2]]))
 
     def _unstretched(self, x: Float[Array, ""], y: Float[Array, ""], z: Float[Array, ""]) -> Float[Array, "3"]:
-        """The normal of this surface, by one, of any length, of a surface of roughness 1."""
+        """Return the normal of this surface, given one of any length of a surface of roughness 1."""
         return normalize(jnp.stack([self.alpha_u * x, self.alpha_v * y, larger(z, 0)]))
 
 
 class GGX(Distribution):
-    """Facets as those of an ellipsoid (Trowbridge and Reitz 1975; Walter et al. 2007)."""
+    """Facets with the normals of an ellipsoid (Trowbridge and Reitz 1975; Walter et al. 2007)."""
 
     def area(self, m):
         x, y, z = m[0] / self.alpha_u, m[1] / self.alpha_v, m[2]
@@ -107,9 +107,9 @@ class GGX(Distribution):
         return 2 / (z + safe_sqrt(x * x + y * y + z * z))
 
     def sample(self, wi, u):
-        """Halfway to a point of the cap that the hemisphere's reflections cover (Dupuy and Benyoub 2023, CGF 42(8))."""
+        """Sample halfway to a point of the spherical cap that reflections cover (Dupuy and Benyoub 2023, CGF 42(8))."""
         w = self._stretched(wi)
-        # The point's z is (1 - u1) (1 + w.z) - w.z; written so, neither 1 - z^2 nor z + w.z cancels.
+        # The point's z is (1 - u1) (1 + w.z) - w.z; in this form neither 1 - z^2 nor z + w.z cancels.
         height = 1 + w[2]
         r = safe_sqrt(u[1] * height * (2 - u[1] * height))
         cos, sin = cos_sin_turns(u[0])
@@ -120,14 +120,14 @@ class Beckmann(Distribution):
     """Facets whose slopes are normally distributed (Beckmann and Spizzichino 1963)."""
 
     def area(self, m):
-        # Of normals so near the horizon that z^4 underflows there are none.
+        # Normals so near the horizon that z^4 underflows have density 0.
         z = larger(m[2], float(jnp.finfo(m.dtype).tiny) ** 0.25)
         x, y, z2 = m[0] / self.alpha_u, m[1] / self.alpha_v, z * z
         value = jnp.exp(-(x * x + y * y) / z2) / (z2 * z2) / (math.pi * self.alpha_u * self.alpha_v)
         return jnp.where(m[2] > 0, value, 0)
 
     def seen(self, v):
-        """By the rational approximation of Walter et al., which Mitsuba has too: within 0.35 % of `drawn`."""
+        """Use the rational approximation of Walter et al., as Mitsuba does; it is within 0.35 % of `drawn`."""
         slope, z = self._slope(v), v[2]
         steep = z >= 1.6 * slope
         a = jnp.where(steep, 0, z / jnp.where(slope > 0, slope, 1))
@@ -135,7 +135,7 @@ class Beckmann(Distribution):
         return jnp.where(steep, 1 / jnp.where(steep, z, 1), low)
 
     def drawn(self, wi):
-        """Exact: Heitz 2014, equation 78, of which all terms are positive."""
+        """Exact: Heitz 2014, equation 78, whose terms are all positive."""
         slope, z = self._slope(wi), wi[2]
         steep = z >= 9 * slope  # erfc(9) is below the rounding of float64
         a = jnp.where(steep, 0, z / jnp.where(slope > 0, slope, 1))
@@ -143,11 +143,11 @@ class Beckmann(Distribution):
         return 1 / jnp.where(steep, z, near)
 
     def sample(self, wi, u):
-        """By slopes, along wi and across (Heitz and d'Eon 2014, CGF 33(4)).
+        """Sample the slopes along and across wi (Heitz and d'Eon 2014, CGF 33(4)).
 
-        Along wi a slope s has the density exp(-s^2) max(cos - s sin, 0). In terms of y = erf(s), as Jakob 2014 ("An
-        improved visible normal sampling routine for the Beckmann distribution") has it, two steps of Newton's method
-        invert its integral within 2e-5, from a start between the exact inverse of normal incidence, and nearly that of
+        The slope s along wi has the density exp(-s^2) max(cos - s sin, 0). In terms of y = erf(s), as in Jakob 2014
+        ("An improved visible normal sampling routine for the Beckmann distribution"), two steps of Newton's method
+        invert its integral within 2e-5. They start between the exact inverse for normal incidence and nearly that for
         grazing incidence.
         """
         w = self._stretched(wi)
@@ -169,7 +169,7 @@ class Beckmann(Distribution):
             y = compute_once(y - (integral(y, slope) - target) / growth)
         along = lax.erf_inv(jnp.clip(y, -tip, most))
         across = lax.erf_inv(jnp.clip(2 * u[1] - 1, -tip, tip))
-        # Azimuth of wi; any where it has none.
+        # Azimuth of wi; arbitrary at normal incidence.
         x = jnp.where(sin > 0, w[0] / jnp.where(sin > 0, sin, 1), 1)
         y = jnp.where(sin > 0, w[1] / jnp.where(sin > 0, sin, 1), 0)
         return self._unstretched(-(x * along - y * across), -(y * along + x * across), jnp.ones_like(cos))
@@ -179,10 +179,10 @@ DISTRIBUTIONS: dict[str, type[Distribution]] = {"beckmann": Beckmann, "ggx": GGX
 
 
 def above_horizon(v: Float[Array, "3"]) -> Float[Array, "3"]:
-    """v, or where it lies below the horizon some direction above, for formulas that divide by v.z."""
+    """Return v, with z = 1 where it lies below the horizon, for formulas that divide by v.z."""
     return jnp.stack([v[0], v[1], jnp.where(v[2] > 0, v[2], 1)])
 
 
 def mirrored(wi: Float[Array, "3"], m: Float[Array, "3"]) -> Float[Array, "3"]:
-    """wi mirrored at the normal m."""
+    """Mirror wi at the normal m."""
     return 2 * dot(wi, m) * m - wi

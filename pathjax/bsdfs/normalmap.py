@@ -1,4 +1,4 @@
-"""Textures of normals."""
+"""Normal maps."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathjax.kinds import Color, Row
 
 
 class NormalMap(Mapped):
-    """Shading by the normals of a texture, whose channels c hold 2 c - 1: along u, across, and along the normal."""
+    """Shading by the normals of a texture, whose channels c encode 2 c - 1 along u, across u, and along the normal."""
 
     normalmap = Color(listed=False, required=True)
 

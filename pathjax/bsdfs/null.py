@@ -1,4 +1,4 @@
-"""Nothing at all."""
+"""Surfaces without effect on light."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pathjax.kinds import Row
 
 
 class Null(BSDF):
-    """A surface that light passes as if it were not there; of masks, what is cut out."""
+    """A surface that light passes as if it were not there; also the cut-outs of masks."""
 
     delta = passes = True
 
@@ -21,10 +21,10 @@ class Null(BSDF):
 
     @staticmethod
     def sample(p: Row, wi: Float[Array, "3"], u: Float[Array, " numbers"]) -> BSDFSample:
-        """Straight on."""
+        """Continue straight on."""
         one = jnp.ones_like(wi[2])
         return BSDFSample(-wi, jnp.ones_like(wi), one, jnp.bool_(True), one)
 
 
-# What masks and panes hold beside something else: one row for all of them.
+# The second bsdf of masks, sheets and panes: one row for all of them.
 NOTHING = Null.instance("nothing")

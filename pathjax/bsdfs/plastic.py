@@ -15,15 +15,15 @@ from pathjax.core.types import BSDFSample
 from pathjax.core.warp import chosen, square_to_cosine_hemisphere, square_to_cosine_hemisphere_pdf
 from pathjax.kinds import Color, Flag, Row
 
-# Lobes are chosen as if neither reflectance were below this: one that is black has a derivative all the same.
+# Least reflectance by which a lobe is chosen: a black one may still have a derivative.
 LEAST_REFLECTANCE = 0.01
 
 
 class Plastic(BSDF):
-    """One-sided. The coat reflects in the mirror direction; what enters the base leaves it through the coat again.
+    """One-sided. The coat reflects in the mirror direction; light that enters the base leaves it through the coat.
 
-    Light that the coat sends back to the base is reflected there again, any number of times. `nonlinear`: by the
-    colour of the base each time, which so becomes more saturated; else its colour counts once.
+    Light that the coat reflects back to the base is reflected there again, any number of times. With `nonlinear` the
+    colour of the base counts each time, which saturates it; else it counts once.
     """
 
     diffuse_reflectance = Color(0.5)
@@ -43,7 +43,7 @@ class Plastic(BSDF):
 
     @staticmethod
     def sample(p: Row, wi: Float[Array, "3"], u: Float[Array, " numbers"]) -> BSDFSample:
-        """The mirror direction by about the share that the coat has in the light, else by the cosine."""
+        """Sample the mirror direction by about the coat's share of the light, else the cosine distribution."""
         mirrors = reflectance(wi, fresnel.relative(p.int_ior, p.ext_ior))
         chance = chance_of_coat(p, mirrors)
         coat, u = chosen(u, chance)
@@ -56,12 +56,14 @@ class Plastic(BSDF):
 
 
 def reflectance(w: Float[Array, "3"], eta: Float[Array, ""]) -> Float[Array, ""]:
-    """Reflectance of the coat, from outside."""
+    """Return the reflectance of the coat from outside."""
     return fresnel.dielectric(jnp.clip(w[2], 0, 1), eta)[0]
 
 
 def base(p: Row, eta: Float[Array, ""], leaves: Float[Array, ""]) -> Float[Array, "3"]:
-    """Albedo of the base, with all reflections between it and the coat, over eta^2: radiance is spread where it leaves.
+    """Return the albedo of the base, with all reflections between it and the coat, over eta^2.
+
+    The division is because radiance spreads where it leaves the coat.
 
     leaves: share of diffuse light that the coat does not send back to the base.
     """
@@ -72,7 +74,7 @@ def base(p: Row, eta: Float[Array, ""], leaves: Float[Array, ""]) -> Float[Array
 
 
 def chance_of_coat(p: Row, mirrors: Float[Array, ""]) -> Float[Array, ""]:
-    """Probability with which the coat is sampled; detached.
+    """Return the probability of sampling the coat, detached.
 
     mirrors: reflectance of the coat for light from `wi`.
     """

@@ -1,4 +1,4 @@
-"""Linear polarisers, at whatever angle."""
+"""Linear polarisers at any angle."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathjax.kinds import Unused
 
 
 class Polarizer(Sheet):
-    """Half of the light goes straight on: light has no polarisation here."""
+    """Passes half of the light straight on, since light has no polarisation here."""
 
     passes_of = 0.5
     unused: ClassVar[Mapping[str, Unused]] = {

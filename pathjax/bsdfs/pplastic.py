@@ -1,4 +1,4 @@
-"""Plastic whose lobes are added, as Mitsuba's polarised plastic is for light without polarisation."""
+"""Plastic as the sum of its lobes: Mitsuba's polarised plastic for unpolarised light."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from pathjax.kinds import Color, Row
 
 
 class PPlastic(Rough):
-    """One-sided: rough reflection, and a diffuse base that light enters and leaves by a smooth interface, once.
+    """One-sided: rough reflection plus a diffuse base, which light enters and leaves once through a smooth interface.
 
-    (Baek et al. 2018, "Simultaneous acquisition of polarimetric SVBRDF and normals".) What the interface sends back to
-    the base is lost.
+    Light that the interface reflects back to the base is lost. (Baek et al. 2018, "Simultaneous acquisition of
+    polarimetric SVBRDF and normals".)
     """
 
     diffuse_reflectance = Color(0.5)
@@ -52,7 +52,7 @@ class PPlastic(Rough):
 
     @staticmethod
     def sample(p: Row, wi: Float[Array, "3"], u: Float[Array, " numbers"]) -> BSDFSample:
-        """Mirrored at a normal that wi sees, by about the share that mirrored light has, else by the cosine."""
+        """Mirror wi at a visible normal by about the coat's share of the light, else sample the cosine distribution."""
         on_coat, u = chosen(u, chance_of_coat(p, reflectance(wi, p.int_ior / p.ext_ior)))
         m = Rough.facets(p).detached().sample(wi, u)
         wo = jnp.where(on_coat, mirrored(wi, m), square_to_cosine_hemisphere(u))

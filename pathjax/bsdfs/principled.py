@@ -1,4 +1,4 @@
-"""Burley's principled bsdf: opaque, or with a part that is clear inside."""
+"""Burley's principled bsdf: opaque, or with a clear part."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ from pathjax.core.types import BSDFSample
 from pathjax.core.warp import chosen, square_to_cosine_hemisphere, square_to_cosine_hemisphere_pdf
 from pathjax.kinds import Color, Number, Row, Unused
 
-# Lobes are chosen as if nothing of them were darker: one that is black has a derivative all the same.
+# Least reflectance by which a lobe is chosen: a black one may still have a derivative.
 LEAST_REFLECTANCE = 0.01
-# Between equal media facets turn nothing, so light that passes has no density. Mitsuba's least `specular` of clear
-# ones, and their IOR where it is 1.
+# Facets between equal media do not deflect light, so transmitted light has no density. These are Mitsuba's least
+# `specular` of clear bsdfs, and their IOR where it is 1.
 LEAST_CLEAR_SPECULAR, LEAST_CLEAR_IOR = 1e-3, 1.001
 
 
 @dataclass(frozen=True)
 class Share(Number):
-    """From 0 to 1. At 0, the default, it is no parameter, and what it is a share of is left out of the program."""
+    """A share in [0, 1]. At 0, the default, it is no parameter, and its effect is left out of the program."""
 
     bounds: tuple[float, float] = (0, 1)
     textured: bool = True
@@ -46,7 +46,7 @@ RATES = {
 
 
 class Principled(BSDF):
-    """One-sided: a metal, a rough coat on a diffuse base, or between them, with sheen and a second, clear coat."""
+    """One-sided: a blend of a metal and a diffuse base under a rough coat, with sheen and a second, clear coat."""
 
     base_color = Color(0.5)
     roughness = Number(0.5, bounds=(0, 1), textured=True)
@@ -54,7 +54,7 @@ class Principled(BSDF):
     metallic = Share()
     spec_trans = Share()
     eta = Number(None, bounds=(LEAST_IOR, math.inf))
-    specular = Number(None, bounds=(0, 1))  # in the place of eta
+    specular = Number(None, bounds=(0, 1))  # instead of eta
     spec_tint = Share()
     sheen = Share()
     sheen_tint = Share()
@@ -69,7 +69,7 @@ class Principled(BSDF):
         if fields.has("eta") and fields.has("specular"):
             raise fields.error("specular", "cannot stand beside eta; give one or the other")
         values = super().read(loader, fields, name).values
-        # What nothing asks for is no parameter.
+        # Tints and glosses of absent lobes are no parameters.
         without = {"sheen": ("sheen_tint",), "clearcoat": ("clearcoat_gloss",)}
         unasked = {part: None for whole, parts in without.items() if values[whole] is None for part in parts}
         return (cls if values["spec_trans"] is None else ClearPrincipled).instance(name, **{**values, **unasked})
@@ -90,15 +90,15 @@ class Principled(BSDF):
 
 
 class ClearPrincipled(Principled):
-    """A principled bsdf of which `spec_trans` of what is no metal is glass: an interface, `eta` its IOR inside.
+    """A principled bsdf whose non-metallic part is glass by the share `spec_trans`: an interface, with `eta` inside.
 
-    Inside there is the glass alone. From the derivative in `eta` an edge is missing, as of `RoughDielectric` with GGX.
+    From inside, only the glass is seen. The derivative in `eta` lacks an edge term, as in `RoughDielectric` with GGX.
     """
 
     transmissive = sided = lobes = True
 
 
-# ---- what both compute ----------------------------------------------------------------------------------------------
+# ---- shared by both -------------------------------------------------------------------------------------------------
 
 
 class Look(NamedTuple):
@@ -119,7 +119,7 @@ class Look(NamedTuple):
 
     @property
     def dielectric(self) -> Float[Array, ""] | float:
-        """Share of what is no metal."""
+        """Share of the non-metallic part."""
         return 1.0 if self.metallic is None else 1 - self.metallic
 
     @property
@@ -129,17 +129,17 @@ class Look(NamedTuple):
 
     @property
     def opaque(self) -> Float[Array, ""] | float:
-        """Share of what has a diffuse base."""
+        """Share of the part with a diffuse base."""
         return self.dielectric if self.spec_trans is None else self.dielectric * (1 - self.spec_trans)
 
     def mixed(self) -> Look:
-        """The look by which lobes are chosen. Each has a chance: of share 0 it is black, but its derivative is not."""
+        """Return the look by which lobes are chosen. Each has a chance, since one of share 0 may have a derivative."""
         shares = {name: getattr(self, name) for name in ("metallic", "spec_trans", "clearcoat")}
         return self._replace(**{name: within_shares(share) for name, share in shares.items() if share is not None})
 
 
 def within_shares(share: Float[Array, ""]) -> Float[Array, ""]:
-    """A share () in [0, 1] moved so far from both ends that each of two lobes has a chance."""
+    """Clamp a share () away from 0 and 1, so that each of two lobes has a chance."""
     return jnp.clip(share, LEAST_REFLECTANCE, 1 - LEAST_REFLECTANCE)
 
 
@@ -149,7 +149,7 @@ def _look(p: Row) -> Look:
     if eta is not None and clear:
         eta = jnp.where(jnp.abs(eta - 1) < LEAST_CLEAR_IOR - 1, LEAST_CLEAR_IOR, eta)
     if specular is not None:
-        # R0 = 0.08 specular. Rows with an eta of their own have no specular, and 0 in its place.
+        # R0 = 0.08 specular. Rows with an eta of their own have specular 0, the others eta 0.
         specular = larger(specular, LEAST_CLEAR_SPECULAR) if clear else specular
         of_specular = 2 / (1 - safe_sqrt(0.08 * specular)) - 1
         eta = of_specular if eta is None else jnp.where(p.eta > 0, eta, of_specular)
@@ -157,9 +157,9 @@ def _look(p: Row) -> Look:
 
 
 def _reflectance(look: Look, cos: Float[Array, ""], inside: Bool[Array, ""] | None):
-    """Reflectance of the facets (3,), that of their glass alone, and the cosine behind them (Burley 2012, 2015).
+    """Return the reflectance of the facets (3,), that of their glass alone, and the cosine behind them.
 
-    inside: None: never.
+    (Burley 2012, 2015.) inside: None: never.
     """
     eta = look.eta if inside is None else jnp.where(inside, 1 / look.eta, look.eta)
     exact, cos_t = fresnel.dielectric(cos, eta)
@@ -177,15 +177,15 @@ def _reflectance(look: Look, cos: Float[Array, ""], inside: Bool[Array, ""] | No
 
 
 def mean(color: Float[Array, "3"]) -> Float[Array, ""]:
-    """Mean of the channels, for chances: never 0."""
+    """Return the mean of the channels for chances, at least LEAST_REFLECTANCE."""
     return larger(jnp.mean(color), LEAST_REFLECTANCE)
 
 
 class Chances(NamedTuple):
-    """Chances of the lobes, by about the light that they carry; detached."""
+    """Probabilities of the lobes, by about the light that they carry; detached."""
 
     base: Float[Array, ""]
-    coat: Float[Array, ""] | None  # of what is not from the base; the facets have the rest
+    coat: Float[Array, ""] | None  # given that it is not the base; the facets have the rest
 
     @classmethod
     def of(cls, look: Look, cos: Float[Array, ""], inside: Bool[Array, ""] | None) -> Chances:
@@ -200,14 +200,14 @@ class Chances(NamedTuple):
 
 
 def _refracts(look: Look, reflectance: Float[Array, "3"], exact: Float[Array, ""]) -> Float[Array, ""]:
-    """Chance that facets let through instead of reflecting; detached."""
+    """Return the probability that facets transmit instead of reflecting, detached."""
     through = look.mixed().clear * (1 - exact) * mean(safe_sqrt(look.base_color))
     reflected = larger(jnp.mean(reflectance), LEAST_REFLECTANCE * exact)
     return lax.stop_gradient(safe_divide(through, through + reflected))
 
 
 def _side(look: Look, wi: Float[Array, "3"]):
-    """Whether wi is inside, None: never; and wi as if the surface were turned towards it, with the sign of that."""
+    """Return whether wi is inside (None: never), wi turned to the upper side, and the sign that turns it."""
     if look.spec_trans is None:
         return None, wi, 1
     side = jnp.where(wi[2] < 0, -1, 1).astype(wi.dtype)
@@ -227,7 +227,7 @@ def _evaluate(look: Look, wi: Float[Array, "3"], wo: Float[Array, "3"]) -> tuple
     cos_i = smaller(jnp.where(possible, cos_i, 1), 1)
     wi, far = (jnp.stack([w[0], w[1], jnp.where(possible, jnp.abs(w[2]), 1)]) for w in (wi, wo))
 
-    # Facets. D times (wi . m) dm/dwo, which is D/4 where they reflect.
+    # Facets: D times (wi . m) dm/dwo, which is D/4 where they reflect.
     spread = cos_i * cos_o * eta * eta / jnp.where(possible, dot(h, h), 1)
     facets = burley.facets(look.roughness, look.anisotropic)
     drawn = facets.area(m) * spread * facets.seen(wi)
@@ -243,7 +243,7 @@ def _evaluate(look: Look, wi: Float[Array, "3"], wo: Float[Array, "3"]) -> tuple
     of_facets = (1 - chances.base) * chance
     pdf = of_facets * drawn if chances.coat is None else of_facets * (1 - chances.coat) * drawn
 
-    # The base, and what lies on it.
+    # The base, with sheen and clear coat.
     above = possible if inside is None else possible & reflects & ~inside
     base = look.opaque * burley.diffuse(look.roughness, look.flatness, wi[2], far[2], cos_i) * look.base_color
     if look.sheen is not None:
@@ -260,7 +260,7 @@ def _evaluate(look: Look, wi: Float[Array, "3"], wo: Float[Array, "3"]) -> tuple
 
 
 def _sample(look: Look, wi: Float[Array, "3"], u: Float[Array, " numbers"]) -> BSDFSample:
-    """From one of the lobes. Of the numbers, the first one chooses: of two also a part of the direction."""
+    """Sample one of the lobes. The first number chooses it; if there are only two, it is used again for wo."""
     inside, seen, side = _side(look, wi)
     u = u if inside is None else jnp.stack([u[2], u[0], u[1]])
     chances = Chances.of(look, jnp.clip(seen[2], 0, 1), inside)
@@ -282,7 +282,7 @@ def _sample(look: Look, wi: Float[Array, "3"], u: Float[Array, " numbers"]) -> B
         passive = jnp.where(refracted, 1 / (eta * eta), 1)
     wo = lax.stop_gradient(jnp.where(from_base, diffuse, wo) * side)
     f, pdf = _evaluate(look, wi, wo)
-    # What lies on the other side of the surface than what was drawn has another density.
+    # If wo is on the wrong side of the surface for its lobe, the pdf from `_evaluate` is that of another lobe.
     pdf = jnp.where((wo[2] * side > 0) == ~refracted, pdf, 0)
     weight = jnp.where(pdf > 0, f * safe_divide(1.0, pdf), 0)
     return BSDFSample(wo, weight, pdf, jnp.bool_(False), lax.stop_gradient(passive))

@@ -1,4 +1,4 @@
-"""Burley's principled bsdf of what is too thin to refract: leaves, paper, panes."""
+"""Burley's principled bsdf for surfaces too thin to refract: leaves, paper, panes."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from pathjax.kinds import Color, Number, Row, Unused
 
 
 class PrincipledThin(BSDF):
-    """Alike on both sides (Burley 2015, 5.3). Of what `spec_trans` leaves, half of `diff_trans` shines through."""
+    """The same on both sides (Burley 2015, 5.3). The share `diff_trans` / 2 of light at the base shines through."""
 
     base_color = Color(0.5)
     roughness = Number(0.5, bounds=(0, 1), textured=True)
@@ -47,7 +47,7 @@ class PrincipledThin(BSDF):
 
     @staticmethod
     def sample(p: Row, wi: Float[Array, "3"], u: Float[Array, " numbers"]) -> BSDFSample:
-        """From the facets or the base, back or through."""
+        """Sample the facets or the base, reflecting or transmitting."""
         look, side = Look.of(p), _side(wi)
         seen, u = wi * side, jnp.stack([u[2], u[0], u[1]])
         from_base, u = chosen(u, look.chance_of_base(seen))
@@ -84,7 +84,7 @@ class Look(NamedTuple):
 
     @property
     def base(self) -> Float[Array, ""] | float:
-        """Share of the base; the rest is that of the facets."""
+        """Share of the base; the facets have the rest."""
         return 1.0 if self.spec_trans is None else 1 - self.spec_trans
 
     @property
@@ -93,12 +93,12 @@ class Look(NamedTuple):
         return 0.0 if self.diff_trans is None else self.diff_trans / 2
 
     def facets(self, through: Bool[Array, ""]) -> burley.GGX:
-        """The facets; those that light passes, by two interfaces, spread it by the IOR, too (Burley 2015, 5.3)."""
+        """Return the facets. For light through both interfaces roughness grows with the IOR (Burley 2015, 5.3)."""
         spread = jnp.where(through, 0.65 * self.eta - 0.35, 1)
         return burley.facets(spread * self.roughness, self.anisotropic)
 
     def reflectance(self, cos: Float[Array, ""]) -> tuple[Float[Array, "3"], Float[Array, ""]]:
-        """Reflectance of the facets, and the part that is let through."""
+        """Return the reflectance of the facets, and the share that they transmit."""
         exact, cos_t = fresnel.dielectric(cos, self.eta)
         total = exact
         if self.spec_tint is not None:
@@ -133,7 +133,7 @@ def _side(wi):
 
 
 def _leaves(wo, m):
-    """Whether wo, once it is on the far side, is also beyond the facet; else it is lost, as in Mitsuba."""
+    """Return whether wo, once on the far side, is also beyond the facet; else it is lost, as in Mitsuba."""
     return wo[0] * m[0] + wo[1] * m[1] < wo[2] * m[2]
 
 
@@ -146,7 +146,7 @@ def _evaluate(look: Look, wi: Float[Array, "3"], wo: Float[Array, "3"]) -> tuple
     m = normalize(wi + back)
     cos_d = smaller(dot(wi, m), 1)
 
-    # The base: what returns, with its sheen, and what shines through.
+    # The base: reflected light, with sheen, and transmitted light.
     returns = look.base_color * burley.diffuse(look.roughness, look.flatness, wi[2], back[2], cos_d)
     if look.sheen is not None:
         fuzz = look.sheen * burley.sheen(back[2], cos_d)
@@ -160,7 +160,7 @@ def _evaluate(look: Look, wi: Float[Array, "3"], wo: Float[Array, "3"]) -> tuple
     if look.diff_trans is None:
         f, pdf = jnp.where(through, 0, f), jnp.where(through, 0, pdf)
 
-    # Facets mirror what they let through, too, to the far side.
+    # Facets also mirror the light that they transmit, to the far side.
     if look.spec_trans is not None:
         facets, (reflected, passed) = look.facets(through), look.reflectance(cos_d)
         value, _ = facets.reflected(wi, back)

@@ -1,4 +1,4 @@
-"""Wave plates, of whatever delay."""
+"""Wave plates of any retardance."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathjax.kinds import Unused
 
 
 class Retarder(Sheet):
-    """All light goes straight on: light has no polarisation here."""
+    """Passes all light straight on, since light has no polarisation here."""
 
     passes_of = 1.0
     unused: ClassVar[Mapping[str, Unused]] = {

@@ -1,4 +1,4 @@
-"""What bsdfs of one rough surface have in common: how rough it is, and how their lobe is drawn."""
+"""Base of bsdfs with one rough surface: its roughness, and how its lobe is sampled."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from pathjax.kinds import Choice, Number, Row, Unused
 
 @dataclass(frozen=True)
 class Roughness(Number):
-    """From 0 to 1. What is smoother than MIN_ALPHA is as rough as that."""
+    """A roughness in [0, 1]; values below MIN_ALPHA count as MIN_ALPHA."""
 
     bounds: tuple[float, float] = (0, 1)
     least: float = MIN_ALPHA
 
 
 class Rough(BSDF):
-    """A surface of facets, as rough along u as along v by `alpha`, or else by `alpha_u` and `alpha_v`.
+    """A surface of facets, with the isotropic roughness `alpha`, or else with `alpha_u` and `alpha_v`.
 
-    What is smoother than `microfacet.MIN_ALPHA` is as rough as that, as in Mitsuba.
+    Values below `microfacet.MIN_ALPHA` count as MIN_ALPHA, as in Mitsuba.
     """
 
     alpha = Roughness(0.1, textured=True)  # None: alpha_u and alpha_v instead
@@ -60,7 +60,7 @@ class Rough(BSDF):
 
     @staticmethod
     def facets(p: Row) -> Distribution:
-        """The facets of one row, at the point."""
+        """Return the facets of one row at the point."""
         made = DISTRIBUTIONS[p.distribution].of
         if (alpha := p.alpha) is not None:
             return made(alpha, alpha)

@@ -15,7 +15,7 @@ from pathjax.kinds import Row
 
 
 class RoughConductor(Rough, Conductor):
-    """Rough one-sided metal, whose facets reflect once (Walter et al. 2007; Heitz 2014)."""
+    """Rough one-sided metal; its facets reflect once (Walter et al. 2007; Heitz 2014)."""
 
     delta = False
 
@@ -28,7 +28,7 @@ class RoughConductor(Rough, Conductor):
 
     @staticmethod
     def sample(p: Row, wi: Float[Array, "3"], u: Float[Array, " numbers"]) -> BSDFSample:
-        """Mirrored at a normal that wi sees."""
+        """Mirror wi at a sampled visible normal."""
         wo = compute_once(mirrored(wi, Rough.facets(p).detached().sample(wi, u)))
         f, pdf = RoughConductor.evaluate(p, wi, wo)
         return BSDFSample(wo, safe_divide(f, pdf), pdf, jnp.bool_(False), jnp.ones_like(pdf))

@@ -18,11 +18,11 @@ from pathjax.kinds import Row
 
 
 class RoughDielectric(Rough, Interface):
-    """Rough interface, whose facets reflect or refract once (Walter et al. 2007); `int_ior` lies on the side that the
+    """Rough interface whose facets reflect or refract once (Walter et al. 2007). `int_ior` lies on the side that the
     normal points away from.
 
-    No path moves with its IOR: directions are drawn by the present one, and the weights carry the derivative. Of GGX an
-    edge is missing from it: facets stand upright too, with which f ends abruptly at directions that the IOR moves.
+    Paths do not move with its IOR: directions are drawn by its primal value, and the weights carry the derivative. With
+    GGX this lacks an edge term: there are upright facets, so f ends abruptly at directions that move with the IOR.
     """
 
     int_ior = IndexOfRefraction(IOR["bk7"])
@@ -38,22 +38,22 @@ class RoughDielectric(Rough, Interface):
 
     @staticmethod
     def evaluate(p: Row, wi: Float[Array, "3"], wo: Float[Array, "3"]) -> tuple[Float[Array, "3"], Float[Array, ""]]:
-        """Radiance is scaled by 1/eta^2 on refraction, eta being the IOR of the far side over that of the near side."""
+        """As in `BSDF`; refraction scales radiance by 1/eta^2, with eta the IOR of the far side over the near side."""
         facets, eta, side = Rough.facets(p), _eta(p, wi), _side(wi)
         wi, wo = wi * side, wo * side
         reflects = wo[2] > 0
-        # Facets that send wi to wo have this normal: Walter et al., equations 13 and 16.
+        # The normal of facets that send wi to wo: Walter et al., equations 13 and 16.
         h = wi + wo * jnp.where(reflects, 1, eta)
         squared = dot(h, h)
         m = normalize(h)
         m = compute_once(m * jnp.where(m[2] < 0, -1, 1))
         i, o = dot(wi, m), dot(wo, m) * jnp.where(reflects, 1, -1)
-        # Both see the side of the facet that they see of the surface.
+        # wi and wo each see the same side of the facet as of the surface.
         possible = (i > 0) & (o > 0) & (wi[2] > 0) & (wo[2] != 0)
         i = smaller(jnp.where(possible, i, 1), 1)
         reflectance, _ = fresnel.dielectric(i, eta)
         chance = jnp.where(reflects, reflectance, 1 - reflectance)
-        # Times D (wi . m) dm/dwo, equations 14 and 17; 4 (wo . m)^2 is the square of h, too, where light is reflected.
+        # (wi . m) dm/dwo, equations 14 and 17; where light is reflected, 4 (wo . m)^2 is the square of h.
         spread = safe_divide(i * o * jnp.where(reflects, 1, eta * eta), jnp.where(possible, squared, 0))
         common = compute_once(chance * facets.area(m) * spread)
         far = jnp.stack([wo[0], wo[1], jnp.where(possible, jnp.abs(wo[2]), 1)])
@@ -65,7 +65,7 @@ class RoughDielectric(Rough, Interface):
 
     @staticmethod
     def sample(p: Row, wi: Float[Array, "3"], u: Float[Array, " numbers"]) -> BSDFSample:
-        """Reflect at a normal that wi sees with the probability R, or else refract."""
+        """Sample a visible normal; reflect at it with the probability R, else refract."""
         eta, side = lax.stop_gradient(_eta(p, wi)), _side(wi)
         seen = wi * side
         m = Rough.facets(p).sample(seen, u)
@@ -77,7 +77,7 @@ class RoughDielectric(Rough, Interface):
         wo = ((scale * i + jnp.where(reflects, i, -cos_t)) * m - scale * seen) * side
         wo = compute_once(lax.stop_gradient(wo))
         f, pdf = RoughDielectric.evaluate(p, wi, wo)
-        # What lies on the other side of the surface than what was drawn has another density.
+        # If wo is on the wrong side of the surface for its lobe, the pdf from `evaluate` is that of the other lobe.
         pdf = jnp.where((wo[2] * side > 0) == reflects, pdf, 0)
         weight = jnp.where(pdf > 0, safe_divide(f, pdf), 0)
         passive = jnp.where(reflects, 1, scale * scale)
@@ -85,11 +85,11 @@ class RoughDielectric(Rough, Interface):
 
 
 def _side(wi):
-    """-1 below the surface, which is seen from there as if turned round."""
+    """Return -1 below the surface, else 1: the factor that turns wi to the upper side."""
     return jnp.where(wi[2] < 0, -1, 1).astype(wi.dtype)
 
 
 def _eta(p, wi):
-    """IOR of the far side over that of the near side."""
+    """Return the IOR of the far side over that of the near side."""
     ratio = fresnel.relative(p.int_ior, p.ext_ior)
     return jnp.where(wi[2] < 0, 1 / ratio, ratio)

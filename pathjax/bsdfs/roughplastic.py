@@ -19,11 +19,11 @@ from pathjax.kinds import Choice, PerRow, Row, Unused
 
 
 class RoughPlastic(Plastic):
-    """As `Plastic`, but that the facets of the coat reflect and refract, each once (Walter et al. 2007)."""
+    """`Plastic` with a coat of facets, which reflect or refract once (Walter et al. 2007)."""
 
     alpha = Roughness(0.1)
     distribution = Choice("beckmann", options=tuple(DISTRIBUTIONS))
-    coat = PerRow()  # of `coat.coats`
+    coat = PerRow()  # from `coat.coats`
     delta = False
     unused: ClassVar[Mapping[str, Unused]] = Rough.unused
 
@@ -45,7 +45,7 @@ class RoughPlastic(Plastic):
 
     @staticmethod
     def sample(p: Row, wi: Float[Array, "3"], u: Float[Array, " numbers"]) -> BSDFSample:
-        """Mirrored at a normal that wi sees, by about the share that the coat has in the light, else by the cosine."""
+        """Mirror wi at a visible normal by about the coat's share of the light, else sample the cosine distribution."""
         T, _ = coat.at(p.coat, p.alpha, _eta(p))
         on_coat, u = chosen(u, chance_of_coat(p, 1 - coat.passes(T, jnp.clip(wi[2], 0, 1))))
         m = _facets(p).detached().sample(wi, u)

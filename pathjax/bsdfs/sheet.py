@@ -1,4 +1,4 @@
-"""Sheets that change the polarisation of light, which here has none: a share of it goes straight on."""
+"""Base of sheets that change polarisation. Light has none here, so a share of it just goes straight on."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from pathjax.bsdfs.null import NOTHING
 from pathjax.bsdfs.wrapper import Choosing
 from pathjax.kinds import Number, Row
 
-# Why what turns polarisation has no effect.
+# Why fields about polarisation have no effect.
 UNPOLARISED = "light has no polarisation here"
 
 
 class Opaque(BSDF):
-    """What absorbs all light."""
+    """A surface that absorbs all light."""
 
     @classmethod
     def sides(cls, instance):
@@ -26,7 +26,7 @@ class Opaque(BSDF):
 
 @dataclass(frozen=True)
 class Transmittance(Number):
-    """A number from 0 to 1, or a grey."""
+    """A number in [0, 1], or a grey colour."""
 
     bounds: tuple[float, float] = (0, 1)
 
@@ -40,7 +40,7 @@ class Transmittance(Number):
 
 
 class Sheet(Choosing):
-    """Lets the share `transmittance` times `passes_of` it straight on, and absorbs the rest."""
+    """Passes the share `passes_of * transmittance` of light straight on, and absorbs the rest."""
 
     nested = 0
     passes_of: ClassVar[float]

@@ -18,17 +18,17 @@ from pathjax.kinds import Row
 
 
 def reflectance(p: Row, cos: Float[Array, ""]) -> Float[Array, ""]:
-    """Share of light that a pane reflects, between its faces any number of times."""
+    """Return the share of light that a pane reflects, with any number of reflections between its faces."""
     r, _ = fresnel.dielectric(smaller(cos, 1), p.int_ior / p.ext_ior)
-    # r + (1 - r)^2 r (1 + r^2 + r^4 + ...)
+    # The sum r + (1 - r)^2 r (1 + r^2 + r^4 + ...).
     return 2 * r / (1 + r)
 
 
 class ThinDielectric(Interface):
-    """A pane with two smooth faces so near each other that light leaves where it came in, going on straight.
+    """A pane whose smooth faces are so close that transmitted light leaves where it entered and goes straight on.
 
-    No path moves with its IOR: the weights carry the derivative. Where going straight on is no bounce, shadow rays pass
-    it too: it is a `Pane`. One with a `specular_transmittance` stays as it is.
+    Paths do not move with its IOR: the weights carry the derivative. Where going straight on is no bounce, it becomes a
+    `Pane`, which shadow rays pass too, unless it has a `specular_transmittance`.
     """
 
     int_ior = IndexOfRefraction(IOR["bk7"])
@@ -53,7 +53,7 @@ class ThinDielectric(Interface):
 
     @staticmethod
     def sample(p: Row, wi: Float[Array, "3"], u: Float[Array, " numbers"]) -> BSDFSample:
-        """Reflect with the probability of doing so between the faces any number of times, else pass."""
+        """Reflect with the probability `reflectance`, else go straight on."""
         r = reflectance(p, jnp.abs(wi[2]))
         reflects = u[0] < lax.stop_gradient(r)
         share = jnp.where(reflects, r, 1 - r)
@@ -64,20 +64,20 @@ class ThinDielectric(Interface):
 
 
 class Reflection(Interface):
-    """The mirror that stands for a pane where chance takes what it reflects."""
+    """The mirror inside a `Pane`, for the light that it reflects."""
 
     transmissive, delta = False, True
 
     @staticmethod
     def sample(p: Row, wi: Float[Array, "3"], u: Float[Array, " numbers"]) -> BSDFSample:
-        """Mirror direction."""
+        """Return the mirror direction."""
         one = jnp.ones_like(wi[2])
         weight = Interface.tinted(p, one, jnp.bool_(True))
         return BSDFSample(jnp.stack([-wi[0], -wi[1], wi[2]]), weight, one, jnp.bool_(True), one)
 
 
 class Pane(Choosing, ThinDielectric):
-    """A mirror, or nothing where light goes straight on, by the share of either."""
+    """A mirror or nothing, chosen by the shares of light that are reflected and go straight on."""
 
     transmissive = delta = False
 

@@ -1,10 +1,10 @@
-"""Bsdfs that hold bsdfs: which one of them scatters at a point, and in what frame.
+"""Bsdfs that hold bsdfs: which one of them scatters at a point, and in which frame.
 
-A material is a tree, whose leaves scatter. It is not evaluated as a mixture: after a hit one uniform number walks from
-the root to a leaf, as in PBRT-4, and light samples and bsdf samples both see that leaf alone. Given the leaf each
-estimator is unbiased, so their mean is that of the mixture, at the price of one bsdf.
+A material is a tree whose leaves scatter. It is not evaluated as a mixture: after a hit one uniform number walks from
+the root to a leaf, as in PBRT-4, and light samples and bsdf samples both see that leaf alone. The estimator is unbiased
+given the leaf, so its mean is that of the mixture, at the cost of one bsdf.
 
-What no wrapper stands in is none of this; of a plain `twosided` the sides are told apart when the scene is built.
+Scenes without wrappers use none of this; the sides of a plain `twosided` are resolved when the scene is built.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from pathjax.core.math import at, cross, dot, normalize, safe_divide, smaller, t
 from pathjax.core.types import Frame, Surface
 from pathjax.kinds import Instance, Row
 
-# Kind, row, and whether it is seen from its back as if that were its front. Kinds number the tables of leaves, then
-# those of wrappers; -1 absorbs.
+# Kind, row, and whether its back is seen as if it were a front. Kinds index the tables of leaves, then those of
+# wrappers; -1 absorbs.
 Node = Int[Array, "3"]
-# Least probability of either where the choice is differentiated: what has no share has a derivative all the same.
+# Least probability of either bsdf where the choice is differentiated: one of share 0 may still have a derivative.
 MIN_CHANCE = 0.1
 
 
@@ -40,13 +40,13 @@ def is_wrapper(instance: Instance) -> bool:
 
 
 def sides(instance: Instance) -> list[tuple[Instance | None, bool]]:
-    """What lies on its front and on its back, and whether that is seen as a front."""
+    """Return the bsdfs on its front and its back, and whether each is mirrored, so that a back is seen as a front."""
     front, back = instance.kind.sides(instance)
     return [(front, False), (back, instance.kind.turns_back)]
 
 
 def reached(instances: list[Instance]) -> list[list[Instance]]:
-    """All that scatters or holds others, level by level: on the sides of some bsdfs, of those that these hold, ..."""
+    """Return all bsdfs on the sides of the given ones (level 0), of those that these hold (level 1), ..., by level."""
     levels = []
     while instances:
         level = list(dict.fromkeys(side for each in instances for side, _ in sides(each) if side is not None))
@@ -60,7 +60,7 @@ def may_pass(instance: Instance) -> bool:
 
 
 def nodes_of(instance: Instance, number: dict) -> np.ndarray:
-    """(2, bsdfs held, 3); number: leaf or wrapper -> its kind and row."""
+    """Return the `Wrapper.nodes` of an instance. number: leaf or wrapper -> its kind and row."""
     held = [[(*number[side], turned) for side, turned in sides(each)] for each in instance.values["held"]]
     return np.swapaxes(np.array(held, np.int32), 0, 1)
 
@@ -69,31 +69,31 @@ def nodes_of(instance: Instance, number: dict) -> np.ndarray:
 
 
 class Turn(NamedTuple):
-    """How a frame was turned; where it was not, it has turned by nothing."""
+    """One turn of a frame; the identity at points where the frame was not turned."""
 
-    n: Float[Array, "3"]  # the normal before, on the side of the one after
-    roughness: Float[Array, ""]  # squared, of the facets that would have normals like that; 0: they cast no shadows
+    n: Float[Array, "3"]  # the normal before the turn, mirrored with the frame
+    roughness: Float[Array, ""]  # squared, of facets that would have such normals; 0: no shadowing
 
 
 class Chosen(NamedTuple):
-    """What one step on the way to a leaf has chosen from, for derivatives."""
+    """One choice on the way to a leaf, for derivatives."""
 
-    row: Int[Array, ""]
+    row: Int[Array, ""]  # of the wrapper
     factor: Float[Array, ""]  # of the leaf's weight
-    by: Float[Array, " columns"]  # derivative of the factor in what `Materials.recorded` names
+    by: Float[Array, " columns"]  # derivative of the factor in the columns `Materials.recorded`
 
 
 class Leaf(NamedTuple):
-    """What scatters at a vertex."""
+    """The bsdf that scatters at a vertex."""
 
     kind: Int[Array, ""]
     row: Int[Array, ""]
     frame: Frame
     wi: Float[Array, "3"]  # in the frame
-    # Share over probability of what was chosen: 1 but for its derivative. None: nothing was to be chosen.
+    # Product of share over probability of all choices; its value is 1 unless `differentiated`. None: no wrappers.
     weight: Float[Array, ""] | None
     turns: tuple[Turn, ...]
-    chosen: tuple[Chosen, ...] = ()  # by step, of `steps`; nothing where `Materials.recorded` is empty
+    chosen: tuple[Chosen, ...] = ()  # one for each of `steps`; empty where `Materials.recorded` is
 
 
 def leaf(
@@ -108,9 +108,9 @@ def leaf(
     """Walk from a node down to a leaf.
 
     Args:
-        frame, wi: around the shading normal.
+        frame, wi: the shading frame, and the direction to the previous vertex in it.
         u: uniform in [0, 1).
-        differentiated: choose also what has no share, since that may have a derivative; the mean is the same.
+        differentiated: also choose bsdfs of share 0, since a share may have a derivative; the mean is the same.
     """
     upright, weight, turns = frame, jnp.ones_like(wi[2]), ()
     node, frame, wi, turns = _entered(node, frame, wi, turns)
@@ -124,7 +124,7 @@ def leaf(
                 same = upright, frame, wi, jnp.zeros_like(weight)
                 before = frame.n
                 turn = partial(_turned, table.kind, p, surface, upright, frame, wi)
-                # What is found at one level is read many times at the next.
+                # The next level reads these many times.
                 upright, frame, wi, roughness = compute_once(lax.cond(here, turn, lambda same=same: same))
                 turns = (*turns, Turn(before, roughness))
                 node = jnp.where(here, _held(p, wi[2] > 0)[0], node)
@@ -141,7 +141,7 @@ def leaf(
 
 
 def _entered(node, frame, wi, turns):
-    """What is met next, mirrored where a back is seen as a front."""
+    """Return node, frame, wi and turns, mirrored where a back is seen as a front."""
     side = jnp.where(node[2] == 1, -1, 1).astype(wi.dtype)
     turns = tuple(turn._replace(n=turn.n * side) for turn in turns)
     node = jnp.stack([node[0], node[1], jnp.zeros_like(node[2])])
@@ -153,7 +153,7 @@ def _held(p, front):
 
 
 def _choice(kind, p, node, cos, u, weight, differentiated, columns):
-    """One of two, the number for the next choice, the weight, and where columns are given what was Chosen."""
+    """Choose one of two bsdfs: return its node, u for the next choice, the weight and, given columns, a `Chosen`."""
     front, cos = cos > 0, jnp.abs(cos)
     share = kind.share(p, cos)
     chance = lax.stop_gradient(share)
@@ -172,7 +172,7 @@ def _choice(kind, p, node, cos, u, weight, differentiated, columns):
 
 
 def steps(materials) -> list[int]:
-    """Places of the wrappers that `leaf` chooses from, one after another."""
+    """Return the indices of the wrappers at which `leaf` makes a choice, in order."""
     places = (place for level in materials.levels for place in level)
     return [place for place in places if materials.wrappers[place].kind.chooses]
 
@@ -180,7 +180,7 @@ def steps(materials) -> list[int]:
 def share_by(
     kind: type[Choosing], p: Row, cos: Float[Array, ""], columns: tuple[int | None, ...]
 ) -> Float[Array, " columns"]:
-    """Derivative of the share of the second of two in some columns of the table."""
+    """Return the derivative of the share of the second bsdf in some columns of the table; for None it is 0."""
 
     def share(nudges):
         nudges = {column: nudges[s] for s, column in enumerate(columns) if column is not None}
@@ -190,7 +190,10 @@ def share_by(
 
 
 def _turned(kind, p, surface, upright, frame, wi):
-    """The frame around the turned normal. upright: the same frame, but never mirrored, to which textures refer."""
+    """Return both frames turned, wi in the new `frame`, and `Turn.roughness`.
+
+    upright: the same frame, but never mirrored; textures refer to it.
+    """
     x, y, z = compute_once(lax.stop_gradient(kind.normal(p, surface, partial(to_local, upright))))
     if (flips := p.flip_invalid_normals) is not None:
         away = flips & (wi[2] * (wi[0] * x + wi[1] * y + wi[2] * z) <= 0)
@@ -209,10 +212,10 @@ def _turned(kind, p, surface, upright, frame, wi):
 
 
 def seen_by_turned(turns: tuple[Turn, ...], n: Float[Array, "3"], d: Float[Array, "3"]) -> Float[Array, ""]:
-    """Share of light from d that counts where the frame was turned to the normal n.
+    """Return the share of light from direction d that counts, where the frame was turned to the normal n.
 
-    None that comes from the front of one of the normals and the back of another, and less of what comes along the
-    surface (Conty Estevez, Lecocq and Stein 2019, "A microfacet-based shadowing function to solve the bump terminator
+    It is 0 for light in front of one of the normals and behind another, and small for light that grazes the surface
+    (Conty Estevez, Lecocq and Stein 2019, "A microfacet-based shadowing function to solve the bump terminator
     problem").
     """
     share, below = jnp.ones_like(d[0]), dot(d, n)
@@ -225,7 +228,7 @@ def seen_by_turned(turns: tuple[Turn, ...], n: Float[Array, "3"], d: Float[Array
     return share
 
 
-# ---- on the way of light --------------------------------------------------------------------------------------------
+# ---- along shadow rays ----------------------------------------------------------------------------------------------
 
 
 def passing(
@@ -238,12 +241,12 @@ def passing(
     level: int = 0,
     place_in_tree: int = 0,
 ) -> Float[Array, ""]:
-    """Share of light that goes straight on: the probability with which `leaf` comes to a leaf that passes.
+    """Return the share of light that goes straight on: the probability that `leaf` reaches a leaf that passes light.
 
     Args:
-        cos: between the ray that looks and the shading normal: which side is seen.
-        passes: whether leaves of a kind do.
-        nudges: added to what each of `on_the_way` looks up in the columns that are `Materials.recorded`.
+        cos: of the shading normal and the direction back along the ray; positive on the front.
+        passes: kind -> whether its leaves pass light.
+        nudges: added to the columns `Materials.recorded` of each wrapper of `on_the_way`.
     """
     kind, row, turned = node
     cos = jnp.where(turned == 1, jnp.abs(cos), cos)
@@ -270,8 +273,9 @@ def passing(
 
 
 def on_the_way(materials, node: Node, front: Bool[Array, ""], level: int = 0) -> list[tuple[Int[Array, ""], ...]]:
-    """Kind and row of all that `passing` may meet in a tree: what is first, then all behind its first, then behind its
-    second; of leaves, and where there is nothing, the kind is none of a wrapper.
+    """Return kind and row of all nodes that `passing` may visit: a node, then the subtrees of its first and second.
+
+    Leaves, and places without a node, have a kind that is not that of a wrapper.
     """
     if level >= len(materials.passing):
         return []
@@ -286,5 +290,5 @@ def on_the_way(materials, node: Node, front: Bool[Array, ""], level: int = 0) ->
 
 
 def most_on_the_way(materials, level: int = 0) -> int:
-    """Number of those that are `on_the_way` from a level on."""
+    """Return the number of nodes of `on_the_way` from a level on."""
     return 2 ** max(len(materials.passing) - level, 0) - 1

@@ -1,4 +1,4 @@
-"""What bump maps and normal maps have in common: none of what they say is a parameter of the scene."""
+"""Base of bump maps and normal maps, whose fields are not parameters of the scene."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ REFUSED = "turns shading frames, and derivatives do not follow these; change it 
 
 @dataclass(frozen=True)
 class Heights(Number):
-    """The one texture in an element, whatever it is called."""
+    """The only texture in an element, whatever its name."""
 
     textured: bool = True
     listed: bool = False

@@ -1,4 +1,4 @@
-"""A bsdf for each side of a surface; the same one twice where the file names one."""
+"""One bsdf for each side of a surface, or the same one for both."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathjax.kinds import Instance
 
 
 class TwoSided(BSDF):
-    """Mitsuba's `twosided`: no bsdf of its own, but where others go. Each sees light as it does on a front."""
+    """Mitsuba's `twosided`, which puts other bsdfs on the two sides. Each sees light as on a front."""
 
     turns_back = True
 

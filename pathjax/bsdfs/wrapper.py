@@ -1,4 +1,4 @@
-"""What a bsdf that holds other bsdfs is."""
+"""Bsdfs that hold other bsdfs."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from pathjax.kinds import Instance, PerRow, Row
 
 
 class Wrapper(BSDF):
-    """A kind of bsdf that holds others, of which at each point one scatters: `bsdfs.tree` finds out which.
+    """A kind of bsdf that holds others, one of which scatters at each point: `bsdfs.tree` chooses it.
 
-    An `Instance` holds them under "held", a tuple.
+    The values of an `Instance` have them under "held", a tuple.
     """
 
-    nested: ClassVar[int] = 1  # bsdfs that stand inside it in a file
-    chooses: ClassVar[bool] = False  # among these, by `share`
-    nodes = PerRow()  # (2, bsdfs held, 3) int32: of its front and its back, the `tree.Node`s of what it holds
+    nested: ClassVar[int] = 1  # number of bsdfs inside its element in a file
+    chooses: ClassVar[bool] = False  # chooses one of them by `share`
+    nodes = PerRow()  # (2, bsdfs held, 3) int32: on its front and its back, the `tree.Node` of each bsdf held
 
     @classmethod
     def holding(cls, name: str, *held: Instance, **values) -> Instance:
-        """An object of this kind without a file, of the bsdfs that would stand inside."""
+        """Return an instance without a file, given the bsdfs that a file would nest inside."""
         made = cls.instance(name, **values)
         return Instance(cls, name, {**made.values, "held": held})
 
@@ -36,7 +36,7 @@ class Wrapper(BSDF):
         if len(elements) < cls.nested:
             wanted = "a <bsdf>" if cls.nested == 1 else f"{cls.nested} <bsdf>s"
             raise fields.element.error(f"{fields.element} needs {wanted} inside, and has {len(elements)}")
-        # What stands alone in it is known by its name.
+        # A single nested bsdf takes the name of its wrapper.
         names = [name] if cls.nested == 1 else [loader.unique(f"{name}_{place}") for place in range(cls.nested)]
         held = [loader.bsdf(element, each) for element, each in zip(elements, names, strict=True)]
         return cls.holding(name, *held, **super().read(loader, fields, name).values)
@@ -55,7 +55,7 @@ class Wrapper(BSDF):
 
 
 class Choosing(Wrapper):
-    """Two bsdfs, of which chance takes one at each point, so that it is their mixture in the mean."""
+    """Two bsdfs, one of which is chosen at random at each point: their mixture in expectation."""
 
     chooses = True
 
@@ -68,14 +68,15 @@ class Choosing(Wrapper):
     @staticmethod
     @abstractmethod
     def share(p: Row, cos: Float[Array, ""]) -> Float[Array, ""]:
-        """The probability of the second one. cos: in [0, 1], of the angle between the ray and the normal."""
+        """Return the probability of the second one. cos: in [0, 1], of the angle between the ray and the normal."""
 
 
 class Turning(Wrapper):
-    """A bsdf in another shading frame, which is detached: a derivative in what turns it is refused by name.
+    """A bsdf in a turned shading frame. The frame is detached; derivatives in its parameters are refused by name.
 
-    Where it would show its back to who looks at the front, it is turned the other way (Schuessler et al. 2017), and
-    light is dimmed where the turned frame would see it too far down (Conty Estevez et al. 2019); rows may do without.
+    Where a ray that sees the front of the surface would see the back of the turned frame, or conversely, the normal is
+    tilted the other way (Schuessler et al. 2017). Light that grazes the surface below a turned frame is dimmed (Conty
+    Estevez et al. 2019). Rows may switch off either.
     """
 
     anisotropic = True
@@ -85,7 +86,7 @@ class Turning(Wrapper):
     def normal(
         p: Row, surface: Surface, to_local: Callable[[Float[Array, "3"]], Float[Array, "3"]]
     ) -> Float[Array, "3"]:
-        """The turned normal, of any length, in the frame that the surface had before.
+        """Return the turned normal, of any length, in the frame before the turn.
 
-        to_local: of a vector in world space, its coordinates in that frame.
+        to_local: maps a vector from world space to that frame.
         """
