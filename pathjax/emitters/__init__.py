@@ -1,7 +1,8 @@
-"""Where light comes from: a file a kind, the table of kinds, and the dispatch over those that a scene holds.
+"""Where light comes from: one file per kind, the table of kinds, and the dispatch over the kinds in a scene.
 
-An emitter is a subclass of `SurfaceEmitter`, `Background` or `DiracEmitter`, which say what it must offer. Lights are
-numbered through all tables: first those of surfaces, to which `Geometry.light` refers, then near and then distant ones.
+An emitter is a subclass of `SurfaceEmitter`, `Background` or `DiracEmitter`, which define the methods that it
+implements. Lights are numbered through all tables: first those on surfaces, to which `Geometry.light` refers, then
+other near ones, then distant ones.
 """
 
 from __future__ import annotations
@@ -55,7 +56,7 @@ __all__ = [
     "register",
 ]
 
-# By the name that scene files give them.
+# Kinds by their names in scene files.
 KINDS: dict[str, type[Emitter]] = {
     "area": Area,
     "constant": Constant,
@@ -69,7 +70,7 @@ KINDS: dict[str, type[Emitter]] = {
 
 
 def register(name: str):
-    """A decorator that makes a subclass of `SurfaceEmitter`, `Background` or `DiracEmitter` a kind named `name`."""
+    """Return a decorator that registers a subclass of `SurfaceEmitter`, `Background` or `DiracEmitter` as `name`."""
     return register_kind(KINDS, Emitter, name, "emitters", _fault)
 
 
@@ -85,12 +86,13 @@ def _fault(kind: type[Emitter]) -> str:
 def build(
     emitters: list[Instance | None], lamps: list[Lamp], shapes: Geometry, dtype, path: tuple, parameters: Parameters
 ) -> tuple[tuple[Lights, ...], Geometry]:
-    """The lights of a scene, and its geometry with their numbers.
+    """Build the lights of a scene, and its geometry with the numbers of the lights.
 
     Args:
-        emitters: of each shape, None where it has none, and then those that stand outside of shapes.
-        lamps: of `shapes.build`.
-        path: where the lights will be in the scene; parameters: to enter theirs.
+        emitters: one per shape, None where it has none, followed by those outside of shapes.
+        lamps: from `shapes.build`.
+        path: location of the lights in the scene.
+        parameters: receives the parameters of the lights.
     """
     of_shapes = dict.fromkeys(emitters[lamp.shape] for lamp in lamps)
     inside = ordered(of_shapes, KINDS)
@@ -105,7 +107,7 @@ def build(
             means = *place, "table", "columns", kind.place(key), "values"
             for row, instance in enumerate(instances):
                 _enter_mean(parameters, f"{instance.name}.{key}", instance.values[key], place, means, row)
-        shining = [lamp for lamp in lamps if emitters[lamp.shape].kind is kind]  # of kinds outside of shapes: nothing
+        shining = [lamp for lamp in lamps if emitters[lamp.shape].kind is kind]  # empty for kinds outside of shapes
         for lamp in shining:
             light[lamp.primitive : lamp.primitive + lamp.count] = number
             number += 1
@@ -118,7 +120,7 @@ def build(
 
 
 def _places(lights: Lights, lamps: list[Lamp]) -> np.ndarray | None:
-    """(R, 3, 3) of each light that is near, as `Lights.places`; None where nobody knows where they are."""
+    """Return `Lights.places` (R, 3, 3) of near lights; None where their positions are unknown."""
     if lights.lamps is not None:
         return np.stack([lamp.place for lamp in lamps])
     names = [key for key, declared in lights.kind.declared.items() if isinstance(declared, Position)]
@@ -129,7 +131,7 @@ def _places(lights: Lights, lamps: list[Lamp]) -> np.ndarray | None:
 
 
 def _arranged(made: list[Lights], places: list[np.ndarray | None], dtype) -> tuple[Lights, ...]:
-    """The lights, those that are near in the tree by which they are chosen where there are many."""
+    """Return the lights; if there are many near ones, these have places and leaves in the tree that chooses them."""
     near = [(lights, place) for lights, place in zip(made, places, strict=True) if not lights.kind.distant]
     if sum(lights.count for lights, _ in near) < light_tree.FEWEST or any(place is None for _, place in near):
         return tuple(made)
@@ -143,7 +145,7 @@ def _arranged(made: list[Lights], places: list[np.ndarray | None], dtype) -> tup
 
 
 def _textures(instances: list[Instance], dtype, path: tuple, parameters: Parameters) -> tuple[Textures | None, dict]:
-    """The textures of lights, and their codes. What is known by name has one place in a scene."""
+    """Return the textures of lights, and their codes. A named parameter may have only one place in a scene."""
     used = dict.fromkeys(v for each in instances for v in each.values.values() if isinstance(v, Instance))
     own = Parameters()
     made, codes = textures.build(list(used), dtype, path, own)
@@ -158,7 +160,7 @@ def _textures(instances: list[Instance], dtype, path: tuple, parameters: Paramet
 
 
 def _enter_mean(parameters: Parameters, name: str, texture, lights: tuple, path: tuple, row: int) -> None:
-    """Where the mean stands of a texture with parameters. No image is one that a bsdf or other lights have, too."""
+    """Enter where the mean of a texture is stored. An image that a bsdf or other lights have too is refused."""
     if not isinstance(texture, Instance):
         return
     if texture in parameters.textures and parameters.textures[texture].path[: len(lights)] != lights:
@@ -174,7 +176,7 @@ def _enter_mean(parameters: Parameters, name: str, texture, lights: tuple, path:
 
 
 def _parts(parameters: Parameters, name: str, value, share: float = 1.0):
-    """What the mean of a texture is the sum of, and the shares: names of parameters, and values of what is none."""
+    """Yield the shares and the terms of the mean of a texture: names of parameters, and values that are none."""
     if name not in parameters.known:
         name = parameters.names.get(value, name) if isinstance(value, Instance) else name
     if name in parameters.known:
@@ -187,7 +189,7 @@ def _parts(parameters: Parameters, name: str, value, share: float = 1.0):
 
 
 def _with_means(table: Table, key: str, values: list) -> Table:
-    """What lights are chosen by."""
+    """Return the table with the means of textures as values of a column; lights are chosen by these."""
     column = table.column(key)
     if column is None or column.texture is None:
         return table
@@ -200,34 +202,34 @@ def _mean(value) -> np.ndarray | None:
 
 
 def name(lights: Lights) -> str:
-    """What scene files call a kind."""
+    """Return the name of a kind in scene files."""
     return next(name for name, kind in KINDS.items() if kind is lights.kind)
 
 
 def chosen_by_place(emitters: tuple[Lights, ...]) -> bool:
-    """Whether the choice of a light depends on the point that it is to shine on."""
+    """Return whether the choice of a light depends on the shaded point."""
     return any(lights.places is not None for lights in emitters)
 
 
 def usual_name(kind: str) -> str:
-    """Return the name of a light outside of shapes that has no id; kind: as scene files call it."""
+    """Return the name of a light outside of shapes that has no id. kind: its name in scene files."""
     return "background" if issubclass(KINDS.get(kind, Emitter), Background) else kind
 
 
 def sampled(emitters: tuple[Lights, ...]) -> bool:
-    """Whether strategy "mis" samples lights."""
+    """Return whether strategy "mis" samples lights."""
     return any(not lights.left_to_bsdfs for lights in emitters)
 
 
 def met_by_no_ray(emitters: tuple[Lights, ...]) -> list[str]:
-    """Names of the kinds that are found by light samples alone."""
+    """Return the names of the kinds that only light samples find."""
     return [name(lights) for lights in emitters if issubclass(lights.kind, DiracEmitter)]
 
 
 def darkness(emitters: tuple[Lights, ...], smooth: bool) -> str | None:
-    """Why every image is black, in words; None where light may come. Of known values, not of traced ones.
+    """Return why every image is black, in words; None if it may not be. Values must not be traced.
 
-    smooth: whether some bsdf is; others reflect no light that no ray meets.
+    smooth: whether some bsdf is smooth; others reflect no light from Dirac emitters.
     """
     if not emitters:
         return "there is no light"
@@ -241,15 +243,15 @@ def darkness(emitters: tuple[Lights, ...], smooth: bool) -> str | None:
 
 
 def backgrounds(emitters: tuple[Lights, ...]) -> list[int]:
-    """Places of those that are met where nothing is hit."""
+    """Return the indices of the backgrounds."""
     return [place for place, lights in enumerate(emitters) if issubclass(lights.kind, Background)]
 
 
 def even_lights(emitters: tuple[Lights, ...]) -> Lights | None:
-    """The lights of surfaces that emit the same radiance in all directions; None: there is no light.
+    """Return the lights on surfaces that emit the same radiance in all directions; None: there is no light.
 
     Raises:
-        InputError: there are other lights.
+        InputError: there are other lights, lights with textures, or several kinds of lights.
     """
     for lights in emitters:
         if lights.lamps is None or not lights.kind.even:
@@ -277,10 +279,11 @@ def sample(
 
     Args:
         ref: the shaded point.
-        u: uniform in [0, 1), whose first number also chooses the light; u_part: chooses within it.
-        backgrounds: else `with_background` is to say what comes from there.
+        u: uniform in [0, 1); the first number also chooses the light.
+        u_part: uniform in [0, 1); chooses a part of the light.
+        backgrounds: whether to evaluate backgrounds; if not, `with_background` completes the sample.
     Returns:
-        EmitterSample; pdf and Le are 0 where nothing arrives from there.
+        The sample; pdf and Le are 0 where no light arrives.
     """
     number, likely, u = choose(chosen, ref, u)
     sampled = [(lights, first) for lights, first in zip(emitters, chosen.first, strict=True) if first is not None]
@@ -314,12 +317,12 @@ def sample(
 
 
 def samples_background(emitters: tuple[Lights, ...], chosen: Choice | None) -> bool:
-    """Whether `sample` draws directions of backgrounds."""
+    """Return whether `sample` draws directions of backgrounds."""
     return chosen is not None and any(chosen.first[place] is not None for place in backgrounds(emitters))
 
 
 def with_background(drawn: EmitterSample, radiance: Float[Array, "3"], density: Float[Array, ""]) -> EmitterSample:
-    """What `sample` drew with `backgrounds=False`; radiance, density: of `background` in the direction drawn.d."""
+    """Complete a sample drawn with `backgrounds=False` by the results of `background` in the direction drawn.d."""
     from_there = jnp.isinf(drawn.distance)
     if drawn.delta is not None:
         from_there &= ~drawn.delta
@@ -329,9 +332,9 @@ def with_background(drawn: EmitterSample, radiance: Float[Array, "3"], density: 
 def hit(
     emitters: tuple[Lights, ...], shapes: Geometry, chosen: Choice | None, ray: Ray, hit: Hit, surface: Surface
 ) -> tuple[Float[Array, "3"], Float[Array, ""]]:
-    """Radiance received from the surface that was hit and the density [1/sr] of `sample` for it; 0, 0 if dark.
+    """Return the radiance from the surface that was hit, and its density [1/sr] in `sample`; 0, 0 if dark.
 
-    ray: from the point that `sample` had.
+    ray: from the `ref` of `sample`.
     """
     zero = jnp.zeros_like(ray.o)
     on_surfaces = [lights for lights in emitters if lights.lamps is not None]
@@ -359,9 +362,9 @@ def hit(
 def background(
     emitters: tuple[Lights, ...], chosen: Choice | None, d: Float[Array, "3"]
 ) -> tuple[Float[Array, "3"], Float[Array, ""]]:
-    """Radiance from direction d where nothing is hit, and the density [1/sr] of `sample` for it.
+    """Return the radiance from direction d where nothing is hit, and its density [1/sr] in `sample`.
 
-    Of all backgrounds together: light may come from several of them, and any of them may have drawn d.
+    Both are sums over all backgrounds: light may come from several of them, and any of them may have drawn d.
     """
     radiances, densities = [], []
     for place, lights in enumerate(emitters):

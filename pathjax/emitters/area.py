@@ -1,4 +1,4 @@
-"""Surfaces that emit the same radiance from their front in all directions, or in all of each point."""
+"""Surfaces that emit from their front, at each point with the same radiance in all directions."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The same radiance from all directions that nothing else fills."""
+"""The same radiance from all directions in which nothing is hit."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ from pathjax.kinds import Color, Direction, Row
 
 class Directional(DiracEmitter):
     irradiance = Color(1.0, bounds=(0, math.inf), textured=False, radiance=True)  # of a surface that faces it, W / m^2
-    direction = Direction()  # that the light goes
+    direction = Direction()  # in which the light travels
     distant = True
 
     @staticmethod

@@ -1,4 +1,4 @@
-"""What an emitter is: three kinds of kinds, by where their light is met."""
+"""The interface of emitters: on surfaces, backgrounds, and Dirac lights."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from pathjax.kinds import Declared, Kind, Row
 
 @dataclass(frozen=True)
 class Weight(Declared):
-    """How often lights are sampled, relative to their `power`. No parameter: it changes noise alone."""
+    """How often a light is sampled, relative to its `power`. It is no parameter, since it only changes noise."""
 
     absent: object = 1.0
 
@@ -26,66 +26,68 @@ class Weight(Declared):
 class Emitter(Kind):
     """A kind of light: `SurfaceEmitter`, `Background` or `DiracEmitter`.
 
-    A class declares its parameters. Colours that are 0 where it is dark are declared with `radiance=True`. Directions
-    are unit and in world space. Nothing may be NaN; where no light arrives it is 0. All is differentiated as it is
-    written, so the derivative in a parameter that moves a light lacks the edges of shadows. The choice is detached.
+    A class declares its parameters. Colours that are 0 if the light is dark are declared with `radiance=True`.
+    Directions are unit and in world space. Results are never NaN, and 0 where no light arrives. Methods are
+    differentiated as written, so the derivative in a parameter that moves a light lacks the edges of shadows. The
+    choice of a light is detached.
     """
 
     sampling_weight = Weight(None, bounds=(0, math.inf))
-    on_surfaces: ClassVar[bool] = False  # stands inside a shape
+    on_surfaces: ClassVar[bool] = False  # nested in a shape
     distant: ClassVar[bool] = False  # infinitely far
     dirac: ClassVar[bool] = False  # shines from one direction at each point
-    single: ClassVar[bool] = False  # a scene takes one of the kind
+    single: ClassVar[bool] = False  # a scene may have only one of the kind
 
     @classmethod
     def tells_entries(cls) -> bool:
-        """Whether `entries` of what it looks up in `Shared` arrays are known."""
+        """Return whether `entries` lists what it looks up in `Shared` arrays."""
         return False
 
     @staticmethod
     @abstractmethod
     def power(p) -> Float[Array, " R"]:
-        """How bright lights are, by which one of them is chosen: relative to others that are distant or not.
+        """Return the brightness by which a light is chosen among the near, or among the distant lights.
 
-        Of a surface its power for each area, of other lights their power, of distant ones the irradiance; each over pi.
+        It is the power per area of surfaces, the power of other near lights, and the irradiance of distant ones, each
+        divided by pi.
 
         p: the parameters of all R rows, (R, *shape).
         """
 
 
 class SurfaceEmitter(Emitter):
-    """What stands inside a shape and shines from its front. Points on it are drawn by the shape."""
+    """An emitter of a shape, which shines from its front. The shape samples points on it."""
 
     on_surfaces = True
-    even: ClassVar[bool] = False  # its parameter `radiance` is all that it emits, in all directions
+    even: ClassVar[bool] = False  # emits its parameter `radiance` in all directions, and nothing else
 
     @staticmethod
     @abstractmethod
     def emitted(p: Row, d: Float[Array, "3"]) -> Float[Array, "3"]:
-        """Radiance that leaves the front of the surface in the direction -d."""
+        """Return the radiance that leaves the front of the surface in the direction -d."""
 
 
 class Background(Emitter):
-    """Radiance from all directions in which nothing is hit. Several of them add up, and are sampled as one mixture."""
+    """Radiance from all directions in which nothing is hit. Several backgrounds add up and are sampled as a mixture."""
 
     distant = True
-    left_to_bsdfs: ClassVar[bool] = False  # which find it with less noise: it is sampled by strategy "light" alone
+    left_to_bsdfs: ClassVar[bool] = False  # bsdf samples find it with less noise; only strategy "light" samples it
 
     @staticmethod
     @abstractmethod
     def sample(p: Row, u: Float[Array, "2"], u_part: Float[Array, ""]) -> Float[Array, "3"]:
-        """Draw a direction by its `density`. u, u_part: uniform in [0, 1)."""
+        """Sample a direction by `density`. u, u_part: uniform in [0, 1)."""
 
     @staticmethod
     @abstractmethod
     def emitted(p: Row, d: Float[Array, "3"]) -> Float[Array, "3"]:
-        """Radiance that comes from the direction d."""
+        """Return the radiance from the direction d."""
 
     @staticmethod
     def entries(p: Row, d: Float[Array, "3"]) -> list[tuple[str, Int[Array, ""], Float[Array, ""]]]:
-        """Return the colours of `Shared` arrays whose sum `emitted` is, for derivatives: parameter, entry, share.
+        """Return the colours in `Shared` arrays that `emitted` is a weighted sum of: parameter, entry, weight.
 
-        `emitted` adds `p.nudge(parameter)` to the sum.
+        They serve derivatives: `emitted` adds `p.nudge(parameter)` to the sum.
         """
         return []
 
@@ -96,32 +98,32 @@ class Background(Emitter):
     @staticmethod
     @abstractmethod
     def density(p: Row, d: Float[Array, "3"]) -> Float[Array, ""]:
-        """1/sr, with which `sample` draws d."""
+        """Return the density [1/sr] of d in `sample`."""
 
     @classmethod
     def met(cls, p: Row, d: Float[Array, "3"]) -> tuple[Float[Array, "3"], Float[Array, ""]]:
-        """`emitted` and `density`, for kinds whose two have something in common."""
+        """Return `emitted` and `density`, for kinds whose two share computations."""
         return cls.emitted(p, d), cls.density(p, d)
 
 
 class DiracEmitter(Emitter):
-    """What shines from one direction at each point: no ray hits it, and no bsdf finds it."""
+    """A light that shines from one direction at each point: no ray hits it, and no bsdf sample finds it."""
 
     dirac = True
-    # With the weight 0 nothing would find it.
+    # With weight 0 it would never be sampled.
     sampling_weight = Weight(None, bounds=(float(np.finfo(np.float32).tiny), math.inf))
 
     @staticmethod
     @abstractmethod
     def sample(p: Row, ref: Float[Array, "3"]) -> tuple[Float[Array, "3"], Float[Array, ""], Float[Array, "3"]]:
-        """What arrives at the point ref.
+        """Return the light that arrives at the point ref.
 
         Returns:
-            direction towards the light; distance at which its shadow ray ends, inf if it is distant; and irradiance of
-            a surface that faces it.
+            The direction towards the light; the distance at which its shadow ray ends, inf if it is distant; and the
+            irradiance of a surface that faces it.
         """
 
     @staticmethod
     def uv(p: Row, d: Float[Array, "3"]) -> Float[Array, "2"]:
-        """Where its textures are looked up for what it throws in the direction -d; of kinds that may have some."""
+        """Return where its textures are looked up for light in the direction -d; for kinds that may have textures."""
         raise NotImplementedError

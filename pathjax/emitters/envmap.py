@@ -1,14 +1,14 @@
-"""A picture of all directions, in Mitsuba's latitudes and longitudes.
+"""An environment map, in Mitsuba's latitude-longitude layout.
 
-Columns are azimuths, whose texels have their centres at (i + 1/2) / width of a turn from -z over x; they repeat. Rows
-are polar angles from +y: the first row is the zenith and the last one the nadir. Between centres radiance is bilinear.
+Columns are azimuths; texel centres lie at (i + 1/2) / width of a turn from -z over x, and columns repeat. Rows are
+polar angles from +y: the first row is the zenith and the last one the nadir. Between centres radiance is bilinear.
 
-Directions are drawn by the luminance above its mean over the sphere: what is even is found with less noise by bsdf
-samples, to which a constant background is left altogether (Karlik et al. 2019, "MIS compensation"). A patch between
-four texels is drawn in proportion to that, integrated over its solid angle, by two searches: for its row among all
-rows, and for its column in that row. Within the patch the density follows its corners: bilinear in the azimuth and in
-the cosine of the polar angle, which makes it exact, and in all but a few rows about what is above the mean there. (At
-the rim of a sun, four texels wide, most patches are bright at one side alone.)
+Directions are sampled by the luminance above its mean over the sphere: bsdf samples find even light with less noise,
+and a constant background is left to them altogether (Karlik et al. 2019, "MIS compensation"). A patch between four
+texels is drawn in proportion to that, integrated over its solid angle, by two searches: for its row among all rows, and
+for its column in that row. Within the patch the density interpolates its corners. It is bilinear in the azimuth and in
+the cosine of the polar angle, so that it is sampled exactly; in all but a few rows it is close to the luminance above
+the mean. (At the rim of a sun four texels wide, most patches are bright on one side only.)
 """
 
 from __future__ import annotations
@@ -32,27 +32,27 @@ from pathjax.images import read_rgb
 from pathjax.kinds import Number, Parameter, PerRow, Rotation, Row, Shared, Unused
 from pathjax.textures.bitmap import texels_of
 
-# What is made of the texels.
+# Columns that are computed from the texels.
 TABLED = "importance", "rows", "columns", "from_pole", "per_solid_angle", "brightness"
-# Of luminance, by what directions are drawn at least: they have to reach all light, also where bsdfs seldom do. Shares
-# from a fiftieth to a tenth were alike, within 6 %, on three scenes.
+# Least share of luminance by which directions are drawn: they must reach all light, also where bsdf samples seldom do.
+# Shares from 1/50 to 1/10 were alike, within 6 %, on three scenes.
 _KEPT = 1 / 20
-# What is added to each corner of a patch, of their mean.
+# Share of the mean of a patch's corners that is added to each of them.
 _LEAST = 1 / 16
-# Bytes at a multiple of which JAX takes arrays of NumPy as they are.
+# Alignment, in bytes, with which JAX uses arrays of NumPy without a copy.
 _ALIGNED = 64
-# Rows of patches whose probabilities are made at once, so that little memory is used beside what is kept.
+# Rows of patches whose probabilities are computed at once, so that little temporary memory is used.
 _ROWS = 64
 
 
 class Envmap(Background):
     """An `Instance` holds `texels` (H, W, 3), `scale` and `to_world`."""
 
-    # Large tables are flat, since lanes would copy others each time.
+    # Large tables are flat, since `lanes` would copy others each time.
     texels = Shared(colors=True)  # (H W 3,) linear radiance
-    importance = Shared()  # (H W,) of each texel, by which directions are drawn
-    rows = Shared()  # (H,) probability of the patches above each row of texels, from 0 to 1
-    columns = Shared()  # ((H - 1) (W + 1),) of those left of each texel in a row of patches, from 0 to 1
+    importance = Shared()  # (H W,) weight of each texel, by which directions are drawn
+    rows = Shared()  # (H,) cumulative probability of the patches above each row of texels
+    columns = Shared()  # ((H - 1) (W + 1),) the same of those left of each texel, within a row of patches
     from_pole = Shared()  # (H,) 1 - |cos| of the polar angles of rows of texels
     per_solid_angle = Shared()  # (H - 1,) probability of a row of patches over the solid angle of one of them, 1/sr
     brightness = PerRow()  # () luminance of the mean over the sphere
@@ -83,7 +83,7 @@ class Envmap(Background):
     def build(cls, instances, dtype, path, parameters, code):
         (instance,) = instances
         texels = np.asarray(instance.values["texels"], dtype)
-        if len(texels) == 1:  # zenith, nadir and what is between
+        if len(texels) == 1:  # zenith, nadir and all between
             texels = np.concatenate([texels, texels])
         where = (*path, "columns", cls.place("texels"), "values")
         radiance = Parameter(where, (0,), texels.shape, (0, math.inf), "texels", rows=texels.size)
@@ -96,7 +96,7 @@ class Envmap(Background):
 
     @classmethod
     def derived(cls, table, changed=()):
-        """The probabilities are those of the texels, detached."""
+        """Recompute the probabilities from the texels, detached."""
         if "texels" not in changed:
             return table
         texels = lax.stop_gradient(table.column("texels").values)
@@ -161,7 +161,7 @@ class Envmap(Background):
 
 
 def _around(p: Row, patch: Int[Array, "2"]) -> list[list[Int[Array, ""]]]:
-    """Numbers of the texels around a patch: two above, two below."""
+    """Return the indices of the texels around a patch: two above, two below."""
     y, x = patch
     width = _size(p)[1]
     first, following = y * width + x, y * width + jnp.where(x + 1 < width, x + 1, 0)
@@ -179,9 +179,9 @@ def _radiance(p: Row, patch: Int[Array, "2"], inside: Float[Array, "2"]) -> Floa
 
 
 def _corners(p: Row, patch: Int[Array, "2"]) -> list[list[Float[Array, ""]]]:
-    """By what directions in a patch are drawn at its corners; none is 0 beside one that is not.
+    """Return the weights at the corners of a patch, by which directions in it are drawn; none is 0 unless all are.
 
-    The derivative of light in a black texel would otherwise be sought where next to nothing is drawn.
+    Otherwise hardly any samples would find the derivative in a black texel.
     """
     corners = [[at(p.importance, number) for number in row] for row in _around(p, patch)]
     least = sum(map(sum, corners)) * (_LEAST / 4)
@@ -204,41 +204,41 @@ def _bilinear(corners, below, beside):
 
 
 def _drawn(first: Float[Array, ""], last: Float[Array, ""], u: Float[Array, ""]) -> Float[Array, ""]:
-    """x in [0, 1) of a density that goes in a straight line from `first` at 0 to `last` at 1; even where both are 0."""
+    """Sample x in [0, 1) by a density linear from `first` at 0 to `last` at 1; uniform where both are 0."""
     total = first + last
     a = jnp.where(total > 0, safe_divide(first, total), 0.5)
     b = 1 - a
-    # The root of a x + (b - a) x^2 / 2 = u / 2, without a difference.
+    # The root of a x + (b - a) x^2 / 2 = u / 2, without cancellation.
     return compute_once(jnp.minimum(safe_divide(u, a + safe_sqrt(a * a * (1 - u) + b * b * u)), 1 - STEP))
 
 
 def _ends(p: Row, y: Int[Array, ""]) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """`from_pole` above and below a row of patches, from the nearer pole, near which cosines have no digits left."""
+    """Return `from_pole` above and below a row of patches, from the nearer pole, where cosines lose their digits."""
     upper, lower = at(p.from_pole, y), at(p.from_pole, y + 1)
     # A row across the equator begins above it.
     return upper, jnp.where(2 * y == _size(p)[0] - 2, 2 - lower, lower)
 
 
 def _placed(values: np.ndarray) -> np.ndarray:
-    """The same where the scene will use it, so that one copy of it is all there is."""
+    """Return the array in memory that the scene will use, so that there is only one copy of it."""
     placed = np.asarray(jax.device_put(values).block_until_ready())
-    gc.collect(0)  # only then JAX lets go of what it has copied
+    gc.collect(0)  # only then does JAX free the array that it copied
     return placed
 
 
 def _size(p: Row) -> tuple[int, int]:
-    """Height and width of the picture."""
+    """Return height and width of the image."""
     height = len(p.rows)
     return height, len(p.columns) // (height - 1) - 1
 
 
 def _patch(p: Row, d: Float[Array, "3"]) -> tuple[Int[Array, "2"], Float[Array, "2"], Float[Array, ""]]:
-    """The patch of a direction: its row and column, how far below and beside its first texel the direction lies, and
-    how far down in equal solid angles."""
+    """Return the patch of a direction (row, column), where the direction lies in it (below and beside its first texel),
+    and how far down it lies in terms of solid angle."""
     height, width = _size(p)
     v = compute_once(d @ p.to_world)
     squared = v[0] * v[0] + v[2] * v[2]
-    # Nearer to a pole an azimuth is nothing but rounding; its derivative would overflow.
+    # Nearer to a pole the azimuth is only rounding error, and its derivative would overflow.
     x, z = jnp.where(squared > jnp.finfo(d.dtype).eps ** 2, jnp.stack([v[0], v[2]]), 0)
     polar = safe_atan2(safe_sqrt(x * x + z * z), v[1]) * ((height - 1) / math.pi)
     beside = turns(x, -z) * width - jnp.asarray(0.5, d.dtype)
@@ -253,10 +253,10 @@ def _patch(p: Row, d: Float[Array, "3"]) -> tuple[Int[Array, "2"], Float[Array, 
 
 
 def _probabilities(texels: np.ndarray) -> dict[str, np.ndarray]:
-    """The tables of an image whose texels are given: all but the texels."""
+    """Compute the columns TABLED from the texels."""
     height, width, _ = texels.shape
     theta = np.linspace(0, np.pi, height)
-    # Of a row of patches: solid angle over that of a turn, and integrals of sin over it, weighted by 1 - t and by t.
+    # For each row of patches: solid angle over 2 pi, and the integrals of sin weighted by 1 - t and by t.
     solid = 2 * np.sin((theta[:-1] + theta[1:]) / 2) * np.sin(np.diff(theta) / 2)
     lower = np.diff(np.sin(theta)) / np.diff(theta) - np.cos(theta[1:])
     upper = solid - lower
@@ -286,7 +286,7 @@ def _probabilities(texels: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def _luminances(texels: np.ndarray) -> np.ndarray:
-    """(H, W) of each texel, with little memory beside it."""
+    """Return the luminances (H, W) of texels, with little temporary memory."""
     found = _unfilled(texels.shape[:2], texels.dtype)
     for first in range(0, len(texels), _ROWS):
         found[first : first + _ROWS] = luminance(texels[first : first + _ROWS])
@@ -294,7 +294,7 @@ def _luminances(texels: np.ndarray) -> np.ndarray:
 
 
 def _unfilled(shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
-    """An array that JAX need not copy once it is filled."""
+    """Return an uninitialised array that JAX need not copy once it is filled."""
     size = math.prod(shape) * dtype.itemsize
     memory = np.empty(size + _ALIGNED, np.uint8)
     start = -memory.ctypes.data % _ALIGNED

@@ -1,16 +1,16 @@
-"""Lights in a binary tree, by which near and bright ones are chosen (Conty Estevez and Kulla 2018, "Importance sampling
-of many lights with adaptive tree splitting").
+"""A binary tree that chooses near and bright lights (Conty Estevez and Kulla 2018, "Importance sampling of many lights
+with adaptive tree splitting").
 
-A sample goes down from the root, to either child with a probability in proportion to its power over the square of the
-distance, and to how much of it faces the point. Of lights i of power p_i and normal n_i, the point in the direction d,
-that is the sum of p_i max(n_i . d, 0). It is taken to be that of the mean normal, and of a rest that faces all sides:
+A sample descends from the root. It takes either child with a probability proportional to the power that faces the
+point, over the square of the distance. For lights i of power p_i and normal n_i, and the point in the direction d, this
+power is the sum of p_i max(n_i . d, 0). It is approximated by the mean normal and a rest that faces all sides:
 
     max(N . d, 0) + (P - |N|) / 4,    N = sum p_i n_i,    P = sum p_i,
 
-which is exact for one flat light and for one that is round, if the light is small. The tree is complete, and all its
-leaves are on one level: the bits of a leaf's number are the way to it, so the probability of any light is found as a
-sample finds it. Only where lights are, which is known when a scene is built, decides on their order; powers, which may
-be traced, are summed up once a render.
+which is exact for a small light that is flat or round. The tree is complete, and all leaves are on one level: the bits
+of a leaf's index are the way to it, so the probability of any light is computed by the same descent as a sample. The
+order of lights depends only on their positions, which are known when a scene is built; powers, which may be traced, are
+summed once per render.
 """
 
 from __future__ import annotations
@@ -26,29 +26,29 @@ from jaxtyping import Array, Float, Int
 from pathjax.compile import compute_once, register_dataclass
 from pathjax.core.math import at, dot, larger, safe_divide, safe_sqrt
 
-# Fewer lights are chosen by power alone, at less cost; the six faces of a cube are lights of their own. From here on
-# the tree is 1.1 to 2.9 times as efficient, with 200 of them 2.3 to 5.7 times (a room 20 wide, 16 spp); where
-# flat ones face all ways, 1.2 times as much by how they face.
+# Fewer lights are chosen by power alone, at less cost; the six faces of a cube are six lights. From this number on the
+# tree is 1.1 to 2.9 times as efficient, with 200 lights 2.3 to 5.7 times (a room 20 wide, 16 spp). Where flat lights
+# face all directions, their normals contribute a factor of 1.2 to this.
 FEWEST = 9
-# Least share of lights that is taken to face all sides: some of many, or a part of a large one, may face a point that
-# their middle does not face.
+# Least share of power that is taken to face all sides: some of many lights, or a part of a large one, may face a point
+# that their middle does not face.
 _LEAST_AROUND = 1 / 16
 
 
 @register_dataclass
 @dataclass(frozen=True)
 class LightTree:
-    # Middle, squared radius, N, and what faces all sides. Children of k are 2 k and 2 k + 1; the first is unused.
+    # Middle, squared radius, N, and the rest that faces all sides. Children of k are 2 k and 2 k + 1; 0 is unused.
     nodes: Float[Array, "N 8"]
-    leaf: Int[Array, " K"]  # of each light, from 0
-    light: Int[Array, " L"]  # of each leaf; -1: none
+    leaf: Int[Array, " K"]  # leaf of each light, from 0
+    light: Int[Array, " L"]  # light of each leaf; -1: none
     levels: int = field(metadata={"static": True})
 
 
 def arranged(places: Float[np.ndarray, "K 3 3"]) -> Int[np.ndarray, " K"]:
-    """The leaf of each light: halves of equal number along the longest axis, and so on within each half.
+    """Return the leaf of each light, by recursive halving along the longest axis.
 
-    places: lower and upper corner around each, and its mean normal.
+    places: lower and upper corner of the box around each light, and its mean normal.
     """
     leaf = np.zeros(len(places), np.int32)
     middles = places[:, :2].mean(1)
@@ -72,9 +72,9 @@ def leaves(lights: int) -> int:
 
 
 def built(places: Float[Array, "K 3 3"], leaf: Int[Array, " K"], power: Float[Array, " K"]) -> LightTree:
-    """The tree of lights at these places, of `arranged`, and leaves. power: relative to each other."""
+    """Build the tree of lights, given their places and their leaves from `arranged`. power: up to a common factor."""
     light = jnp.full(leaves(len(leaf)), -1, jnp.int32).at[leaf].set(jnp.arange(len(leaf), dtype=jnp.int32))
-    # An empty leaf follows the lights of its node; its power is 0, and its place that of a light among them.
+    # Empty leaves come last in their node; their power is 0, and their place that of a light in the node.
     near = lax.cummax(jnp.where(light >= 0, jnp.arange(len(light)), 0))
     lo, hi, normal = (places[light[near], part] for part in range(3))
     level, levels = jnp.where(light >= 0, power[light], 0)[:, None], []
@@ -95,7 +95,7 @@ def built(places: Float[Array, "K 3 3"], leaf: Int[Array, " K"], power: Float[Ar
 def choose(
     tree: LightTree, ref: Float[Array, "3"], u: Float[Array, ""]
 ) -> tuple[Int[Array, ""], Float[Array, ""], Float[Array, ""]]:
-    """Choose a light for the point ref: its number, the probability, and u, uniform anew."""
+    """Choose a light for the point ref: return its number, its probability, and u, uniform again."""
 
     def by_chance(level, state, first):
         node, probability, u = state
@@ -110,7 +110,7 @@ def choose(
 
 
 def probability(tree: LightTree, ref: Float[Array, "3"], number: Int[Array, ""]) -> Float[Array, ""]:
-    """With which `choose` finds a light."""
+    """Return the probability with which `choose` finds a light."""
     leaf = at(tree.leaf, number)
 
     def towards_it(level, state, first):
@@ -122,13 +122,13 @@ def probability(tree: LightTree, ref: Float[Array, "3"], number: Int[Array, ""])
 
 
 def _descend(tree: LightTree, ref, step: Callable, state):
-    """step: (level, state, probability of the first child of state[0]) -> state."""
+    """Descend to a leaf. step: (level, state, probability of the first child of state[0]) -> state."""
     ref = lax.stop_gradient(ref)
 
     def importance(node):
         row = at(tree.nodes, node)
         to = jnp.stack([ref[axis] - row[axis] for axis in range(3)])
-        # Within the sphere around a node distances tell nothing.
+        # Within the sphere around a node, its radius replaces the distance, which says nothing there.
         inverse = safe_divide(1, safe_sqrt(larger(dot(to, to), row[3])))
         return inverse * inverse * (larger(dot(row[4:7], to) * inverse, 0) + row[7])
 

@@ -1,4 +1,4 @@
-"""A light without size that shines the same in all directions."""
+"""A point light with the same intensity in all directions."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathjax.core.math import dot, luminance, safe_divide, safe_sqrt
 from pathjax.emitters.emitter import DiracEmitter
 from pathjax.kinds import Color, Position, Row
 
-# Share of the way to the light at which shadow rays end, as Mitsuba's do: what a light hangs on does not hide it.
+# Share of the way to the light at which shadow rays end, as in Mitsuba: a surface at the light does not hide it.
 REACH = 1 - 2**-10
 
 
@@ -24,7 +24,7 @@ class Point(DiracEmitter):
 
     @staticmethod
     def sample(p: Row, ref: Float[Array, "3"]) -> tuple[Float[Array, "3"], Float[Array, ""], Float[Array, "3"]]:
-        """At the light itself nothing arrives."""
+        """As in `DiracEmitter`; at the light itself no light arrives."""
         to_light = p.position - ref
         squared = dot(to_light, to_light)
         distance = safe_sqrt(squared)

@@ -1,4 +1,4 @@
-"""A light without size that throws a picture, as a camera would see it."""
+"""A point light that projects an image, the reverse of a camera."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Projector(DiracEmitter):
     scale = Number(1.0, bounds=(0, math.inf))
     position = Position()
     to_world = Rotation()
-    tan_x = PerRow()  # () half the width of the picture at distance 1
+    tan_x = PerRow()  # () half the width of the image at distance 1
     tan_y = PerRow()  # () half the height
 
     @classmethod
@@ -40,7 +40,7 @@ class Projector(DiracEmitter):
 
     @staticmethod
     def power(p) -> Float[Array, " R"]:
-        """The power of a point light, times the root of the share of directions in which it shines, as for a spot."""
+        """Return the power of a point light, times the root of its share of all directions, as for a spot."""
         wide, high = p.tan_x, p.tan_y
         solid_angle = 4 * jnp.arcsin(wide * high / jnp.sqrt((1 + wide * wide) * (1 + high * high)))
         return (4 * math.pi) * luminance(p.irradiance) * p.scale * jnp.sqrt(solid_angle / (4 * math.pi))
@@ -55,7 +55,7 @@ class Projector(DiracEmitter):
         ahead = safe_divide(1, jnp.where(z > 0, z, 0))
         inside = (z > 0) & jnp.all((uv >= 0) & (uv <= 1))
         seen = p.on(jnp.where(inside, uv, 0)).irradiance * p.scale
-        # A screen is met aslant by cos = z, and is further away by 1 / z.
+        # Light meets the screen at the cosine z, and the screen is 1 / z times as far away as along the axis.
         arriving = seen * (math.pi * ahead**3 * safe_divide(1, squared))
         return d, distance * REACH, jnp.where(inside, arriving, 0)
 
@@ -66,13 +66,13 @@ class Projector(DiracEmitter):
 
 
 def _screen(p: Row, d: Float[Array, "3"]) -> tuple[Float[Array, ""], Float[Array, "2"]]:
-    """Cosine between the axis and -d, and where on the screen -d leads."""
+    """Return the cosine between the axis and -d, and the uv on the screen in the direction -d."""
     x, y, z = -(d @ p.to_world)
     ahead = safe_divide(1, jnp.where(z > 0, z, 0))
     return z, jnp.asarray(0.5, d.dtype) * (1 - jnp.stack([x / p.tan_x, y / p.tan_y]) * ahead)
 
 
 def _extent(fov: float, fov_axis: str, irradiance) -> dict[str, float]:
-    """Half sizes of the picture at distance 1. Its shape is that of its texels; without a picture it is a square."""
+    """Return half the size of the image at distance 1; its aspect is that of its texels, or else a square."""
     height, width = irradiance.kind.resolution(irradiance) if isinstance(irradiance, Instance) else (1, 1)
     return dict(zip(("tan_x", "tan_y"), half_extent(fov, fov_axis, width / height).tolist(), strict=True))

@@ -26,12 +26,12 @@ class Lights:
     """All lights of one kind."""
 
     table: Table  # a row for each emitter of the file
-    lamps: Lamps | None  # what shines, of kinds that stand inside shapes; None: each row is one light
-    row: Int[Array, " R"] | None  # row of the table, of each lamp
-    textures: Textures | None = None  # in the place of parameters; None: there are none
-    # Lower and upper corner around each, and the mean normal of its area; None: nothing chooses by them.
+    lamps: Lamps | None  # of kinds on surfaces; None: each row is one light
+    row: Int[Array, " R"] | None  # of each lamp in the table
+    textures: Textures | None = None  # of textured parameters; None: there are none
+    # Lower and upper corner around each light, and its mean normal; None: the choice does not depend on them.
     places: Float[Array, "R 3 3"] | None = None
-    leaf: Int[Array, " R"] | None = None  # of each in the tree by which they are chosen
+    leaf: Int[Array, " R"] | None = None  # of each light in the tree that chooses them
 
     @property
     def kind(self) -> type[Emitter]:
@@ -49,18 +49,18 @@ class Lights:
         return issubclass(self.kind, Background) and self.kind.left_to_bsdfs
 
     def parameters(self, light: Number, surface: Surface | None = None) -> Row:
-        """The parameters of light number `light` of this kind; surface: where it is met, if it has textures."""
+        """Return the parameters of light number `light` of this kind. surface: point on it, if it has textures."""
         return Row(self.table, light if self.row is None else at(self.row, light), surface, self.textures)
 
     def power(self, weighted: bool = False) -> Float[Array, " R"]:
-        """`Emitter.power`, of surfaces times their area. weighted: times the weights that files give."""
+        """Return `Emitter.power`, for surfaces times their area. weighted: times the weights from files."""
         power, weights = self.kind.power(AllRows(self.table)), self.table.column("sampling_weight")
         if weighted and weights is not None:
             power = power * weights.values
         return power if self.lamps is None else self.lamps.area * power[self.row]
 
     def dark(self) -> bool:
-        """Whether they emit nothing; of known values, not of traced ones."""
+        """Return whether they emit nothing. Values must not be traced."""
         colors = [key for key, d in self.kind.declared.items() if isinstance(d, Color) and d.radiance]
         if not colors:
             return not np.asarray(self.power()).any()
@@ -68,7 +68,7 @@ class Lights:
 
 
 class AllRows:
-    """Parameters of all rows, as attributes (R, *shape); of a texture its mean."""
+    """Parameters of all rows, as attributes (R, *shape); a texture is replaced by its mean."""
 
     def __init__(self, table: Table):
         self._table = table
@@ -81,29 +81,31 @@ class AllRows:
 @register_dataclass
 @dataclass(frozen=True)
 class Choice:
-    """Probability of each light, numbered through the tables that are sampled; made once per render."""
+    """Probability of each light, numbered through the tables that are sampled; computed once per render."""
 
     pdf: Float[Array, " R"]
     cdf: Float[Array, " R"]  # ends at 1
-    first: tuple[int | None, ...] = field(metadata={"static": True})  # by table, its first number; None: not sampled
-    # By which those that are not distant are chosen, and the probability that one of them is; None: all by `cdf`.
+    # Per table, the number of its first light; None: the table is not sampled.
+    first: tuple[int | None, ...] = field(metadata={"static": True})
+    # Tree that chooses near lights, and their total probability; None: `cdf` chooses all lights.
     tree: LightTree | None = None
     near: Float[Array, ""] | None = None
 
 
 def choice(emitters: tuple[Lights, ...], strategy: str) -> Choice | None:
-    """Near lights and distant ones half of the time each, and among those by power, of many near ones also by place.
+    """Return the probabilities of lights; None where there are none to choose from.
 
-    None where there is nothing to choose from.
+    Near and distant lights have half of the probability each. It is divided by power, among many near lights also by
+    place.
     """
     first: list[int | None] = []
-    powers: dict[bool, list] = {False: [], True: []}  # by whether they are distant, as tables are ordered
+    powers: dict[bool, list] = {False: [], True: []}  # by whether lights are distant, in the order of tables
     count = 0
     for lights in emitters:
         sampled = strategy == "light" or not lights.left_to_bsdfs
         first.append(count if sampled else None)
         if sampled:
-            # Strategy "light" has to find what has the weight 0 too.
+            # Strategy "light" has to find lights of weight 0 too.
             powers[lights.kind.distant].append(lights.power(weighted=strategy == "mis"))
             count += lights.count
     groups = [lax.stop_gradient(jnp.concatenate(group)) for group in powers.values() if group]
@@ -112,7 +114,7 @@ def choice(emitters: tuple[Lights, ...], strategy: str) -> Choice | None:
     power = groups[0]
     if len(groups) > 1:
         power = jnp.concatenate([_over(group, jnp.sum(group), 0) for group in groups])
-    # Lights of power 0 throughout: any choice will do, and 0 / 0 will not.
+    # If all powers are 0, any choice will do, but 0 / 0 will not.
     pdf = _over(power, jnp.sum(power), 1 / len(power))
     chosen = Choice(pdf, jnp.cumsum(pdf), tuple(first))
     placed = [lights for lights in emitters if lights.places is not None]
@@ -124,14 +126,14 @@ def choice(emitters: tuple[Lights, ...], strategy: str) -> Choice | None:
 
 
 def _over(power, total, otherwise):
-    """power / total, or `otherwise` where the total is 0."""
+    """Return power / total, or `otherwise` where the total is 0."""
     return jnp.where(total > 0, power / jnp.where(total > 0, total, 1), otherwise)
 
 
 def choose(
     chosen: Choice, ref: Float[Array, "3"], u: Float[Array, "2"]
 ) -> tuple[Int[Array, ""], Float[Array, ""], Float[Array, "2"]]:
-    """Choose a light for the point ref: its number, the probability, and u, of which the first number is used anew."""
+    """Choose a light for the point ref: return its number, its probability, and u with a fresh first number."""
     count = chosen.pdf.shape[0]
     if count == 1:
         return jnp.int32(0), jnp.ones_like(u[0]), u
@@ -158,7 +160,7 @@ def _by_power(chosen: Choice, u):
 
 
 def probability(chosen: Choice, ref: Float[Array, "3"], number: Int[Array, ""]) -> Float[Array, ""]:
-    """With which `choose` finds a light that is not distant."""
+    """Return the probability with which `choose` finds a light that is not distant."""
     if chosen.tree is None:
         return at(chosen.pdf, number)
     return light_tree.probability(chosen.tree, ref, number) * chosen.near

@@ -1,4 +1,4 @@
-"""A light without size that shines into a cone."""
+"""A point light that shines into a cone."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from pathjax.kinds import Angle, Color, Direction, Rotation, Row
 class Spot(Point):
     """A cone of light: `intensity` up to `beam_width` off its axis, falling linearly from there to `cutoff_angle`."""
 
-    # Over the square around the cone, seen from the light; white of rows that lack it.
+    # Over the square around the cone, as seen from the light; rows without one are white.
     texture = Color(None, bounds=(0, math.inf), radiance=True, absent=1.0)
     cutoff_angle = Angle(20.0, bounds=(0, 180))
     beam_width = Angle(None)  # by default 3/4 of the cutoff angle
@@ -50,13 +50,13 @@ class Spot(Point):
 
     @staticmethod
     def power(p) -> Float[Array, " R"]:
-        """The power of a point light, times the root of the share of its light that is left.
+        """Return the power of a point light, times the root of the share of its light that is left.
 
-        The mean square error of an image is least if lights are chosen by the root mean square of what they add to it.
+        The mean square error of an image is least if lights are chosen by the root mean square of their contribution.
         """
         cutoff, beam = jnp.radians(p.cutoff_angle), jnp.radians(p.beam_width)
         middle, half = (cutoff + beam) / 2, (cutoff - beam) / 2
-        # (1 - (sin c - sin b) / (c - b)) / 2. Written so, it would be 0 for narrow cones by rounding, and they would
+        # (1 - (sin c - sin b) / (c - b)) / 2. In that form rounding would make it 0 for narrow cones, which would then
         # never be chosen.
         share = jnp.sin(middle / 2) ** 2 + jnp.cos(middle) * (1 - jnp.sinc(half / math.pi)) / 2
         bright = Point.power(p) if p.texture is None else 4 * luminance(p.intensity * p.texture)
@@ -75,7 +75,7 @@ class Spot(Point):
 
     @staticmethod
     def uv(p: Row, d: Float[Array, "3"]) -> Float[Array, "2"]:
-        """The square that the texture fills just holds the cone; beside that any texel will do."""
+        """The texture fills the square that just holds the cone; outside of that, uv is arbitrary."""
         x, y, z = -(d @ p.to_world)
         radius = jnp.tan(p.cutoff_angle * (math.pi / 180))
         scale = 0.5 * safe_divide(1, jnp.where(x * x + y * y < 2 * (z * radius) ** 2, larger(z, 0) * radius, 0))

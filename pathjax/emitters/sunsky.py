@@ -1,11 +1,11 @@
 """A clear sky with its sun, by the model of Hosek and Wilkie.
 
-The sky (2012, "An analytic model for full spectral sky-dome radiance", ACM TOG 31(4)) is a formula whose ten numbers by
-colour follow from turbidity, albedo of the ground and elevation of the sun. The sun (2013, "Adding a solar-radiance
-function to the Hosek-Wilkie skylight model", IEEE CG&A 33(3)) is a disc of even radiance, as Mitsuba has it unless
-`complex_sun` is asked for. Up is +z; below the horizon all is dark, and with it the sky while the sun is there.
+The sky (2012, "An analytic model for full spectral sky-dome radiance", ACM TOG 31(4)) is a formula of ten numbers per
+colour, which follow from turbidity, ground albedo and elevation of the sun. The sun (2013, "Adding a solar-radiance
+function to the Hosek-Wilkie skylight model", IEEE CG&A 33(3)) is a disc of even radiance, as in Mitsuba without
+`complex_sun`. Up is +z. Directions below the horizon are dark, and so is the sky while the sun is below it.
 
-`sunsky.npz` holds the data in linear RGB; `sunsky.txt` says where they are from, and their licence.
+`sunsky.npz` holds the data in linear RGB; `sunsky.txt` states their source and licence.
 
 Directions are drawn from the disc, or from the sky by its mean luminance in each of many cells of equal solid angle.
 """
@@ -43,15 +43,15 @@ from pathjax.kinds import Direction, Instance, Number, PerRow, Rotation, Row, Sh
 
 # Cells of the sky in cos(polar angle) and azimuth.
 ROWS, COLUMNS = 32, 64
-# Degrees across the sun as it is; seen wider or narrower it shines as much.
+# Diameter of the real sun in degrees; a wider or narrower sun gives the same light.
 APERTURE = 0.5358
-# Elevations, in degrees, of the table of the sun's radiance, which Mitsuba takes for lower and higher suns too.
+# Elevations, in degrees, in the table of the sun's radiance. As in Mitsuba, its ends apply to lower and higher suns.
 ELEVATIONS = np.linspace(2, 89, 30)
-# Mitsuba's place and time: Tokyo, on a day in July. Of whole numbers, the bounds too.
+# Mitsuba's default place and time: Tokyo, on a day in July. Integers: default, lower and upper bound.
 DATE = {"year": (2010, 1, 9999), "month": (7, 1, 12), "day": (10, 1, 31)}
 TIME = {"hour": 15.0, "minute": 0.0, "second": 0.0}
 PLACE = {"latitude": 35.6894, "longitude": 139.6917, "timezone": 9.0}
-# Least chance of the sun, and of the sky, to be drawn: what has no light may have a derivative.
+# Least probability of sampling the sun, and the sky: one without light may have a derivative.
 LEAST = 1 / 32
 
 
@@ -61,13 +61,13 @@ class SunSky(Background):
     sky_scale = Number(1.0, bounds=(0, math.inf))
     sun_scale = Number(1.0, bounds=(0, math.inf))
     to_world = Rotation()
-    formula = PerRow()  # (3, 10) by colour the numbers of the sky
+    formula = PerRow()  # (3, 10) numbers of the formula of the sky, per colour
     disc = PerRow()  # (3,) radiance of the sun
     direction = PerRow()  # (3,) of the sun, local
-    one_minus_cos = PerRow()  # () of half the aperture
-    sky_light = PerRow()  # () luminance of the sky, its mean over the sphere
+    one_minus_cos = PerRow()  # () 1 - cos of half the aperture
+    sky_light = PerRow()  # () mean luminance of the sky over the sphere
     sun_light = PerRow()  # () the same of the sun
-    cells = Shared()  # (ROWS COLUMNS + 1,) probability of the cells before each, of the sky
+    cells = Shared()  # (ROWS COLUMNS + 1,) cumulative probability of the cells of the sky before each
     single = True
 
     @classmethod
@@ -158,11 +158,12 @@ class SunSky(Background):
 
 
 def _sky(formula, z, root, gamma, cos, exp):
-    """Radiance of the sky (3,), never negative: equations 7 and 8 of the paper of 2012.
+    """Return the radiance of the sky (3,), never negative, by equations 7 and 8 of the paper of 2012.
 
     Args:
-        formula: (3, 10) the factor comes last.
-        z: cosine of the polar angle, at least 0, and its root; gamma: angle to the sun, and its cosine.
+        formula: (3, 10); the factor comes last.
+        z, root: cosine of the polar angle, at least 0, and its square root.
+        gamma, cos: angle to the sun, and its cosine.
     """
     a, b, c, d, e, f, g, h, i, factor = formula.T
     glow = 1 + i * i - 2 * i * cos
@@ -172,7 +173,7 @@ def _sky(formula, z, root, gamma, cos, exp):
 
 
 def _half(p: Row, v: Float[Array, "3"]) -> Float[Array, ""]:
-    """(1 - cos) / 2 of the angle to the sun: by the chord, since the cosine has no digits near 1."""
+    """Return (1 - cos) / 2 of the angle to the sun, by the chord, since the cosine loses digits near 1."""
     chord = v - p.direction
     return smaller(dot(chord, chord) / 4, jnp.ones_like(v[0]))
 
@@ -191,18 +192,18 @@ def _chance_of_sun(p: Row) -> Float[Array, ""]:
 
 @cache
 def _data() -> tuple[np.ndarray, np.ndarray]:
-    """The sky by turbidity, albedo, control point, colour and number; the sun by turbidity, elevation, colour."""
+    """Return the sky by turbidity, albedo, control point, colour, number; the sun by turbidity, elevation, colour."""
     with np.load(Path(__file__).parent / "sunsky.npz") as data:
         return data["sky"].astype(float), data["sun"].astype(float)
 
 
 def _at_turbidity(table: np.ndarray, turbidity: float) -> np.ndarray:
-    low = min(int(turbidity), 9)  # of 1 to 10
+    low = min(int(turbidity), 9)  # turbidities are 1 to 10
     return table[low - 1] + (table[low] - table[low - 1]) * (turbidity - low)
 
 
 def _formula(turbidity: float, albedo: np.ndarray, elevation: float) -> np.ndarray:
-    """(3, 10): in the albedo (3,) linear, in the cube root of the elevation a Bezier curve of degree 5."""
+    """Return (3, 10), linear in the albedo (3,), and a Bezier curve of degree 5 in the cube root of the elevation."""
     if elevation < 0:
         return np.zeros((3, 10))
     black, white = _at_turbidity(_data()[0], turbidity)
@@ -212,14 +213,14 @@ def _formula(turbidity: float, albedo: np.ndarray, elevation: float) -> np.ndarr
 
 
 def _radiance(turbidity: float, elevation: float) -> np.ndarray:
-    """(3,) of the sun's disc; what lies out of the range of RGB is 0 there."""
+    """Return the radiance (3,) of the sun's disc; channels out of the gamut, and suns below the horizon, are 0."""
     table = _at_turbidity(_data()[1], turbidity)
     radiance = [np.interp(math.degrees(elevation), ELEVATIONS, column) for column in table.T]
     return np.maximum(radiance, 0) * (elevation >= 0)
 
 
 def _means(formula: np.ndarray, sun: np.ndarray) -> np.ndarray:
-    """(ROWS, COLUMNS) luminance of the sky in each cell, by four points."""
+    """Return the luminance (ROWS, COLUMNS) of the sky in each cell, as the mean of four points."""
     z = (np.arange(2 * ROWS)[:, None] + 0.5) / (2 * ROWS)
     azimuth = (np.arange(2 * COLUMNS) + 0.5) * (math.pi / COLUMNS)
     cos = np.sqrt(1 - z * z) * (np.cos(azimuth) * sun[0] + np.sin(azimuth) * sun[1]) + z * sun[2]
@@ -232,10 +233,10 @@ def _means(formula: np.ndarray, sun: np.ndarray) -> np.ndarray:
 
 
 def _sun_at(fields) -> np.ndarray:
-    """Local direction of the sun at a place and time; south is +x, west +y, up +z.
+    """Return the local direction of the sun at a place and time; south is +x, west +y, up +z.
 
-    By Blanco-Muriel, Alarcon-Padilla, Lopez-Moratalla and Lara-Coira 2001, "Computing the solar vector", Solar Energy
-    70(5), right to half a minute of arc.
+    This is the method of Blanco-Muriel, Alarcon-Padilla, Lopez-Moratalla and Lara-Coira 2001, "Computing the solar
+    vector", Solar Energy 70(5), right to half a minute of arc.
     """
     year, month, day = (fields.integer(key, first, at_least=a, at_most=b) for key, (first, a, b) in DATE.items())
     hour, minute, second = (fields.float(key, default) for key, default in TIME.items())
@@ -257,7 +258,7 @@ def _sun_at(fields) -> np.ndarray:
     south = math.cos(declination) * math.cos(turned) * math.sin(phi) - math.sin(declination) * math.cos(phi)
     west = math.cos(declination) * math.sin(turned)
     up = math.cos(declination) * math.cos(turned) * math.cos(phi) + math.sin(declination) * math.sin(phi)
-    # Seen from the ground and not from the middle of the Earth: its radius over the distance of the sun.
+    # Parallax, as seen from the ground: the radius of the Earth over the distance of the sun.
     zenith = math.acos(min(max(up, -1), 1))
     zenith += 6371.01 / 149597890 * math.sin(zenith)
     flat = math.hypot(south, west)
