@@ -1,8 +1,7 @@
-"""What varies over a surface: a file a kind, the table of kinds, and the look-up among those that a scene holds.
+"""What varies over a surface: one file per kind, the table of kinds, and the look-up among the kinds in a scene.
 
-A texture is a subclass of `Texture`, which says what it must offer. Where a bsdf, or a texture, declares a `Color`, or
-a `Number` that may be textured, a scene file may put a texture; of kinds that the scene does not hold nothing is
-compiled.
+A texture is a subclass of `Texture`, which defines the methods that it implements. A scene file may put a texture
+wherever a kind declares a `Color` or a `Number` that may be textured. Only kinds that occur in the scene are compiled.
 """
 
 from __future__ import annotations
@@ -47,7 +46,7 @@ __all__ = [
     "register",
 ]
 
-# By the name that scene files give them.
+# Kinds by their names in scene files.
 KINDS: dict[str, type[Texture]] = {
     "bitmap": Bitmap,
     "checkerboard": Checkerboard,
@@ -58,21 +57,21 @@ KINDS: dict[str, type[Texture]] = {
 
 
 def register(name: str):
-    """A decorator that makes a subclass of `Texture` a kind, which scene files name by `name`."""
+    """Return a decorator that registers a subclass of `Texture` as a kind, which scene files call `name`."""
     return register_kind(KINDS, Texture, name, "textures")
 
 
-# Places in a list of derivatives and their shares in a number, or in each channel of a colour.
+# Indices in a list of derivatives, and their weights in a number or in each channel of a colour.
 Pairs = tuple[tuple[Int[Array, ""], Float[Array, "..."]], ...]
 
 
 @register_dataclass
 @dataclass(frozen=True)
 class Textures:
-    tables: tuple[Table, ...]  # one for each kind present; of what holds textures behind the tables of these
+    tables: tuple[Table, ...]  # one for each kind present and depth of nesting; held textures come first
 
     def look_up(self, code: Int[Array, "2"], surface: Surface) -> Float[Array, "3"]:
-        """Colour of a texture at a point of a surface. code: kind and row, or below 0: any."""
+        """Return the colour of a texture at a point of a surface. code: kind and row; below 0: arbitrary."""
 
         def of(number, table):
             def look_up():
@@ -87,16 +86,15 @@ class Textures:
         return Row(table, row, surface, self._held(number)) if table.textured else Row(table, row)
 
     def _held(self, number: int) -> Textures:
-        """Those that the textures of a table may hold."""
+        """Return the textures that those of a table may hold."""
         return Textures(self.tables[:number])
 
     def entries(
         self, code: Int[Array, "2"], surface: Surface, first: Mapping[tuple[int, int | str], int]
     ) -> Pairs:
-        """Where the numbers that a colour is the sum of stand in a list of derivatives, and their shares.
+        """Return the numbers that a colour is a weighted sum of, as indices in a list of derivatives, and the weights.
 
-        first: by table and column, or the name of what meshes carry, where its entries begin. Of what is not there the
-            share is 0.
+        first: (table, column or name of a mesh attribute) -> index where its entries begin; others are left out.
         """
 
         return self._found(code, surface, first, lambda kind, *where: (None, kind.entries(*where)))[1]
@@ -104,7 +102,7 @@ class Textures:
     def with_entries(
         self, code: Int[Array, "2"], surface: Surface, first: Mapping[tuple[int, int | str], int]
     ) -> tuple[Float[Array, "3"], Pairs]:
-        """`look_up` and `entries`."""
+        """Return the results of `look_up` and `entries`."""
         return self._found(code, surface, first, lambda kind, *where: kind.with_entries(*where))
 
     def _found(self, code, surface, first, find):
@@ -138,18 +136,18 @@ class Textures:
         return self._switch(code, [partial(made_alike, call) for call in calls])
 
     def _switch(self, code, calls):
-        """What the call of the texture's kind gives."""
+        """Return the result of the call for the texture's kind."""
         return calls[0]() if len(calls) == 1 else lax.switch(jnp.maximum(code[0], 0), calls)
 
 
 def alike(calls: Sequence[Callable], dtype) -> list[Callable]:
-    """Calls that give places and shares; now all give as many, of which those that they lack have the share 0."""
+    """Return the calls, which return `Pairs`, padded with weights of 0 so that all return equally many."""
     filled = _filling(calls, dtype)
     return [lambda call=call: filled(call()) for call in calls]
 
 
 def _filling(calls: Sequence[Callable], dtype) -> Callable:
-    """What makes of the Pairs of each of these calls as many as the most."""
+    """Return a function that pads `Pairs` to the largest number that these calls return."""
     found = [jax.eval_shape(lambda call=call: tuple(call())) for call in calls]
     most = max(1, *map(len, found))
     shape = np.broadcast_shapes(*(share.shape for pairs in found for _, share in pairs))
@@ -167,14 +165,14 @@ def _uv(p: Row, surface: Surface) -> Float[Array, "2"]:
 
 
 def of_number(texture: Instance, known: dict[Instance, Instance]) -> Instance:
-    """The texture as it is where it stands for a number. known: those that were asked for before."""
+    """Return the texture in the form that stands for a number. known: cache of the results."""
     if texture not in known:
         known[texture] = texture.kind.of_number(texture, partial(of_number, known=known))
     return known[texture]
 
 
 def build(instances: list[Instance], dtype, path: tuple, parameters: Parameters) -> tuple[Textures | None, dict]:
-    """Textures, or None where there are none, and the code (kind, row) of each instance and of those that they hold."""
+    """Build textures (None: there are none); and the code (kind, row) of each instance and of those that they hold."""
     tables, codes, levels = [], {}, {}
     for instance in instances:
         _enter_level(instance, levels)
@@ -192,7 +190,7 @@ def build(instances: list[Instance], dtype, path: tuple, parameters: Parameters)
 
 
 def _enter_level(texture: Instance, levels: dict[Instance, int]) -> int:
-    """How deep the textures are nested that a texture holds; 0: it holds none. It and these are entered."""
+    """Return the depth of nesting in a texture (0: it holds none); enter it and those that it holds in `levels`."""
     if texture not in levels:
         held = [_enter_level(each, levels) for each in texture.values.values() if isinstance(each, Instance)]
         levels[texture] = max(held, default=-1) + 1

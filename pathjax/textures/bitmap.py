@@ -1,4 +1,4 @@
-"""Images over uv in [0, 1)^2; v points downwards, as Mitsuba's loader has it."""
+"""Images over uv in [0, 1)^2; v points downwards, as in Mitsuba's loader."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ from pathjax.textures.texture import Texture
 
 WRAPS = ("repeat", "mirror", "clamp")
 FILTERS = ("bilinear", "nearest")
-# From here on float32 does not tell texels apart.
+# From here on float32 does not distinguish texels.
 _FAR = 2.0**24
 
 
 class Bitmap(Texture):
-    """An image. An `Instance` holds `texels` (H, W, 3), linear, `to_uv`, `interpolation` and `wrap`."""
+    """An image. An `Instance` holds `texels` (H, W, 3), linear, `to_uv`, `nearest` and `wrap`."""
 
     texels = Shared(by_number=True, wider=True)  # (N, 3), all images one after another, rows from the top
-    first = PerRow()  # () int32 first texel
+    first = PerRow()  # () int32 index of the first texel
     size = PerRow()  # (2,) int32 height, width
     nearest = PerRow()  # () bool, no interpolation
-    wrap = PerRow()  # () int32 into WRAPS
+    wrap = PerRow()  # () int32 index into WRAPS
     unused: ClassVar[Mapping[str, Unused]] = {
         "accel": Unused("boolean"),
         "format": Unused("string", "texels have the precision of the scene", choices=("variant", "fp16", "auto")),
@@ -94,12 +94,12 @@ class Bitmap(Texture):
 
 
 def _joined(arrays: list[np.ndarray]) -> np.ndarray:
-    """One after another; of one alone no copy is made, as it may be large."""
+    """Concatenate arrays; a single one is not copied, as it may be large."""
     return arrays[0] if len(arrays) == 1 else np.concatenate(arrays)
 
 
 def texels_of(fields, data: np.ndarray, raw: bool) -> np.ndarray:
-    """(H, W, 3) float32 of an array: bytes and 16-bit integers are stored as in a PNG, real numbers are linear."""
+    """Return an array as (H, W, 3) float32: bytes and 16-bit integers are encoded as in a PNG, floats are linear."""
     if fields.has("filename"):
         raise fields.error("data", "excludes filename; give one or the other")
     if data.ndim not in (2, 3) or data.ndim == 3 and data.shape[2] not in (1, 3) or 0 in data.shape:
@@ -111,14 +111,14 @@ def texels_of(fields, data: np.ndarray, raw: bool) -> np.ndarray:
 
 
 def _corners(p, uv):
-    """The texels around a point: (0 or 1 down, 0 or 1 right) -> number of one; and (2,) where it is between them."""
+    """Return (0 or 1 down, 0 or 1 right) -> index of a texel around a point; and the position (2,) between texels."""
     size = p.size
     vu = jnp.stack([uv[1], uv[0]])
     # Texel centres lie at (i + 1/2) / size.
     place = compute_once(vu * size - jnp.where(p.nearest, 0, jnp.asarray(0.5, uv.dtype)))
     low = jnp.floor(place)
     fraction = jnp.where(p.nearest, 0, place - low)
-    # Twelve numbers are read at these places.
+    # Twelve numbers are read at these indices.
     corners = wrapped(low, size, p.wrap), wrapped(low + 1, size, p.wrap)
     corners, fraction = compute_once((corners, fraction))
 
@@ -143,7 +143,7 @@ def _entries(index, fraction):
 
 
 def wrapped(low, size, wrap):
-    """Row and column (2,) int32 in the image, or places along three axes; low: whole numbers, as floats, any."""
+    """Return row and column (2,) int32 in the image, or indices along three axes. low: any integers, as floats."""
     size = jnp.maximum(size, 1)
     folded = _modulo(low, jnp.where(wrap == 1, 2 * size, size))
     folded = jnp.where(folded < size, folded, 2 * size - 1 - folded)
@@ -151,9 +151,9 @@ def wrapped(low, size, wrap):
 
 
 def _modulo(a, b):
-    """a mod b, int32, of a whole a and b > 0, without division of integers, for which there is no SIMD."""
+    """Return a mod b, int32, for integers a and b > 0, without integer division, for which there is no SIMD."""
     a = jnp.where(jnp.abs(a) < _FAR, a, 0)
     quotient = jnp.floor(a / b.astype(a.dtype)).astype(jnp.int32)
-    rest = a.astype(jnp.int32) - quotient * b  # the rounding of the quotient moves it by b, at most
+    rest = a.astype(jnp.int32) - quotient * b  # by rounding of the quotient off by b, at most
     rest = jnp.where(rest < 0, rest + b, rest)
     return jnp.where(rest >= b, rest - b, rest)

@@ -1,4 +1,4 @@
-"""Two colours in squares of half a unit of uv, as Mitsuba's `checkerboard` has them."""
+"""Two colours in squares of half a unit of uv, as in Mitsuba's `checkerboard`."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from pathjax.textures.texture import Texture
 
 
 class Checkerboard(Texture):
-    """Squares of two colours; the first one lies at uv = (0, 0), and the second one where it stands for a number."""
+    """Squares of two colours. At uv = (0, 0) is the first one, or the second one if it stands for a number."""
 
     color0 = Color(0.4)
     color1 = Color(0.2)
@@ -26,7 +26,7 @@ class Checkerboard(Texture):
 
     @classmethod
     def of_number(cls, texture: Instance, held: Callable[[Instance], Instance]) -> Instance:
-        """The board shifted by a square: Mitsuba's begins with `color1` there, and files rely on it."""
+        """Return the board shifted by a square: Mitsuba's begins with `color1` here, and files rely on it."""
         values = {key: held(x) if isinstance(x, Instance) else x for key, x in texture.values.items()}
         to_uv = np.eye(2, 3) if values["to_uv"] is None else values["to_uv"]
         return replace(texture, values=values | {"to_uv": to_uv + np.array([[0, 0, 0.5], [0, 0, 0]])})
@@ -38,6 +38,6 @@ class Checkerboard(Texture):
 
 
 def _first(uv):
-    """Whether the square has the first colour."""
+    """Return whether the square at uv has the first colour."""
     odd = uv - jnp.floor(uv) > 0.5
     return odd[0] == odd[1]

@@ -1,4 +1,4 @@
-"""What the vertices or faces of a mesh carry, such as colours."""
+"""Attributes of the vertices or faces of a mesh, such as colours."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from pathjax.textures.texture import Texture
 
 
 class MeshAttribute(Texture):
-    """An attribute of the mesh that was hit, by its name: that of a vertex is interpolated, of a face it is constant.
+    """An attribute, by name, of the mesh that was hit: interpolated between vertices, or constant on a face.
 
-    `Surface.attributes` has the values of all names that a scene asks for.
+    `Surface.attributes` has the values of all attributes that a scene uses.
     """
 
     names = Setting("")  # of the attributes of all rows, separated by blanks
-    number = PerRow()  # () int32 into them
+    number = PerRow()  # () int32 index of its name
     scale = Number(1.0, bounds=(0, math.inf))
 
     @classmethod
@@ -59,7 +59,7 @@ class MeshAttribute(Texture):
 
     @classmethod
     def span(cls, texture: Instance) -> tuple[float, float]:
-        """Any: `fault` checks the meshes that it is used on."""
+        """Return a placeholder: `fault` checks the meshes that it is used on."""
         return 0.0, 0.0
 
 
@@ -69,7 +69,7 @@ def _value(p: Row, surface: Surface) -> Float[Array, "3"]:
 
 
 def asked(instance: Instance) -> Iterator[tuple[str, Declared, Instance]]:
-    """Parameter, its declaration and the texture, wherever in an object such a texture stands."""
+    """Yield parameter, declaration and texture for each such texture in an instance."""
     for key, value in instance.values.items():
         for each in value if isinstance(value, tuple | list) else (value,):
             if isinstance(each, Instance) and each.kind is MeshAttribute:
@@ -79,7 +79,7 @@ def asked(instance: Instance) -> Iterator[tuple[str, Declared, Instance]]:
 
 
 def fault(instance: Instance, attributes: Mapping[str, np.ndarray]) -> str:
-    """Why a shape that carries these attributes cannot have this bsdf, in words; empty: it can."""
+    """Return why a shape with these attributes cannot have this bsdf, in words; empty: it can."""
     for key, declared, texture in asked(instance):
         name, scale = texture.values["names"], texture.values["scale"]
         if name not in attributes:

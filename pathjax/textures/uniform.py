@@ -1,4 +1,4 @@
-"""The texture that is the same everywhere."""
+"""Textures that are the same everywhere."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pathjax.textures.texture import Texture
 
 
 class Uniform(Texture):
-    """One number, of all channels."""
+    """One number for all channels."""
 
     value = Number(bounds=(0, math.inf))
 

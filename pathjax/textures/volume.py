@@ -1,4 +1,4 @@
-"""Volumes as textures: a surface has the values that lie where it is in space."""
+"""Volumes as textures: a point of a surface has the value of the volume there."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ class Volume(Texture):
     """A grid of values in world space. An `Instance` holds `volume`, a `media.GridVolume`."""
 
     volume = Shared(by_number=True)  # (N, 3) cells of all grids one after another, x running fastest
-    first = PerRow()  # () int32 first cell
+    first = PerRow()  # () int32 index of the first cell
     size = PerRow()  # (3,) int32 cells along x, y, z
-    to_grid = PerRow()  # (3, 4) to where the centre of cell i lies at i
+    to_grid = PerRow()  # (3, 4) from world space to cell coordinates; the centre of cell i is at i
     nearest = PerRow()  # () bool, no interpolation
-    wrap = PerRow()  # () int32 into WRAPS
+    wrap = PerRow()  # () int32 index into WRAPS
     over_uv = False
 
     @classmethod
@@ -78,12 +78,12 @@ class Volume(Texture):
 
     @classmethod
     def mean(cls, texture):
-        """None: what part of it a surface meets is not known."""
+        """Return None: it is not known which part of the volume a surface meets."""
         return None
 
 
 def _corners(p: Row, surface: Surface):
-    """The numbers of eight cells around a point, and the share of each."""
+    """Return the indices of the eight cells around a point, each with its weight."""
     m = p.to_grid
     place = m[:, :3] @ surface.p + m[:, 3] + jnp.where(p.nearest, jnp.asarray(0.5, m.dtype), 0)
     low = jnp.floor(place)
