@@ -1,13 +1,13 @@
-"""What lies between surfaces: participating media, their phase functions, and where each of them begins and ends.
+"""Participating media between surfaces, their phase functions, and where each of them begins and ends.
 
-Each shape may say what is inside of it, where its normals point away from, and what is outside. A path knows the medium
-that it is in, and changes it where it leaves such a shape, to whatever side. Distances are drawn by the extinction in
-one of three colours, chosen by chance in proportion to what the path still carries of them; weights are those of the
-mixture, so no colour's weight grows beyond the inverse of its chance (the balance heuristic of Veach 1997, as in Wilkie
-et al. 2014, "Hero wavelength spectral sampling"). Distances and densities are detached: weights carry the derivatives.
+Each shape may state the medium inside, on the side that its normals point away from, and the medium outside. A path
+keeps track of its medium, and changes it where it leaves such a shape, to either side. Distances are drawn by the
+extinction in one of three colours, chosen in proportion to what the path still carries of them. Weights are those of
+the mixture, so none exceeds the inverse of its colour's probability (the balance heuristic of Veach 1997, as in Wilkie
+et al. 2014, "Hero wavelength spectral sampling"). Distances and densities are detached: weights carry derivatives.
 
-Of media that only absorb nothing is drawn, and no scattering is compiled. The albedo may vary in space, and so may the
-extinction of what is heterogeneous, each by a grid: see `grids`.
+Where media only absorb, no distance is drawn and no scattering is compiled. The albedo may vary in space, and so may
+the extinction of heterogeneous media, each by a grid: see `grids`.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ __all__ = [
     "register",
 ]
 
-# By the name that scene files give them.
+# Kinds by their names in scene files.
 KINDS = {"homogeneous": Homogeneous, "heterogeneous": Heterogeneous}
 PHASES: dict[str, type[Phase]] = {
     "isotropic": Isotropic,
@@ -66,35 +66,35 @@ PHASES: dict[str, type[Phase]] = {
     "tabphase": TabPhase,
     "blendphase": BlendPhase,
 }
-# In the place of a row: no medium; and of shapes that say nothing, which leave paths in the medium that they are in.
+# Instead of a row: no medium; and, for shapes that state none, the medium that the path is already in.
 NONE, SAME = -1, -2
-# Least probability of each colour: what the path carries nothing of may have a derivative.
+# Least probability of each colour: one that the path carries nothing of may have a derivative.
 LEAST = 1 / 30
 
 
 def register(name: str):
-    """A decorator that makes a subclass of `Phase` a phase function, which scene files name by `name`."""
+    """Return a decorator that registers a subclass of `Phase` as a kind, which scene files call `name`."""
     return register_kind(PHASES, Phase, name, "media")
 
 
 class Nudges(NamedTuple):
-    """For derivatives: what is added to what grids say; None: nothing."""
+    """For derivatives: what is added to values of grids; None: nothing."""
 
-    extinction: Float[Array, ""] | None = None  # where a flight ends at a particle
-    albedo: Float[Array, ""] | None = None  # there
-    depth: Float[Array, ""] | None = None  # of the flight
+    extinction: Float[Array, ""] | None = None  # to the one where a flight ends at a particle
+    albedo: Float[Array, ""] | None = None  # to the one there
+    depth: Float[Array, ""] | None = None  # to the depth of the flight
     shadow: Float[Array, ""] | None = None  # to the depth of a shadow ray: see `integrators.shadow`
 
 
 @register_dataclass
 @dataclass(frozen=True)
 class Media:
-    table: Table  # of all media, whatever their kind; without albedo where nothing scatters
-    phases: tuple[Table, ...]  # one for each kind of phase function present; that of blends comes last
-    phase: Int[Array, "R 2"]  # of each medium: kind and row of its phase function
-    sides: Int[Array, "S 2"]  # of each shape: rows of the media inside and outside, or NONE, or SAME twice
+    table: Table  # of all media, of both kinds; without albedo if nothing scatters
+    phases: tuple[Table, ...]  # one per kind of phase function present; that of blends comes last
+    phase: Int[Array, "R 2"]  # per medium: kind and row of its phase function
+    sides: Int[Array, "S 2"]  # per shape: rows of the media inside and outside, or NONE, or SAME twice
     camera: Int[Array, ""]  # row of the medium in which paths begin, or NONE
-    # What the extinctions and albedos of the table are multiplied by; None: none varies in space.
+    # Factors of the extinctions and albedos of the table; None: none varies in space.
     extinctions: Grids | None = None
     albedos: Grids | None = None
     nudges: Nudges | None = None
@@ -111,11 +111,13 @@ def build(
     path: tuple,
     parameters: Parameters,
 ) -> Media | None:
-    """The media of a scene; None where there are none.
+    """Build the media of a scene; None where there are none.
 
     Args:
-        sides: of each shape, the media inside and outside; camera: that of the sensor.
-        path: where they will be in the scene; parameters: to enter those of media and phase functions.
+        sides: of each shape, the media inside and outside.
+        camera: the medium of the sensor.
+        path: location of the media in the scene.
+        parameters: receives the parameters of media and phase functions.
     """
     present = list(dict.fromkeys(each for each in (*(m for pair in sides for m in pair), camera) if each is not None))
     if not present:
@@ -150,16 +152,13 @@ def _numbers(value: object) -> object:
 
 
 def _constant(medium: Instance) -> Instance:
-    """The medium with ones in the place of grids, which multiply them."""
+    """Return the medium with ones in place of grids; these are factors of the grids."""
     values = {key: np.ones(3) if isinstance(value, GridVolume) else value for key, value in medium.values.items()}
     return Instance(medium.kind, medium.name, values)
 
 
 def _grids(rows: list[Instance], key: str, dtype, path: tuple, parameters: Parameters) -> Grids | None:
-    """The grids that stand in the place of a parameter of media, which its values are then; None: there are none.
-
-    path: where they will be in the scene.
-    """
+    """Build the grids that replace a parameter of media, at `path` in the scene, and enter it; None: no grids."""
     values = {each: each.values[key] for each in rows if isinstance(each.values[key], GridVolume)}
     if not values:
         return None
@@ -183,7 +182,7 @@ def _grids(rows: list[Instance], key: str, dtype, path: tuple, parameters: Param
 
 
 def _absorbing(medium: Instance, parameters: Parameters) -> Instance:
-    """The media without albedo, as all albedos are 0."""
+    """Return the medium without albedo, since all albedos are 0."""
     parameters.refused[f"{medium.name}.albedo"] = (
         f"{medium.name}.albedo is 0, as that of all media of the scene is, so no scattering is compiled; "
         "load the scene with one above 0 to set it"
@@ -192,7 +191,7 @@ def _absorbing(medium: Instance, parameters: Parameters) -> Instance:
 
 
 def names(media: Media) -> list[str]:
-    """Names that scene files give the kinds that are present, for `info`."""
+    """Return the names in scene files of the kinds present, for `info`."""
     known = {kind: name for name, kind in (KINDS | PHASES).items()}
     present = [media.table.kind, *(table.kind for table in media.phases)]
     more = [] if media.extinctions is None and media.albedos is None else ["grids"]
@@ -210,7 +209,7 @@ def beyond(
     n: Float[Array, "3"],
     d: Float[Array, "3"],
 ) -> Int[Array, ""]:
-    """The medium in which a ray goes on that leaves a shape, of the normal n, in the direction d; shape -1: none."""
+    """Return the medium of a ray that leaves a shape with normal n in the direction d. shape: -1: none."""
     side = at(media.sides, jnp.maximum(shape, 0), jnp.where(dot(n, d) > 0, 1, 0))
     return jnp.where((shape < 0) | (side == SAME), medium, side)
 
@@ -218,15 +217,12 @@ def beyond(
 def distance(
     media: Media, medium: Int[Array, ""], ray: Ray, throughput: Float[Array, "3"], u: Float[Array, "2"]
 ) -> Float[Array, ""]:
-    """Draw how far light goes along a ray until it meets a particle, detached; inf where there is none.
-
-    u: uniform in (0, 1).
-    """
+    """Sample the distance along a ray to the next particle, detached; inf: there is none. u: uniform in (0, 1)."""
     sigma, chances = extinction(media, medium), _chances(throughput)
     red, green = u[0] < chances[0], u[0] < chances[0] + chances[1]
     of_colour = lax.stop_gradient(jnp.where(red, sigma[0], jnp.where(green, sigma[1], sigma[2])))
     attenuates = of_colour > 0
-    # In units of the values of a grid; else it is the distance.
+    # The distance; with a grid, the integral of its values to be reached.
     wanted = jnp.where(attenuates, -jnp.log1p(-u[1]) / jnp.where(attenuates, of_colour, 1), jnp.inf)
     if media.extinctions is None:
         return wanted
@@ -243,9 +239,9 @@ def flight_weight(
     distance: Float[Array, ""],
     scatters: Bool[Array, ""] | None,
 ) -> Float[Array, "3"]:
-    """What a path carries of its throughput along a ray over a distance, to a surface, or to where it is scattered.
+    """Return the factor of the throughput for a flight along a ray, to a surface or to where the path is scattered.
 
-    scatters: whether it ends in the medium, at a distance that `distance` drew; None: nothing scatters.
+    scatters: whether the flight ends in the medium, at a distance drawn by `distance`; None: nothing scatters.
     """
     nudges = media.nudges or Nudges()
     passed = transmittance(media, medium, ray, distance, nudges.depth)
@@ -265,7 +261,7 @@ def flight_weight(
         return number * _in_grid(values, medium, of_grid, lambda: one)
 
     sigma = at_end(extinction(media, medium), media.extinctions, nudges.extinction)
-    # The density with which each colour would have had the light end here, or go on further than this.
+    # For each colour, the density of flights that end here, or the probability of longer ones.
     density = jnp.where(scatters, sigma, 1) * passed
     drawn = lax.stop_gradient(dot(_chances(throughput), density))
     albedo = at_end(Row(media.table, jnp.maximum(medium, 0)).albedo, media.albedos, nudges.albedo)
@@ -279,9 +275,9 @@ def transmittance(
     distance: Float[Array, ""],
     nudge: Float[Array, ""] | None = None,
 ) -> Float[Array, "3"]:
-    """Share of the light that comes through; of an endless way, which has no derivative, all or nothing.
+    """Return the share of light that is transmitted; over an infinite distance it is 0 or 1, without derivative.
 
-    nudge: to be added to the depth in a grid.
+    nudge: added to the depth in a grid.
     """
     sigma = extinction(media, medium)
 
@@ -301,12 +297,12 @@ def transmittance(
 
 
 def nudged_shadow(media: Media, medium: Int[Array, ""]) -> Float[Array, "3"]:
-    """What the share of light is multiplied by whose depth in the grid of a medium is nudged."""
+    """Return the factor of transmitted light due to the nudge of its depth in the grid of a medium."""
     return jnp.exp(-extinction(media, medium) * media.nudges.shadow)
 
 
 def extinction(media: Media, medium: Int[Array, ""]) -> Float[Array, "3"]:
-    """1 over the unit of length, 0 without medium; of what is a grid, what its values are multiplied by."""
+    """Return the extinction per unit of length, or the factor of its grid; 0 without medium."""
     p = Row(media.table, jnp.maximum(medium, 0))
     return jnp.where(medium >= 0, p.sigma_t * p.scale, 0)
 
@@ -314,11 +310,7 @@ def extinction(media: Media, medium: Int[Array, ""]) -> Float[Array, "3"]:
 def on_the_way(
     media: Media, medium: Int[Array, ""], ray: Ray, distance: Float[Array, ""], u: Float[Array, ""]
 ) -> tuple[Float[Array, "3"], Float[Array, ""]]:
-    """Draw a point of a ray evenly of what lies in the grid of a medium's extinction up to a distance.
-
-    Returns:
-        The point, and the length of that part: 0 where the medium has no grid.
-    """
+    """Sample a point of a ray uniformly up to a distance in its medium's grid; return that length too (0: no grid)."""
     values = media.extinctions
     grid = _grid(values, medium)
     p, length = grids.on_the_way(values, jnp.maximum(grid, 0), ray, distance, u)
@@ -326,7 +318,7 @@ def on_the_way(
 
 
 def entries(values: Grids, medium: Int[Array, ""], p: Float[Array, "3"]) -> Pairs:
-    """Which values its grid's value at a point is the sum of, and the share of each; 0 where the medium has none."""
+    """Return the indices and weights of the values that a medium's grid interpolates at a point; 0 without a grid."""
     grid = _grid(values, medium)
     found = grids.entries(values, jnp.maximum(grid, 0), p)
     return tuple((place, jnp.where(grid >= 0, share, 0)) for place, share in found)
@@ -337,13 +329,13 @@ def _grid(values, medium):
 
 
 def _in_grid(values, medium, of_grid, otherwise):
-    """What a function finds of the grid of a medium, or what stands for it where it has none."""
+    """Return of_grid(grid) for the grid of a medium, or otherwise() where it has none."""
     grid = _grid(values, medium)
     return lax.cond(grid >= 0, lambda: of_grid(jnp.maximum(grid, 0)), otherwise)
 
 
 def _chances(throughput):
-    """The chance (3,) of each colour to be the one that a distance is drawn for."""
+    """Return the probability (3,) of each colour to be the one by which a distance is drawn."""
     carried = lax.stop_gradient(throughput)
     total = carried[0] + carried[1] + carried[2]
     share = jnp.where(total > 0, carried / jnp.where(total > 0, total, 1), 1 / 3)
@@ -351,14 +343,14 @@ def _chances(throughput):
 
 
 def evaluate(media: Media, medium: Int[Array, ""], wo: Float[Array, "3"]) -> tuple[Float[Array, "3"], Float[Array, ""]]:
-    """The phase function, as a bsdf is evaluated, and its density."""
+    """Return the value of the phase function, like that of a bsdf, and its density."""
     code = at(media.phase, jnp.maximum(medium, 0))
     f = _of_phase(media, code, lambda kind, p: kind.evaluate(p, wo)) if not _mixes(media) else _mixture(media, code, wo)
     return jnp.broadcast_to(f, wo.shape), lax.stop_gradient(f)
 
 
 def sample(media: Media, medium: Int[Array, ""], u: Float[Array, "2"]) -> BSDFSample:
-    """Draw `wo` from the phase function, as if it were a bsdf; of a blend, from the one or the other by its weight."""
+    """Sample `wo` from the phase function, as from a bsdf; from a blend, by one of its two, chosen by weight."""
     code = blend = at(media.phase, jnp.maximum(medium, 0))
     if _mixes(media):
         one, other, weight = _held(media, blend)
@@ -378,7 +370,7 @@ def sample(media: Media, medium: Int[Array, ""], u: Float[Array, "2"]) -> BSDFSa
 
 
 def _of_phase(media, code, of):
-    """What a function finds of the kind and the row of a phase function that is no blend."""
+    """Return of(kind, row) for a phase function that is no blend."""
     tables = media.phases[:-1] if _mixes(media) else media.phases
     branches = [lambda table=table: of(table.kind, Row(table, code[1])) for table in tables]
     return branches[0]() if len(branches) == 1 else lax.switch(code[0], branches)
@@ -393,7 +385,7 @@ def _mixes(media) -> bool:
 
 
 def _held(media, code):
-    """The phase functions that a blend holds, and the weight of the second; of what is none, itself twice, and 0."""
+    """Return the phase functions in a blend, and the weight of the second; for others, themselves twice, and 0."""
     is_blend = code[0] == len(media.phases) - 1
     p = Row(media.phases[-1], jnp.where(is_blend, code[1], 0))
     one, other = (jnp.where(is_blend, held, code) for held in p.codes)

@@ -7,9 +7,9 @@ from pathjax.media.phase import Phase
 
 
 class BlendPhase(Phase):
-    """The first phase function inside where the weight is 0, the second one where it is 1.
+    """The first nested phase function at weight 0, the second at weight 1, in between their mixture.
 
-    An `Instance` holds both under "held". What scatters is one of these: see `media.sample`.
+    The values of an `Instance` have both under "held". One of them scatters: see `media.sample`.
     """
 
     weight = Number(bounds=(0, 1), required=True)

@@ -1,10 +1,10 @@
 """Grids of volumes in kernels: their values at a point, and their integral along a ray.
 
-Between the planes through the centres of cells the interpolation is a polynomial of degree 3 along a ray, of which two
-points of Gauss's quadrature give the integral exactly. Where values are not interpolated, but each fills its cell, the
-planes are the faces of cells. So the optical depth of a way is known without chance, as in a
-homogeneous medium, and so is where it reaches a given one ("regular tracking": Novak et al. 2018, "Monte Carlo Methods
-for Volumetric Light Transport Simulation", section 4.1). The price is a step for each plane.
+Between the planes through the centres of cells the interpolation is a polynomial of degree 3 along a ray, which Gauss's
+quadrature with two points integrates exactly. Where values are not interpolated, but each fills its cell, the planes
+are the faces of cells. So the optical depth of a segment is computed without noise, as in a homogeneous medium, and so
+is the distance at which it reaches a given value ("regular tracking": Novak et al. 2018, "Monte Carlo Methods for
+Volumetric Light Transport Simulation", section 4.1). The cost is one step per plane.
 """
 
 from __future__ import annotations
@@ -23,23 +23,23 @@ from pathjax.core.types import Ray
 from pathjax.media.gridvolume import GridVolume
 from pathjax.textures import Pairs
 
-# Halvings of a part of a ray between two planes, after which float32 tells no difference.
+# Bisections of a part of a ray between two planes; more make no difference in float32.
 _HALVINGS = 24
 
 
 @register_dataclass
 @dataclass(frozen=True)
 class Grids:
-    """The grids of one thing of R media, G of them, of T cells."""
+    """The G grids of one parameter of R media, with T cells in all."""
 
-    of: Int[Array, " R"]  # grid of each medium, below 0: none
+    of: Int[Array, " R"]  # grid of each medium; below 0: none
 
-    values: Float[Array, "T C"]  # of one after the other, x running fastest
-    first: Int[Array, " G"]  # cell of each
+    values: Float[Array, "T C"]  # all grids one after another, x running fastest
+    first: Int[Array, " G"]  # first cell of each
     size: Int[Array, "G 3"]  # cells along x, y, z
-    to_grid: Float[Array, "G 3 4"]  # to where the planes lie at integers
+    to_grid: Float[Array, "G 3 4"]  # from world space to cell coordinates, in which planes lie at integers
     box: Float[Array, "G 2 3"]
-    nearest: Bool[Array, " G"] | None = None  # which are not interpolated; None: none of them
+    nearest: Bool[Array, " G"] | None = None  # whether values are not interpolated; None: all are
 
 
 class _Line(NamedTuple):
@@ -47,19 +47,19 @@ class _Line(NamedTuple):
 
     o: Float[Array, "3"]
     d: Float[Array, "3"]
-    last: Float[Array, "3"]  # those of the last planes
+    last: Float[Array, "3"]  # coordinates of the last planes
     varies: Bool[Array, "3"]  # along which axes values vary between planes
 
 
 class _March(NamedTuple):
     t: Float[Array, ""]
     depth: Float[Array, " C"]  # from where the ray enters up to t
-    plane: Float[Array, "3"]  # which is met next along each axis
+    plane: Float[Array, "3"]  # the next one along each axis
     goes_on: Bool[Array, ""]
 
 
 def build(of: list[GridVolume | None], dtype) -> Grids:
-    """of: that of each medium."""
+    """Build the grids. of: grid of each medium."""
     present = list(dict.fromkeys(each for each in of if each is not None))
     number = {each: row for row, each in enumerate(present)} | {None: -1}
     channels = max(grid.data.shape[3] for grid in present)
@@ -76,14 +76,14 @@ def build(of: list[GridVolume | None], dtype) -> Grids:
 
 
 def look_up(grids: Grids, grid: Int[Array, ""], p: Float[Array, "3"]) -> Float[Array, " C"]:
-    """The value of a grid at a point in world space."""
+    """Return the value of a grid at a point in world space."""
     to_grid = at(grids.to_grid, grid)
     x = to_grid[:, :3] @ p + to_grid[:, 3]
     return _interpolated(_corners(grids, grid, x), _shares(grids, grid, x))
 
 
 def entries(grids: Grids, grid: Int[Array, ""], p: Float[Array, "3"]) -> Pairs:
-    """Which of the values a grid's value at a point is the sum of, and the share of each."""
+    """Return the indices and weights of the values that a grid interpolates at a point."""
     to_grid = at(grids.to_grid, grid)
     x = to_grid[:, :3] @ p + to_grid[:, 3]
     share = _shares(grids, grid, x)
@@ -97,7 +97,7 @@ def entries(grids: Grids, grid: Int[Array, ""], p: Float[Array, "3"]) -> Pairs:
 def on_the_way(
     grids: Grids, grid: Int[Array, ""], ray: Ray, distance: Float[Array, ""], u: Float[Array, ""]
 ) -> tuple[Float[Array, "3"], Float[Array, ""]]:
-    """A point of a ray, drawn evenly of what lies within the box of a grid up to a distance, and the length of that."""
+    """Sample a point uniformly on the part of a ray, up to a distance, in the box of a grid; and return its length."""
     start, end = _ends(grids, grid, ray)
     end = smaller(distance, end)
     start, length = jnp.where(start < end, start, 0), jnp.where(start < end, end - start, 0)
@@ -105,14 +105,14 @@ def on_the_way(
 
 
 def depth(grids: Grids, grid: Int[Array, ""], ray: Ray, distance: Float[Array, ""]) -> Float[Array, " C"]:
-    """Integral of a grid along a ray up to a distance, which may be inf."""
+    """Return the integral of a grid along a ray up to a distance, which may be inf."""
     return _follow(grids, grid, ray, distance, None).depth
 
 
 def reach(
     grids: Grids, grid: Int[Array, ""], ray: Ray, channel: Int[Array, ""], wanted: Float[Array, ""]
 ) -> Float[Array, ""]:
-    """Distance at which the integral of one channel has a wanted value; inf where it never does."""
+    """Return the distance at which the integral of one channel reaches a wanted value; inf where it never does."""
     line, (_, end) = _line(grids, grid, ray), _ends(grids, grid, ray)
     found = _follow(grids, grid, ray, jnp.full_like(ray.t_max, jnp.inf), (channel, wanted))
     t, rest = found.t, wanted - _channel(found.depth, channel)
@@ -130,7 +130,7 @@ def reach(
 
 
 def _follow(grids, grid, ray, distance, target) -> _March:
-    """Go from plane to plane, to the end, or to the part in which the integral of a channel reaches `target`.
+    """March from plane to plane, to the end, or to the part in which the integral of a channel reaches `target`.
 
     target: channel and value; None: to the end.
     """
@@ -142,7 +142,7 @@ def _follow(grids, grid, ray, distance, target) -> _March:
         length = t1 - march.t
         depth = march.depth + _integral(line, *_between(grids, grid, line, march.t, length), march.t, length)
         reached = False if target is None else _channel(depth, target[0]) >= target[1]
-        # All axes whose plane this is, and others that rounding puts no further.
+        # Advance all axes whose next plane is here, or by rounding no further.
         plane = jnp.where(_at_planes(line, march.plane) <= t1, march.plane + jnp.sign(line.d), march.plane)
         on = _March(t1, depth, plane, t1 < end)
         if target is None:
@@ -153,7 +153,7 @@ def _follow(grids, grid, ray, distance, target) -> _March:
     x = line.o + start * line.d
     plane = jnp.where(line.d > 0, larger(jnp.floor(x) + 1, 0), smaller(jnp.ceil(x) - 1, line.last))
     nothing = jnp.zeros_like(grids.values[0])
-    # Nothing is asked of a ray that misses the box.
+    # A ray that misses the box takes no step.
     begun = _March(jnp.where(start < end, start, end), nothing, plane, start < end)
     return lax.while_loop(lambda march: march.goes_on, step, begun)
 
@@ -165,7 +165,7 @@ def _line(grids, grid, ray) -> _Line:
 
 
 def _planes(grids, grid, dtype):
-    """`last` and `varies` of a line."""
+    """Return `last` and `varies` of a line."""
     last = (at(grids.size, grid) - 1).astype(dtype)
     if grids.nearest is None:
         return last, last > 0
@@ -174,7 +174,7 @@ def _planes(grids, grid, dtype):
 
 
 def _ends(grids, grid, ray):
-    """Where a ray enters the box of a grid and leaves it; of a miss the end is not beyond the start."""
+    """Return where a ray enters and leaves the box of a grid; for a miss the end is not beyond the start."""
     box = at(grids.box, grid)
     moves = ray.d != 0
     inverse = 1 / jnp.where(moves, ray.d, 1)
@@ -187,25 +187,25 @@ def _ends(grids, grid, ray):
 
 
 def _at_planes(line, plane):
-    """Distances of planes, one of each axis; inf where there is none."""
+    """Return the distances of planes, one per axis; inf where there is none."""
     exists = (line.d != 0) & (plane >= 0) & (plane <= line.last)
     return jnp.where(exists, (plane - line.o) / jnp.where(line.d != 0, line.d, 1), jnp.inf)
 
 
 def _next(line, march):
     t = _at_planes(line, march.plane)
-    # Rounding may put a plane before where the ray is.
+    # Rounding may put a plane behind the position of the ray.
     return larger(smaller(smaller(t[0], t[1]), t[2]), march.t)
 
 
 def _between(grids, grid, line, t, length):
-    """The values at the corners around a part of a line between two planes, and cell coordinates of the lowest one."""
+    """Return the values at the corners around a part of a line between planes, and coordinates of the lowest corner."""
     low = _lowest(grids, grid, line.o + (t + length / 2) * line.d)
     return _corners_at(grids, grid, low), low.astype(line.o.dtype)
 
 
 def _integral(line, corners, low, t, length):
-    """Along a part of a line between two planes, by Gauss's quadrature of two points."""
+    """Integrate along a part of a line between two planes, by Gauss's quadrature with two points."""
     middle, off = t + length / 2, length / (2 * np.sqrt(3.0).astype(length.dtype))
 
     def value(x):
@@ -215,12 +215,12 @@ def _integral(line, corners, low, t, length):
 
 
 def _clipped(share, varies):
-    """Beyond the outermost centres nothing changes; along an axis of one cell neither."""
+    """Clip to the outermost centres, beyond which values are constant; 0 along axes that do not vary."""
     return jnp.where(varies, jnp.clip(share, 0, 1), 0)
 
 
 def _lowest(grids, grid, x):
-    """The lowest corner (3,) of the cell of eight centres around cell coordinates."""
+    """Return the lowest corner (3,) of the cube of eight centres around cell coordinates."""
     size = at(grids.size, grid)
     most = jnp.maximum(size - 2, 0)
     if grids.nearest is not None:
@@ -238,12 +238,12 @@ def _shares(grids, grid, x):
 
 
 def _corners_at(grids, grid, low):
-    """Values (C,) at eight centres."""
+    """Return the values (C,) at eight centres."""
     return [at(grids.values, place) for place in _places(grids, grid, low)]
 
 
 def _places(grids, grid, low):
-    """Of eight centres among all values; x is the lowest bit of the number."""
+    """Return the indices of eight centres among all values; x is the lowest bit of a centre's number."""
     size, first = at(grids.size, grid), at(grids.first, grid)
     high = jnp.minimum(low + 1, size - 1)
     found = []
@@ -261,7 +261,7 @@ def _interpolated(corners, share):
 
 
 def _channel(depth, channel):
-    """The depth () of a channel, of those of one channel for all, or of three."""
+    """Return the depth () of a channel; grids have one channel for all colours, or three."""
     if depth.shape[0] == 1:
         return depth[0]
     return jnp.where(channel == 0, depth[0], jnp.where(channel == 1, depth[1], depth[2]))

@@ -1,4 +1,4 @@
-"""Volumes whose values stand in a grid: what scene files and `.vol` files say of them."""
+"""Volumes with values in a grid, as in scene files and `.vol` files."""
 
 from __future__ import annotations
 
@@ -17,25 +17,25 @@ from pathjax.system.files import write_whole
 
 _HEADER = struct.Struct("<3sB5i6f")  # "VOL", version, encoding, x, y, z, channels, the corners of the box
 _VERSION, _FLOAT32 = 3, 1
-# Of a grid that repeats: 4 GB of colours in float32.
+# Largest size of a grid that repeats: 4 GB of colours in float32.
 MOST_CELLS = 4e9 / 12
 UNIT = np.array([[0.0] * 3, [1.0] * 3])
 
 
 @dataclass(frozen=True, eq=False)
 class GridVolume(Stored):
-    """Values at the centres of the cells of a box, and between them the trilinear interpolation, or none of it.
+    """Values at the centres of the cells of a box, trilinearly interpolated or not.
 
-    Beyond the outermost centres they stay the same.
+    They are constant beyond the outermost centres.
     """
 
     data: np.ndarray  # (Z, Y, X, C), C being 1 or 3
-    to_grid: np.ndarray  # (3, 4), from world space to where the centre of cell i lies at i; x, y, z
-    box: np.ndarray  # (2, 3) lower and upper corner in world space of the box around it, beyond which nothing is
-    wrap: str = "clamp"  # what is beyond the box for surfaces; of "repeat" see `repeated`, too
+    to_grid: np.ndarray  # (3, 4), from world space to cell coordinates x, y, z; the centre of cell i is at i
+    box: np.ndarray  # (2, 3) lower and upper corner of its bounding box in world space; nothing is outside
+    wrap: str = "clamp"  # how it continues beyond the box on surfaces; for "repeat" see also `repeated`
     nearest: bool = False  # each value fills its cell
     listed: bool = False  # its values are a parameter of the scene
-    box_of_file: np.ndarray = field(default_factory=lambda: UNIT)  # (2, 3), which a file of its values states
+    box_of_file: np.ndarray = field(default_factory=lambda: UNIT)  # (2, 3), to state in a file of its values
 
     unused: ClassVar[Mapping[str, Unused]] = {
         "accel": Unused("boolean"),
@@ -73,10 +73,10 @@ class GridVolume(Stored):
         write_vol(path, data, self.box_of_file)
 
     def repeated(self, box: np.ndarray) -> GridVolume:
-        """The same laid side by side, as far as a box (2, 3) in world space reaches.
+        """Return copies of the grid side by side that cover a box (2, 3) in world space.
 
         Raises:
-            InputError: that would be more than MOST_CELLS.
+            InputError: this takes more than MOST_CELLS.
         """
         corners = corners_of(box) @ self.to_grid[:, :3].T + self.to_grid[:, 3]
         low, high = np.floor(corners.min(0)).astype(int), np.ceil(corners.max(0)).astype(int)
@@ -88,13 +88,13 @@ class GridVolume(Stored):
 
 
 def boxed(value: np.ndarray, to_world: np.ndarray) -> GridVolume:
-    """One value (3,) in a unit cube that a (4, 4) places."""
+    """Return a volume of one value (3,) in the unit cube, placed by a (4, 4) matrix."""
     data = np.reshape(value, (1, 1, 1, 3))
     return GridVolume(data, *_placed(to_world, UNIT, (1, 1, 1)))
 
 
 def _placed(to_world: np.ndarray, box: np.ndarray, size: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """`to_grid` and `box` of a grid of cells x, y, z that fills a box of its own space."""
+    """Return `to_grid` and `box` of a grid of cells x, y, z that fills a box of its local space."""
     extent = box[1] - box[0]
     to_cells = np.diag([*(np.array(size) / extent), 1.0])
     to_cells[:3, 3] = -box[0] * np.array(size) / extent - 0.5
@@ -103,12 +103,12 @@ def _placed(to_world: np.ndarray, box: np.ndarray, size: tuple[int, ...]) -> tup
 
 
 def corners_of(box: np.ndarray) -> np.ndarray:
-    """(8, 3)."""
+    """Return the corners (8, 3)."""
     return np.stack(np.meshgrid(*box.T, indexing="ij"), -1).reshape(-1, 3)
 
 
 def read_vol(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Values (Z, Y, X, C) and the box (2, 3) of a file of Mitsuba's own format.
+    """Read values (Z, Y, X, C) and the box (2, 3) from a file in Mitsuba's own format.
 
     Raises:
         InputError: it cannot be read, is of another format, or is cut off.

@@ -1,4 +1,4 @@
-"""Media: what is the same everywhere, and what grids of volumes say otherwise of."""
+"""Media whose extinction and albedo are the same everywhere, or are grids."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ EVEN = Isotropic.instance("isotropic")
 
 
 class ConstVolume:
-    """What Mitsuba calls a volume of one value: the value."""
+    """Mitsuba's volume of one value, read as the value."""
 
     unused: ClassVar[Mapping[str, Unused]] = {"to_world": Unused("transform", "it is the same everywhere")}
 
@@ -26,13 +26,13 @@ class ConstVolume:
         return fields.color("value", at_most=high)
 
 
-# By the name that scene files give them.
+# Kinds by their names in scene files.
 VOLUMES = {"constvolume": ConstVolume, "gridvolume": GridVolume}
 
 
 @dataclass(frozen=True)
 class VolumeColor(Color):
-    """A colour; in files a volume may stand in its place."""
+    """A colour; files may give a volume instead."""
 
     textured: bool = False
     kinds: Mapping[str, type] = field(default_factory=lambda: VOLUMES)
@@ -45,7 +45,7 @@ class VolumeColor(Color):
 
 
 class BoxedVolume:
-    """A constant volume as what it is the same in: the unit cube, which `to_world` places."""
+    """A constant volume as a grid: the unit cube, which `to_world` places."""
 
     unused: ClassVar[Mapping[str, Unused]] = {}
 
@@ -56,7 +56,7 @@ class BoxedVolume:
 
 @dataclass(frozen=True)
 class BoxedColor(VolumeColor):
-    """A volume that ends with its box; a colour fills the unit cube, as in Mitsuba."""
+    """A volume bounded by its box; a colour fills the unit cube, as in Mitsuba."""
 
     kinds: Mapping[str, type] = field(default_factory=lambda: VOLUMES | {"constvolume": BoxedVolume})
 
@@ -66,13 +66,13 @@ class BoxedColor(VolumeColor):
 
 
 class Homogeneous(Kind):
-    """Absorbs alike in all places and directions, and scatters what `albedo` says, which may be a grid.
+    """A medium with the same extinction in all places and directions. Its `albedo` may be a grid.
 
-    sigma_t times `scale` is the extinction: how much of the light each unit of length takes out of a ray. The share
-    `albedo` of it is scattered, the rest absorbed. It emits nothing. Distances are drawn by the extinction, detached,
-    and all its colours are parameters, of which weights carry the derivatives.
+    sigma_t times `scale` is the extinction, which a ray loses of its light per unit of length. The share `albedo` of it
+    is scattered, the rest absorbed. The medium emits nothing. Distances are drawn by the extinction, detached. All its
+    colours are parameters, whose derivatives the weights carry.
 
-    An `Instance` holds the phase function under "phase".
+    The values of an `Instance` have the phase function under "phase".
     """
 
     sigma_t = VolumeColor(1.0, bounds=(0, math.inf), kinds={"constvolume": ConstVolume})
@@ -98,11 +98,11 @@ class Homogeneous(Kind):
 
     @staticmethod
     def scattering(made: Instance, phase: Instance) -> Instance:
-        """The medium with a phase function."""
+        """Return the medium with a phase function."""
         return Instance(made.kind, made.name, {**made.values, "phase": phase})
 
 
 class Heterogeneous(Homogeneous):
-    """A medium whose extinction is that of a volume, beyond whose box there is nothing."""
+    """A medium whose extinction is a volume, and 0 outside of the box of the volume."""
 
     sigma_t = BoxedColor(1.0, bounds=(0, math.inf))

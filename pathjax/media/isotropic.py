@@ -11,7 +11,7 @@ from pathjax.media.phase import Phase
 
 
 class Isotropic(Phase):
-    """Scatters evenly."""
+    """Scatters uniformly over all directions."""
 
     @staticmethod
     def evaluate(p: Row, wo: Float[Array, "3"]) -> Float[Array, ""]:

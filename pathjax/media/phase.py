@@ -1,4 +1,4 @@
-"""What a phase function is."""
+"""The interface of phase functions."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from pathjax.kinds import Kind, Row
 
 
 class Phase(Kind):
-    """A kind of phase function: in what directions a medium scatters, as a density that integrates to 1.
+    """A kind of phase function: the density, with integral 1, of the directions into which a medium scatters.
 
-    Directions are unit and local: z points to where light, followed backwards, came from, so what goes straight on has
-    wo.z = -1. It is sampled by its own density, so that samples weigh 1 but for their derivatives.
+    Directions are unit and local: z points to the previous vertex of the path, so wo.z = -1 is straight on. Samples are
+    drawn by this density, so that their weights are 1 in value, but carry derivatives.
     """
 
     @staticmethod
     @abstractmethod
     def evaluate(p: Row, wo: Float[Array, "3"]) -> Float[Array, ""]:
-        """Density [1/sr]; differentiable in the parameters."""
+        """Return the density [1/sr], differentiable in the parameters."""
 
     @staticmethod
     @abstractmethod
     def sample(p: Row, u: Float[Array, "2"]) -> Float[Array, "3"]:
-        """Draw `wo`, detached. u: uniform in [0, 1)."""
+        """Sample `wo`, detached. u: uniform in [0, 1)."""

@@ -1,4 +1,4 @@
-"""How particles much smaller than the wavelength scatter (Rayleigh 1871; drawn after Frisvad 2011, JOSA A 28(12))."""
+"""Scattering by particles much smaller than the wavelength (Rayleigh 1871; sampling: Frisvad 2011, JOSA A 28(12))."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pathjax.media.phase import Phase
 
 
 class Rayleigh(Phase):
-    """Forwards and backwards alike, and half as much to the sides."""
+    """Scatters equally forwards and backwards, and half as much to the sides."""
 
     @staticmethod
     def evaluate(p: Row, wo: Float[Array, "3"]) -> Float[Array, ""]:
@@ -21,7 +21,7 @@ class Rayleigh(Phase):
 
     @staticmethod
     def sample(p: Row, u: Float[Array, "2"]) -> Float[Array, "3"]:
-        """The cosine c has the distribution (4 + 3 c + c^3) / 8, of which Cardano's formula gives the inverse."""
+        """Invert the distribution (4 + 3 c + c^3) / 8 of the cosine c by Cardano's formula."""
         a = 4 * u[1] - 2
         root = jnp.cbrt(jnp.abs(a) + jnp.sqrt(a * a + 1))
         z = jnp.copysign(root - 1 / root, a)

@@ -1,4 +1,4 @@
-"""The phase function that a table states, as measurements and Mie's theory give it."""
+"""Tabulated phase functions, for example from measurements or Mie theory."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from pathjax.media.phase import Phase
 
 
 class TabPhase(Phase):
-    """Values at cosines from -1 (backwards) to 1 (straight on) of equal distance, and straight lines between these.
+    """Values at equidistant cosines from -1 (backwards) to 1 (straight on), with linear interpolation.
 
-    An `Instance` holds `values` (N,), N >= 2, whose scale is of no effect.
+    An `Instance` holds `values` (N,), N >= 2, whose scale has no effect.
     """
 
-    values = Shared(by_number=True)  # of one row after the other, as densities of the cosine
-    before = Shared(by_number=True)  # the share of light that scatters by smaller cosines
-    first = PerRow()  # () int32 where a row begins
-    parts = PerRow()  # () int32 how many lines
-    most = Setting("")  # of these in any row
+    values = Shared(by_number=True)  # all rows one after another, as densities of the cosine
+    before = Shared(by_number=True)  # cumulative: the share of light that scatters at smaller cosines
+    first = PerRow()  # () int32 index of the first value of a row
+    parts = PerRow()  # () int32 number of linear parts
+    most = Setting("")  # largest number of parts in any row
 
     @classmethod
     def read(cls, loader, fields, name):
@@ -61,7 +61,7 @@ class TabPhase(Phase):
 
     @staticmethod
     def sample(p: Row, u: Float[Array, "2"]) -> Float[Array, "3"]:
-        """A line by its share; on it x has the share (low x + (high - low) x^2 / 2) / ((low + high) / 2)."""
+        """Choose a part by its share; x in it is distributed as (low x + (high - low) x^2 / 2) / ((low + high) / 2)."""
         part, u_part = search(p.before, p.first, p.parts, u[1], int(p.most))
         low, high = (lax.stop_gradient(at(p.values, p.first + part + k)) for k in (0, 1))
         x = safe_divide(u_part * (low + high), low + safe_sqrt(low * low + u_part * (high * high - low * low)))
