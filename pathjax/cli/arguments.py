@@ -15,12 +15,12 @@ def parser() -> argparse.ArgumentParser:
     render = subparsers.add_parser("render", help="render a scene to an image")
     _add_scene(render)
     render.add_argument("-o", "--output", required=True, metavar="OUT.{exr,png}")
-    spp = "most samples per pixel; default: the file's, if neither --error nor --time is given"
+    spp = "maximal samples per pixel; default: the file's, if neither --error nor --time is given"
     render.add_argument("--spp", type=_positive, metavar="N", help=spp)
     error = "stop when the error, relative to the image's own level, is this low: 0.02 is 2 %%"
     render.add_argument("--error", type=_real, metavar="E", help=error)
     render.add_argument("--time", type=_real, metavar="SECONDS", help="stop after this many seconds of rendering")
-    checkpoint = "save the state in this file, and go on from it when called again"
+    checkpoint = "save the state in this file, and continue from it when called again"
     render.add_argument("--checkpoint", metavar="FILE.npz", help=checkpoint)
     kinds, aov = "{error,depth,normal,albedo,bounces}", "more channels of the EXR file, separated by commas"
     render.add_argument("--aov", type=_comma_separated(str), default=[], metavar=kinds, help=aov)
@@ -32,7 +32,7 @@ def parser() -> argparse.ArgumentParser:
     batch = subparsers.add_parser("batch", help="render many scenes, which share kernels")
     batch.add_argument("jobs", metavar="JOBS.jsonl", help="a JSON object a line: see `pathjax help batch`")
     batch.add_argument("-o", "--output", required=True, metavar="DIR", help="the folder of the images")
-    part = "every N-th job alone, from the I-th on, counted from 0: so that N processes share the work"
+    part = "render only every N-th job, from the I-th on, counted from 0, so that N processes share the work"
     batch.add_argument("--part", type=_part, default=(0, 1), metavar="I/N", help=part)
     batch.add_argument("--json", action="store_true", help="print one JSON object on stdout")
 
@@ -41,13 +41,13 @@ def parser() -> argparse.ArgumentParser:
     fit.add_argument("target", metavar="TARGET.{exr,png}")
     param = "a parameter to recover; may be repeated"
     fit.add_argument("--param", dest="params", action="append", required=True, metavar="NAME[=START]", help=param)
-    fit.add_argument("--spp", type=_positive, default=128, metavar="N", help="of each of the last two renders")
-    smooth = "how much neighbouring texels of textures are expected to differ; auto: found out"
+    fit.add_argument("--spp", type=_positive, default=128, metavar="N", help="of each of the two final renders")
+    smooth = "how much neighbouring texels are expected to differ; auto: estimated from the images"
     fit.add_argument("--smoothness", type=_smoothness, metavar="S|auto", help=smooth)
     prior = "laplacian: they differ alike everywhere; total variation: few differ much, as at edges"
     fit.add_argument("--prior", default="laplacian", metavar="KIND", help=prior)
     fit.add_argument("--seed", type=_seed, default=0, metavar="K")
-    wrote = "writes PREFIX.json and PREFIX.png; of a texture also PREFIX.NAME.exr and the scene, PREFIX.xml"
+    wrote = "write PREFIX.json and PREFIX.png; for a texture also PREFIX.NAME.exr and the scene, PREFIX.xml"
     fit.add_argument("-o", "--output", default="fit", metavar="PREFIX", help=wrote)
     fit.add_argument("--json", action="store_true", help="print one JSON object on stdout")
     _add_processes(fit)
@@ -60,32 +60,33 @@ def parser() -> argparse.ArgumentParser:
 
     convert = subparsers.add_parser("convert", help="write a scene, or glTF or a mesh, as a scene file of Mitsuba")
     _add_scene(convert)
-    convert.add_argument("output", metavar="OUT.xml", help="textures and meshes that it needs are written beside it")
+    convert.add_argument("output", metavar="OUT.xml", help="its textures and meshes are written beside it")
     convert.add_argument("--json", action="store_true", help="print one JSON object on stdout")
 
     bench = subparsers.add_parser("bench", help="speed against error")
-    bench.add_argument("scenes", nargs="*", metavar="SCENE.xml", help="none: twelve, and one number for all of them")
+    bench.add_argument("scenes", nargs="*", metavar="SCENE.xml", help="default: twelve scenes, with one summary number")
     bench.add_argument("-D", dest="defines", action="append", default=[], type=_pair, metavar="name=value")
     bench.add_argument("--against", choices=("mitsuba",), help="measure this peer in the same run")
-    spp = "default: 16,64,256; of the twelve 64"
+    spp = "default: 16,64,256; 64 for the twelve"
     bench.add_argument("--spp", type=_comma_separated(_positive), metavar="16,64,256", help=spp)
-    reference = "of the converged reference; default: 16384, of the twelve 2048"
+    reference = "of the converged reference; default: 16384, or 2048 for the twelve"
     bench.add_argument("--reference-spp", type=_positive, metavar="N", help=reference)
     bench.add_argument("--repeat", type=_positive, default=5, metavar="N", help="timed runs of each; medians are shown")
     bench.add_argument("-o", "--output", metavar="DIR", help="also write bench.md, bench.json and plots to this folder")
-    bench.add_argument("--quick", action="store_true", help="speed against error alone; the twelve always are")
-    bunny = "a mesh, upright along y, for the box of the twelve that has a made one else"
+    bench.add_argument("--quick", action="store_true", help="measure speed against error alone, as for the twelve")
+    bunny = "a mesh, upright along y, to replace the generated one in a scene of the twelve"
     bench.add_argument("--bunny", metavar="MESH.ply", help=bunny)
-    bench.add_argument("--resume", action="store_true", help="go on after the scenes in DIR/bench.json")
+    bench.add_argument("--resume", action="store_true", help="continue after the scenes in DIR/bench.json")
     bench.add_argument("--json", action="store_true", help="print one JSON object on stdout")
     _add_processes(bench)
 
     compare = subparsers.add_parser(
         "compare",
         help="how an image differs from a reference",
-        description="Of image A against reference B, in linear light: MSE; relMSE = mean((A - B)^2 / (B^2 + 0.01)); "
-        "error, which `render --error` aims at: sqrt(relMSE) if images are exposed so that B has the level 1; PSNR, "
-        "whose peak is B's maximum; HDR-FLIP. Unless both are OpenEXR or Radiance HDR, the peak is 1; LDR-FLIP.",
+        description="Compare image A with reference B in linear light: MSE; relMSE = mean((A - B)^2 / (B^2 + 0.01)); "
+        "the error of `render --error`, which is sqrt(relMSE) if images are exposed so that B has the level 1; PSNR, "
+        "whose peak is B's maximum; HDR-FLIP. Unless both are OpenEXR or Radiance HDR, the peak is 1 and FLIP is "
+        "LDR-FLIP.",
         epilog="Exit status: 0 the images agree, or no limit was set; 1 they differ: a measure is above its "
         "limit, or with --errors p is below ALPHA; 2 the command or a file is wrong.",
     )
@@ -94,10 +95,10 @@ def parser() -> argparse.ArgumentParser:
     compare.add_argument(
         "--errors",
         action="store_true",
-        help="weigh differences by the standard errors in channels error.R, error.G, error.B of one or both; where "
-        "only one holds them the other is taken as exact",
+        help="weight differences by the standard errors in channels error.R, error.G, error.B of one or both; if only "
+        "one has them, the other is taken as exact",
     )
-    alpha = "with --errors: the chance that equal scenes are said to differ; default: 0.001"
+    alpha = "with --errors: the false-alarm rate; default: 0.001"
     compare.add_argument("--alpha", type=_chance, default=1e-3, help=alpha)
     compare.add_argument("--max-relmse", type=_limit, metavar="X", help="differ where relMSE is above")
     error = "differ where the error is above"
@@ -114,8 +115,9 @@ def parser() -> argparse.ArgumentParser:
 
 def _add_scene(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("scene", metavar="SCENE.xml", help="or glTF, or a mesh: .glb, .gltf, .obj, .ply, .stl")
+    define = "replace a $name of the file"
     parser.add_argument(
-        "-D", dest="defines", action="append", default=[], type=_pair, metavar="name=value", help="a $name of the file"
+        "-D", dest="defines", action="append", default=[], type=_pair, metavar="name=value", help=define
     )
     parser.add_argument(
         "--set", dest="settings", action="append", default=[], type=_pair, metavar="NAME=VALUE", help="set a parameter"
@@ -136,10 +138,10 @@ def _pair(text: str) -> tuple[str, str]:
 
 
 def _add_processes(parser: argparse.ArgumentParser) -> None:
-    coordinator = "address of the first of several processes that share the work, or auto, where JAX finds the cluster"
+    coordinator = "address of the first of several processes that share the work, or auto: find the cluster as JAX does"
     parser.add_argument("--coordinator", metavar="HOST:PORT", help=coordinator)
-    parser.add_argument("--processes", type=_positive, metavar="N", help="how many there are")
-    parser.add_argument("--process", type=_seed, metavar="I", help="which of them this is, from 0")
+    parser.add_argument("--processes", type=_positive, metavar="N", help="number of processes")
+    parser.add_argument("--process", type=_seed, metavar="I", help="index of this process, from 0")
 
 
 def _part(text: str) -> tuple[int, int]:
