@@ -1,1 +1,1 @@
-"""Derivatives of images in what materials and lights are made of."""
+"""Derivatives of images with respect to the parameters of materials, lights and media."""

@@ -1,12 +1,12 @@
-"""J^T v, and J in many numbers, at the price of about one image, whatever the number of parameters: a recorded sweep.
+"""J^T v, and J in many scalars, by a recorded sweep: about the cost of one image, whatever the number of parameters.
 
-A path's derivative has entries at the parameters of the vertices that it meets, and nowhere else. So each vertex is
-recorded as it is met (`record`, which has the equations), and when the path has ended its vertices are gone through
-again, the last one first. Times the adjoint of the pixel these are added to a list of derivatives, at the entries that
-the vertex looked up (`places`, `totals`): one list for all pixels, or, without an adjoint, one for each.
+A path's derivative has entries at the parameters of its vertices, and nowhere else. So each vertex is recorded
+(`record`, which has the equations), and when the path has ended, its vertices are swept in reverse order. Their
+derivatives, times the adjoint of the pixel, are added to a list of derivatives at the entries that the vertex looked up
+(`places`, `totals`): one list for all pixels or, without an adjoint, one for each.
 
 All lanes record at once, in one row of a ring of buffers, and are swept at once, every WINDOW trips: back from the last
-end of a path that they have recorded to the first vertex of a path that was swept before.
+path end that they have recorded to the first vertex of the oldest path that is not swept yet.
 """
 
 from __future__ import annotations
@@ -39,17 +39,17 @@ from pathjax.integrators.random_numbers import bounce_numbers
 from pathjax.integrators.reconstruction import images, pulled
 from pathjax.scene.scene import Scene
 
-# Trips between two sweeps, and those that the ring holds: powers of 2. Where the longest path is not known when a
-# kernel is made, it is RING; a path of more than the difference is not recorded whole then, and makes derivatives NaN.
+# Trips between two sweeps; trips that the ring holds where the longest path is unknown when a kernel is traced; and at
+# most. Powers of 2. In the second case a path of more than RING - WINDOW vertices is lost, and derivatives become NaN.
 WINDOW, RING, MOST_RING = 32, 1024, 1 << 14
-# Of paths that roulette may end, so many vertices later one in 1e20 is left.
+# Of the paths that roulette may end, one in 1e20 is still alive after this many vertices.
 ROULETTE = 900
-# Bits of what a lane records.
+# Bits of a lane's record.
 BEGINS, ENDS, HOLDS = 1, 2, 4
 
 
 def columns_of(record: Record) -> list:
-    """Its numbers, one after another, the two flags in one."""
+    """Return the scalars of a record, one after another, the two flags first, in one integer."""
     bits = jnp.where(record.begins, BEGINS, 0) | jnp.where(record.ends, ENDS, 0)
     numbers = [x for leaf in jax.tree.leaves(record._replace(begins=None, ends=None)) for x in jnp.ravel(leaf)]
     return [bits, *numbers]
@@ -63,29 +63,31 @@ class Memory(NamedTuple):
     clock: Int[Array, ""]  # trips
     swept: Int[Array, ""]  # trips before the last sweep
     lost: Int[Array, ""]  # 1: a path was longer than the ring
-    size: Int[Array, ""]  # trips that are used of the ring: few stay in near caches
-    ring: list  # (trips, numbers, W) of each type: the numbers of Records; few arrays, as loops pay for each they carry
+    size: Int[Array, ""]  # trips of the ring that are used: a short ring stays in near caches
+    ring: list  # (trips, scalars, W) of Records, one per dtype: loops pay for each array that they carry
 
 
 class Sweep(NamedTuple):
-    """What goes back through the ring, of each lane."""
+    """State of the backward sweep, per lane."""
 
     back: Int[Array, ""]  # trips so far
     goes_on: Bool[Array, ""]
-    complete: Int[Array, " W"]  # 1: has met the end of a path, so that it knows what arrives
-    stopped: Int[Array, " W"]  # 1: all that is older has been swept before
-    R: list[Float[Array, " W"]]
+    complete: Int[Array, " W"]  # 1: has met the end of a path, so that R is known
+    stopped: Int[Array, " W"]  # 1: all older vertices have been swept before
+    R: list[Float[Array, " W"]]  # as in `record`
     total: Total
 
 
 def start(scene: Scene, record: Record, entries: int, ring: int, lanes: int) -> Memory:
-    """Before the first pixel.
+    """Return the memory before the first pixel.
 
     Args:
-        record: of shapes and dtypes.
-        ring: trips that it holds.
+        record: a record of shapes and dtypes.
+        entries: of the total.
+        ring: trips that the ring holds.
+        lanes: their number.
     Raises:
-        InputError: too many.
+        InputError: paths may have more vertices than the ring can hold.
     """
     if ring > MOST_RING:
         raise InputError(
@@ -93,7 +95,7 @@ def start(scene: Scene, record: Record, entries: int, ring: int, lanes: int) -> 
             "for derivatives in many numbers; set a smaller max_depth or rr_depth"
         )
     total = totals.start(entries, lanes, scene.camera.origin.dtype)
-    # No trip is read that was not written. On CPUs it is filled with zeros all the same, so it had better be short.
+    # No trip is read before it is written. On CPUs the ring is filled with zeros all the same, so it should be short.
     types = [x.dtype for x in jax.eval_shape(columns_of, record)]
     buffers = [lax.empty((ring, types.count(dtype), lanes), dtype) for dtype in dict.fromkeys(types)]
     zero = jnp.int32(0)
@@ -101,7 +103,7 @@ def start(scene: Scene, record: Record, entries: int, ring: int, lanes: int) -> 
 
 
 def longest_ring(scene: Scene) -> int:
-    """Trips of a ring that holds the scene's longest path and a window; RING, where max_depth is not known yet."""
+    """Trips of a ring that holds the scene's longest path and a window; RING where max_depth or rr_depth is traced."""
     depths = scene.max_depth, scene.rr_depth
     if any(map(is_traced, depths)):
         return RING
@@ -113,13 +115,13 @@ def longest_ring(scene: Scene) -> int:
 
 
 def _passes(scene: Scene) -> bool:
-    """Whether paths meet what does not count into their depth, but has records too."""
+    """Return whether a path may record vertices that do not count towards its depth."""
     passes = scene.media is not None or bsdfs.occurs(scene.materials, "passes")
     return bool(passes or scene.free_passes or scene.hide_emitters)
 
 
 def ring_size(scene: Scene, ring: int) -> Int[Array, ""]:
-    """Power of 2 that holds the longest path and a window, as far as that is known; the ring's at most."""
+    """Return the power of 2 that holds the longest path and a window; `ring` if that is unknown or less."""
     if _passes(scene):
         return jnp.int32(ring)
     sizes = [1 << k for k in range(ring.bit_length())]
@@ -128,9 +130,9 @@ def ring_size(scene: Scene, ring: int) -> Int[Array, ""]:
 
 
 def remember(structure: Record, memory: Memory, here: Bool[Array, " W"], columns: list) -> Memory:
-    """Record a vertex of every lane; now and then, sweep."""
+    """Record one vertex per lane; sweep every WINDOW trips."""
     bits, *numbers = columns
-    # A lane without an item records nothing that is whole.
+    # A lane without an item records an empty path: one that begins and ends here and holds no vertex.
     columns = [jnp.where(here, bits | HOLDS, BEGINS | ENDS), *numbers]
     ring = _with_row(memory.ring, memory.clock & (memory.size - 1), columns)
     memory = memory._replace(clock=memory.clock + 1, ring=ring)
@@ -138,7 +140,7 @@ def remember(structure: Record, memory: Memory, here: Bool[Array, " W"], columns
 
 
 def _with_row(ring: list, row: Int[Array, ""], columns: list) -> list:
-    """The ring with a trip's columns at a row, those of a type one after another."""
+    """Return the ring with a trip's columns written to a row, in order within each dtype."""
     new = []
     for buffer in ring:
         for k, x in enumerate([x for x in columns if x.dtype == buffer.dtype]):
@@ -149,7 +151,7 @@ def _with_row(ring: list, row: Int[Array, ""], columns: list) -> list:
 
 
 def _row(ring: list, row: Int[Array, ""], types: list) -> list:
-    """What `_with_row` put there, of columns of these types."""
+    """Return the columns that `_with_row` wrote to a row. types: dtype of each."""
     following = {}
     for buffer in ring:
         columns = lax.dynamic_index_in_dim(buffer, row, keepdims=False, allow_negative_indices=False)
@@ -158,7 +160,7 @@ def _row(ring: list, row: Int[Array, ""], types: list) -> list:
 
 
 def sweep(structure: Record, memory: Memory, due: Bool[Array, ""]) -> Memory:
-    """Add what all paths give that have ended since the last sweep, if it is due."""
+    """Add the derivatives of all paths that have ended since the last sweep, if `due`."""
     window = jnp.where(due, memory.clock - memory.swept, 0)
     types = [x.dtype for x in jax.eval_shape(columns_of, structure)]
 
@@ -168,7 +170,7 @@ def sweep(structure: Record, memory: Memory, due: Bool[Array, ""]) -> Memory:
         begins, ends, holds = (bits & bit != 0 for bit in (BEGINS, ENDS, HOLDS))
         complete = (state.complete != 0) | ends
         here = complete & (state.stopped == 0) & holds
-        # What is not finite in one path stays out of the one before.
+        # A non-finite value of one path must not reach the path before it.
         R = [jnp.where(ends, 0, x) for x in state.R]
         total = state.total
         for slot in record.slots:
@@ -188,13 +190,13 @@ def sweep(structure: Record, memory: Memory, due: Bool[Array, ""]) -> Memory:
     zeros = [jnp.zeros(nothing.shape, structure.weight.dtype)] * 3
     first = Sweep(jnp.int32(0), window > 0, nothing, nothing, zeros, memory.total)
     last = lax.while_loop(lambda state: state.goes_on, step, first)
-    # At the end there may be nothing left to sweep.
+    # In the last sweep the window may be empty.
     lost = memory.lost | jnp.where((window > 0) & ~all_set(last.stopped != 0), 1, 0)
     return memory._replace(total=last.total, swept=jnp.where(due, memory.clock, memory.swept), lost=lost)
 
 
 def unflattened(structure: Record, numbers: list) -> Record:
-    """The Record whose numbers these are, each vector as a list."""
+    """Return the Record that has these scalars, each vector as a list."""
     following = iter(numbers)
 
     def taken(leaf):
@@ -223,9 +225,11 @@ def pixel_sweep(
     paths: differentiated.Paths,
     structure: Record,
 ) -> tuple[Float[Array, "3"], Memory]:
-    """Add what the samples of a pixel give, and their mean.
+    """Add the derivatives of a pixel's samples to the memory; return the samples' mean, and the memory.
 
-    scale: of the derivatives of the mean; of_slot: Slots of the list of entries as those of the total.
+    Args:
+        scale: factor of the derivatives of the mean.
+        of_slot: Slot with places in the list of entries -> Slot with places in the total.
     """
     pixel_number, first_sample, spp, seed = work
     stream = sampler.pixel_stream(seed, pixel_number)
@@ -255,21 +259,21 @@ def pixel_sweep(
 def finish(structure: Record, memory: Memory) -> Float[Array, "entries 4"]:
     memory = sweep(structure, memory, jnp.bool_(True))
     total = totals.finish(memory.total)
-    # A loop of no trip, where a choice would copy what may be most of the memory.
+    # A loop of 0 or 1 trips: a `cond` would copy the total, which may be most of the memory.
     return lax.fori_loop(0, memory.lost, lambda _, total: jnp.full_like(total, jnp.nan), total)
 
 
 class _Kernel(NamedTuple):
-    """What kernels of some arrays have in common."""
+    """What `pullback` and `rows` share."""
 
     scene: Scene
     choice: Choice | None
-    structure: Record  # of shapes and dtypes
+    structure: Record  # shapes and dtypes
     of_pixel: Callable  # `pixel_sweep`
 
 
 def _kernel(scene: Scene, kept: Kept, options: Options, of_slot: Callable = lambda slot: slot) -> _Kernel:
-    """of_slot: what becomes of a Slot, whatever its places are."""
+    """Prepare `pullback` or `rows`. of_slot: how they change Slots, apart from their places."""
     scene = options.applied(scene)
     choice = emitters.choice(scene.emitters, options.strategy)
     paths, slots = kept.paths, differentiated.slots(scene, kept.paths, kept.fields)
@@ -286,12 +290,12 @@ def _kernel(scene: Scene, kept: Kept, options: Options, of_slot: Callable = lamb
 
 
 def moved(place_of: Callable, slot: Slot) -> Slot:
-    """The Slot whose places are those of the total. place_of: from the list of entries to the total."""
+    """Return the Slot with places in the total. place_of: place in the list of entries -> place in the total."""
     return replace(slot, places=tuple(map(place_of, slot.places)))
 
 
 def in_numbers(slot: Slot) -> Slot:
-    """What adds to the derivatives in the number itself where it may be the luminance of a texture."""
+    """Return the Slot that adds to derivatives in the scalar itself, where that may be the luminance of a texture."""
     if not slot.by_luminance:
         return slot
     shares = slot.shares and tuple(luminance(share) if share.ndim else share for share in slot.shares)
@@ -313,15 +317,15 @@ def pullback(
     form=None,
     devices=None,
 ) -> Float[Array, "entries 4"]:
-    """J^T adjoint: of the entries that are kept; of a number, the sum of the first three is its own. The last is none.
+    """Return J^T adjoint for the kept entries: 3 columns, whose sum is the derivative in a scalar, and one unused.
 
     Args:
         scene: without names.
         adjoint: (N, 3) of the means of the pixels.
         pixels, first_sample, spp, seed: (N,) each, as for `map_pixels`.
-        kept: of arrays that `differentiated` knows.
-        ring: of `longest_ring`.
-        form, devices: of `native_fold`.
+        kept: entries of arrays in `differentiated.paths`.
+        ring: as returned by `longest_ring`.
+        form, devices: as for `native_fold`.
     """
     scene, choice, structure, sweep_of = _kernel(scene, kept, options)
 
@@ -345,10 +349,10 @@ def pullback(
 def rows(
     scene: Scene, pixels, first_sample, spp, seed, *, kept: Kept, options: Options, ring, form=None, devices=None
 ) -> tuple[Float[Array, "N 3"], Rows]:
-    """Means of pixels, and derivatives of each channel in the same channel of each colour that is kept, or in a number.
+    """Return the means of pixels, and derivatives of each channel in the same channel of kept colours, or in scalars.
 
-    A texture of colours that stands for a number has derivatives in the number, so it stands nowhere for colours.
-    Arguments as for `pullback`, and work as for `map_pixels`. A row is (N, 4), and the last number is none.
+    A colour texture that is used as a scalar has derivatives in that scalar, so it must not be used as a colour too.
+    Arguments as for `pullback`, work as for `map_pixels`. A row is (N, 4), whose last column is unused.
     """
     scene, choice, structure, sweep_of = _kernel(scene, kept, options, in_numbers)
 

@@ -1,9 +1,9 @@
-"""What is differentiated: the arrays, the one list that their entries stand in, and the numbers that a vertex looks up.
+"""What is differentiated: the arrays, the one list of their entries, and the slots of a vertex.
 
-The list holds the entries of all arrays that are differentiated, one array after another: the row of a constant, a
-texel. A vertex of a path looks up a few numbers, each of one entry, or the sum of some (of four texels, say). A slot is
-one such number: the first colour that a bsdf looks up, or the second, or the first number, whatever the kind of the
-bsdf is.
+The list holds the entries of all differentiated arrays, one array after another. An entry is a constant's row or a
+texel. A vertex of a path looks up a few values, each of which is one entry or the weighted sum of several (of four
+texels, say). A slot is one such value: the first colour that a bsdf looks up, or the second, or the first scalar,
+whatever the kind of the bsdf.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from pathjax.media import Nudges
 from pathjax.scene import parameters as named
 from pathjax.scene.scene import Scene
 
-# Of the arrays that are differentiated, where they are in the scene.
+# Paths in the scene to the differentiated arrays.
 Paths = tuple[tuple, ...]
-# What kinds call the parameters in whose places textures stand that are differentiated; None: it may be any.
+# Fields of bsdfs and lights in which differentiated textures stand; None: possibly all.
 Fields = frozenset[str] | None
-# By slot, the column that is looked up; None: none.
+# The column that each slot looks up; None: none.
 Columns = tuple[int | None, ...]
 
-# Values of grids of media -> where they count: see `media.Nudges`.
+# Values of grids of media -> the fields of `media.Nudges` that nudge them.
 GRIDS = {
     ("media", "extinctions", "values"): ("extinction", "depth", "shadow"),
     ("media", "albedos", "values"): ("albedo",),
@@ -40,18 +40,18 @@ BSDFS, WRAPPERS, TEXTURES = (("materials", each) for each in ("tables", "wrapper
 
 @dataclass(frozen=True)
 class Slots:
-    """What is differentiated, by slot; of bsdfs those of colours come before those of numbers."""
+    """What each slot looks up. Slots of bsdfs for colours come before those for scalars."""
 
-    bsdfs: tuple[Columns, ...]  # by table
-    lights: tuple[Columns, ...]  # by table; none of backgrounds
-    backgrounds: tuple[tuple[int, int, int], ...]  # table, row, column: of all at once, as all are met at once
-    colors: int  # of the slots of bsdfs
-    wrappers: tuple[Columns, ...]  # by table of bsdfs that hold others
-    choices: tuple[tuple[int, int, int], ...]  # of `tree.steps`: the step, its wrapper, and which of its columns
-    on_the_way: int  # wrappers that `tree.on_the_way` tells; each has a slot for each column
-    by_luminance: bool  # whether a texture may be looked up as one of the numbers of bsdfs, by its luminance
-    corners: bool  # whether what meshes carry is differentiated
-    grids: tuple[str, ...]  # of `media.Nudges`: what is nudged of media
+    bsdfs: tuple[Columns, ...]  # per table
+    lights: tuple[Columns, ...]  # per table; empty for backgrounds
+    backgrounds: tuple[tuple[int, int, int], ...]  # (table, row, column) of all: a ray that escapes meets all of them
+    colors: int  # number of slots of bsdfs that are colours
+    wrappers: tuple[Columns, ...]  # per table of bsdfs that hold others
+    choices: tuple[tuple[int, int, int], ...]  # (index in `tree.steps`, wrapper there, index of the wrapper's column)
+    on_the_way: int  # nodes that `tree.on_the_way` returns; each has a slot per column
+    by_luminance: bool  # whether a bsdf may look up a texture as a scalar, by its luminance
+    corners: bool  # whether mesh attributes are differentiated
+    grids: tuple[str, ...]  # differentiated fields of `media.Nudges`
 
     @property
     def of_bsdfs(self) -> int:
@@ -70,7 +70,7 @@ class Slots:
         return max([len(self.backgrounds), *map(len, self.lights)])
 
     def numbered(self) -> list[range]:
-        """Slots of bsdfs, lights, choices among bsdfs, what is passed and grids, counted through all of these."""
+        """Index ranges of the slots of bsdfs, lights, choices among bsdfs, passed surfaces and grids, in one count."""
         counts = self.of_bsdfs, self.of_lights, self.of_choices, self.of_passed, len(self.grids)
         return [range(*each) for each in pairwise(accumulate(counts, initial=0))]
 
@@ -79,13 +79,13 @@ class Slots:
 
 
 def tables_of_textures(scene: Scene, path: tuple) -> list[tuple]:
-    """Paths of the tables of the textures that are at a path."""
+    """Return the paths of the tables of the textures at a path."""
     textures = named.get(scene, path)
     return [(*path, "tables", i) for i in range(len(textures.tables))] if textures else []
 
 
 def paths(scene: Scene) -> set[tuple]:
-    """Paths of all arrays that may be differentiated: not those of textures and backgrounds that tell no entries."""
+    """Return the paths of all arrays that can be differentiated: not those read by kinds that lack `entries`."""
     tables = [(*BSDFS, i) for i in range(len(scene.materials.tables))] + [(*WRAPPERS, i) for i in _choosing(scene)]
     covers = tables_of_textures(scene, TEXTURES)
     for i in range(len(scene.emitters)):
@@ -104,18 +104,18 @@ def paths(scene: Scene) -> set[tuple]:
 
 
 def _choosing(scene: Scene) -> list[int]:
-    """Wrappers whose parameters decide what is chosen."""
+    """Return the wrappers whose parameters affect the choice among the bsdfs that they hold."""
     return [i for i, table in enumerate(scene.materials.wrappers) if table.kind.chooses]
 
 
 def _columns(scene: Scene, table: tuple) -> dict[tuple, int]:
-    """Paths to the values of the columns of a table -> place of the column."""
+    """Return, for the columns of a table, path to the values -> index of the column."""
     columns = named.get(scene, table).columns
     return {(*table, "columns", i, "values"): i for i, column in enumerate(columns) if column is not None}
 
 
 def in_textures(scene: Scene, paths: Iterable[tuple], of_textures: tuple) -> dict[tuple[int, int | str], tuple]:
-    """The arrays that textures look up: by table, and column or name of what meshes carry."""
+    """Return the paths of the arrays that textures look up, by (table, column or name of a mesh attribute)."""
     found: dict[tuple[int, int | str], tuple] = {}
     for number, path in enumerate(tables_of_textures(scene, of_textures)):
         table = named.get(scene, path)
@@ -126,7 +126,7 @@ def in_textures(scene: Scene, paths: Iterable[tuple], of_textures: tuple) -> dic
 
 
 def places_of_textures(parameters: Iterable[Parameter]) -> Fields:
-    """Where those of some parameters stand that are textures, or of textures."""
+    """Return the fields in which those of the parameters stand that are textures or belong to textures."""
     places = [each.stands_in for each in parameters if _is_looked_up_by_textures(each.path)]
     return None if None in places else frozenset().union(*places)
 
@@ -137,23 +137,23 @@ def _is_looked_up_by_textures(path: tuple) -> bool:
 
 
 def slots(scene: Scene, paths: Paths, fields: Fields) -> Slots:
-    """What is differentiated. fields: of `places_of_textures`."""
+    """Return the slots. fields: as returned by `places_of_textures`."""
 
     def looked_up(table, textures):
-        """Colours and numbers that are looked up in a table."""
+        """Return the differentiated columns of a table that hold colours, and those that hold scalars."""
         columns, by_textures = named.get(scene, table).columns, filled(table, in_textures(scene, paths, textures))
         found = [i for path, i in _columns(scene, table).items() if path in paths or i in by_textures]
         return [i for i in found if columns[i].values.ndim > 1], [i for i in found if columns[i].values.ndim == 1]
 
     def filled(table, textures):
-        """Columns of a table that look up some of these textures."""
+        """Return the columns of a table that may look up one of these textures."""
         held = named.get(scene, table)
         may_be = [fields is None or name in fields for name in held.kind.declared]
         looks_up = [column is not None and column.texture is not None for column in held.columns]
         return [i for i in range(len(looks_up)) if textures and may_be[i] and looks_up[i]]
 
     def joined(found):
-        """All colours, and all numbers behind the most colours that any table has."""
+        """Return the columns per table, scalars after as many colours as any table has; and how many that are."""
         most, numbers = (max(map(len, each), default=0) for each in zip(*found, strict=True)) if found else (0, 0)
 
         def filled(columns, count):
@@ -193,7 +193,10 @@ def slots(scene: Scene, paths: Paths, fields: Fields) -> Slots:
 
 
 def prepared(scene: Scene, paths: Paths, slots: Slots, number: Int[Array, ""]) -> Scene:
-    """The scene that tells of its vertices what derivatives take. number: of a surface that a shadow ray passes."""
+    """Return the scene set up so that vertices report what derivatives need.
+
+    number: index of the one surface passed by a shadow ray that is differentiated.
+    """
     first, _ = firsts(scene, paths)
     listed = tuple((key, first[path]) for key, path in in_textures(scene, paths, TEXTURES).items())
     materials = replace(scene.materials, recorded=slots.wrappers, listed=listed)
@@ -205,9 +208,9 @@ def prepared(scene: Scene, paths: Paths, slots: Slots, number: Int[Array, ""]) -
 
 
 def nudged(scene: Scene, slots: Slots, nudges: Float[Array, " slots"]) -> Scene:
-    """The scene where each slot's number is larger by its nudge, in all channels.
+    """Return the scene in which each slot's value is increased by its nudge, in all channels.
 
-    Those of choices are left as they are: see `places.by_choices`.
+    Slots of choices are left unchanged: `places.by_choices` has their derivatives.
     """
     of_bsdfs, of_lights, _, of_passed, of_grids = slots.numbered()
 
@@ -240,13 +243,13 @@ def _with_grids_nudged(scene, slots, nudges):
 
 
 def firsts(scene: Scene, paths: Paths) -> tuple[dict[tuple, int], int]:
-    """Where each array begins in the list, and the length of the list."""
+    """Return the index in the list at which each array begins, and the length of the list."""
     ends = np.cumsum([0, *(count(scene, path) for path in paths)]).tolist()
     return dict(zip(paths, ends[:-1], strict=True)), ends[-1]
 
 
 def count(scene: Scene, path: tuple) -> int:
-    """Entries of an array: its colours, or its numbers."""
+    """Return the number of entries of an array: of its colours, or of its scalars."""
     array = named.get(scene, path)
     if not of_colors(scene, path):
         return array.size
@@ -254,12 +257,12 @@ def count(scene: Scene, path: tuple) -> int:
 
 
 def path_of_grid(nudge: str) -> tuple:
-    """Path to the values that a nudge stands for."""
+    """Return the path to the grid values that a nudge stands for."""
     return next(path for path, nudges in GRIDS.items() if nudge in nudges)
 
 
 def of_colors(scene: Scene, path: tuple) -> bool:
-    """Whether an array holds colours; else it holds numbers."""
+    """Return whether an array holds colours; else it holds scalars."""
     array = named.get(scene, path)
     if array.ndim > 1:
         return array.shape[-1] == 3 or may_be_wider(scene, path)
@@ -268,14 +271,14 @@ def of_colors(scene: Scene, path: tuple) -> bool:
 
 
 def is_both(scene: Scene, parameter: Parameter) -> bool:
-    """Whether colours may count as such in one place, and by their luminance in another one."""
+    """Return whether colours may be used as colours in one place and by their luminance in another."""
     if not parameter.is_color:
         return False
     return slots(scene, (parameter.path,), places_of_textures([parameter])).by_luminance
 
 
 def may_be_wider(scene: Scene, path: tuple) -> bool:
-    """Whether the rows of an array may have numbers behind their colours."""
+    """Return whether the rows of an array may have further numbers after their colours."""
     if "columns" not in path:
         return False
     known = declared(scene, path)
@@ -283,6 +286,6 @@ def may_be_wider(scene: Scene, path: tuple) -> bool:
 
 
 def declared(scene: Scene, path: tuple) -> Declared:
-    """What the parameter is declared as whose column is at a path."""
+    """Return the declaration of the parameter whose column is at a path."""
     *table, _, column, _ = path
     return list(named.get(scene, table).kind.declared.values())[column]

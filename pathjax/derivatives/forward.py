@@ -1,10 +1,10 @@
-"""Forward mode at the price of about one image, whatever the number of parameters: J v by the records of `record`.
+"""J v by forward mode on the records of `record`: about the cost of one image, whatever the number of parameters.
 
-What v does to a path's throughput, b, goes along with it from vertex to vertex:
+The change b of a path's throughput with v is carried along from vertex to vertex:
 
     dI = sum_k  b_k (Le_k + n_k) + beta_k (dLe_k + dn_k) v,        b_{k+1} = b_k w_k + beta_k dw_k v,        b_0 = 0
 
-with the names of `record`. The numbers of v that a vertex needs are looked up as the parameters themselves are.
+in the notation of `record`. A vertex looks up the entries of v that it needs as it looks up the parameters themselves.
 """
 
 from __future__ import annotations
@@ -31,22 +31,22 @@ from pathjax.integrators.reconstruction import map_pixels
 from pathjax.scene import parameters as named
 from pathjax.scene.scene import Scene
 
-# Numbers in a row of texels with their changes beside them: a power of 2, so that one line of a cache holds it.
+# Scalars in a row that holds a texel and its change: a power of 2, so that the row lies in one cache line.
 WIDTH = 8
 
 
 def changes(
     record: Record, v: Float[Array, "M numbers"], kept: Kept
 ) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
-    """What v does to Le + n and to w of a vertex.
+    """Return the changes of Le + n and of w at a vertex with v.
 
-    v: the changes of the entries that are kept: the last three numbers of each row.
+    v: changes of the kept entries: the last three scalars of each row.
     """
     now = later = jnp.zeros_like(record.weight)
     for slot in record.slots:
         shares = slot.shares or (1,)
         change = sum(share * at(v, kept.place(place))[-3:] for place, share in zip(slot.places, shares, strict=True))
-        # Read once, as both of its consumers would read it from far memory.
+        # Else both of its consumers would read it from far memory.
         change = compute_once(luminance(change) if slot.by_luminance else change)
         now = now + slot.now * change
         if slot.later is not None:
@@ -64,7 +64,7 @@ def pixel_change(
     slots: differentiated.Slots,
     kept: Kept,
 ) -> Float[Array, "3"]:
-    """What v does to the mean of a pixel. v: None, where it stands `beside` the one array that is differentiated."""
+    """Return the change of a pixel's mean with v. v: None if it stands `beside` the one differentiated array."""
     pixel_number, first_sample, spp, seed = work
     stream = sampler.pixel_stream(seed, pixel_number)
     v = named.get(scene, kept.paths[0]) if v is None else v
@@ -89,7 +89,7 @@ def pixel_change(
 
 
 def beside(array: Float[Array, "M 3"], v: Float[Array, "M 3"]) -> Float[Array, "M numbers"]:
-    """Texels, and their changes behind them: what J v costs is mostly what it reads from far memory, once so."""
+    """Return texels with their changes in the same rows, since reads from far memory, here one, dominate J v."""
     return jnp.concatenate([array, jnp.zeros((len(array), WIDTH - 6), array.dtype), v], 1)
 
 
@@ -107,14 +107,14 @@ def push(
     form=None,
     devices=None,
 ) -> Float[Array, "N 3"]:
-    """J v of the means of pixels.
+    """Return J v for the means of pixels.
 
     Args:
         scene: without names.
-        v: of the entries that are kept.
+        v: changes of the kept entries.
         pixels, first_sample, spp, seed: (N,) each.
-        kept: of arrays that `differentiated` knows.
-        form, devices: of `native_map`.
+        kept: entries of arrays in `differentiated.paths`.
+        form, devices: as for `native_map`.
     """
     scene = options.applied(scene)
     choice = emitters.choice(scene.emitters, options.strategy)

@@ -12,7 +12,7 @@ from pathjax.scene.scene import Scene
 
 
 def table(scene: Scene) -> Table:
-    """The table of dielectrics, of a scene that has some."""
+    """Return the table of dielectrics. The scene must have some."""
     return scene.materials.tables[dielectric.place(scene.materials)]
 
 
@@ -21,11 +21,11 @@ def with_table(scene: Scene, table: Table) -> Scene:
 
 
 def ratio_by(scene: Scene, parameter: Parameter) -> Float[Array, ""]:
-    """Derivative of the relative IOR int_ior / ext_ior in one of the two."""
+    """Return the derivative of the relative IOR int_ior / ext_ior in one of the two."""
     return dielectric.relative_ior_by(table(scene), parameter.index[0], parameter.field)
 
 
 def at_ratio(scene: Scene, name: str, ratio: float) -> Float[Array, ""]:
-    """Value of the parameter `name`, an IOR, at which int_ior / ext_ior of its glass is `ratio`."""
+    """Return the value of the IOR `name` at which int_ior / ext_ior of its glass is `ratio`."""
     parameter = named.find(scene, name)
     return dielectric.ior_at(table(scene), parameter.index[0], parameter.field, ratio)

@@ -1,12 +1,12 @@
-"""Derivatives in the IOR of smooth glass: central differences of paths that share all that chance decides.
+"""Derivatives in the IOR of smooth glass: central differences with common random numbers.
 
-The IOR moves the path itself, and what is seen through glass has edges, which no derivative of a moving point knows. So
-a pixel's paths are traced again with the IOR a step h higher and lower, with the same random numbers and with the
-probabilities of their choices at the IOR that the scene has, so that no choice flips by itself:
+The IOR moves the path itself, and the derivative of a moving point misses the edges that are seen through glass. So a
+pixel's paths are traced again with the IOR a step h higher and lower, with the same random numbers, and with branch
+probabilities at the scene's own IOR, so that no choice flips by itself:
 
-    dI/d(eta) = (I(eta + h) - I(eta - h)) / (2 h) + bias,        bias = h^2 I'''/6 + O(h^4)
+    (I(eta + h) - I(eta - h)) / (2 h) = dI/d(eta) + bias,        bias = h^2 I'''/6 + O(h^4)
 
-which a few paths at twice the step estimate: (difference at 2 h - difference at h) / 3 (Richardson).
+A few paths at twice the step estimate the bias: (difference at 2 h - difference at h) / 3 (Richardson).
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ from pathjax.integrators.options import Options
 from pathjax.integrators.random_numbers import bounce_numbers
 from pathjax.scene.scene import Scene
 
-# One path in so many is also traced at twice the step, to estimate the bias.
+# One path in this many is also traced at twice the step, to estimate the bias.
 RICHARDSON_EVERY = 16
-# Dielectrics of one kernel: the four shifts of each are bits of an int32.
+# Most dielectrics of one kernel: the four shifts of each are bits of an int32.
 MOST_GLASS = 7
 
 
@@ -40,25 +40,25 @@ def mean_and_differences(
     rows: tuple[int, ...],
     options: Options,
 ) -> tuple[Float[Array, "3"], tuple[Float[Array, "G 3"], Float[Array, "G 3"]]]:
-    """Mean of a pixel, and of its central differences in the IOR of G dielectrics, with their biases.
+    """Return the mean of a pixel, its central differences in the IOR of G dielectrics, and their biases.
 
-    A sample is a path at the IORs of the scene, then four for each of the dielectrics that it met: at + h, - h, and now
-    and then at + 2 h, - 2 h. A path that never met a glass is the same at every IOR of it.
+    A sample is a path at the scene's IORs, then more for each dielectric that it met: at + h and - h, and for one
+    sample in RICHARDSON_EVERY at + 2 h and - 2 h. A path that never met a dielectric does not depend on its IOR.
 
     Args:
         steps: h, in relative IOR.
-        rows: of the dielectrics, at most MOST_GLASS.
-        options: that watch what moves.
+        rows: table rows of the dielectrics, at most MOST_GLASS.
+        options: with `watch_moving`.
     """
     pixel_number, first_sample, spp, seed = work
     stream = sampler.pixel_stream(seed, pixel_number)
     table = ior.table(scene)
     ratios = dielectric.relative_ior(table)
     rows = jnp.asarray(rows, jnp.int32)
-    shifts = jnp.arange(4 * len(rows), dtype=jnp.int32)  # dielectric 4 k, 4 k + 1, ...
+    shifts = jnp.arange(4 * len(rows), dtype=jnp.int32)  # four per dielectric: + h, - h, + 2 h, - 2 h
 
     def shifted(shift):
-        """The scene at a shift, choosing its branches by the IORs that it has; as it is where shift < 0."""
+        """Return the scene at a shift, with branch probabilities at its own IORs; unshifted where shift < 0."""
         place, k = jnp.maximum(shift, 0) // 4, shift % 4
         row, h = at(rows, place), at(steps, place)
         moves = (jnp.arange(len(ratios)) == row) & (shift >= 0)
@@ -78,7 +78,7 @@ def mean_and_differences(
         def end():
             place, k = jnp.maximum(shift, 0) // 4, shift % 4
             value, place, k, again = compute_once((weight * now.L, place, k, twice(number)))
-            # The sample itself, or the second of a pair, whose first was kept.
+            # The path at the scene's IORs, or the second of a pair, with the value of the first in `plus`.
             mean, by_ior, bias = sums
             mean = pixel.add_compensated(mean, jnp.where(shift < 0, value, 0))
             width = 2 * at(steps, place) * (1 + k // 2).astype(value.dtype)
@@ -87,7 +87,7 @@ def mean_and_differences(
             by_ior = pixel.add_compensated(by_ior, jnp.where(mine & (k == 1), quotient, 0))
             doubled = (RICHARDSON_EVERY / 3) * jnp.where(k == 1, -quotient, quotient)
             bias = pixel.add_compensated(bias, jnp.where(mine & again, doubled, 0))
-            # Shifts of this sample that are still to do are the bits of `todo`.
+            # The bits of `todo` are the shifts of this sample that remain.
             touched = (jnp.right_shift(now.moving, rows % 31) & 1) == 1
             touched = jnp.broadcast_to(touched[:, None], (len(rows), 4)).reshape(shifts.shape)  # for each shift
             wanted = touched & ((shifts % 4 < 2) | again)

@@ -1,4 +1,4 @@
-"""By how much to change an IOR for a difference: so that the image moves by a part of a pixel."""
+"""The step of a central difference in an IOR: one that moves the image by a part of a pixel."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from pathjax.scene.scene import Scene
 from pathjax.sensors import film
 from pathjax.shapes import geometry
 
-# Images move by this part of a pixel under one step, in the median: less adds noise, more adds bias.
+# Median motion of the image under one step, in pixels: less adds noise, more adds bias.
 STEP_PIXELS = 0.35
-# Bounds of the step, relative to the IOR: float32 resolves the lower; beyond the upper a difference is no derivative.
+# Bounds of the step, relative to the IOR: float32 resolves the lower; above the upper a difference is no derivative.
 MIN_STEP, MAX_STEP = 2e-4, 0.03
-# Rays that are followed to see how far the image moves, and vertices of each.
+# Rays that are traced to measure the motion of the image, and the most vertices of each.
 _PILOTS, _PILOT_DEPTH = 1024, 12
 
 
 def steps(scene: Scene, rows: tuple[int, ...], step: float | Float[Array, ""] | None) -> Float[Array, " G"]:
-    """Steps of the relative IOR of some dielectrics; `step`, if that is not None."""
+    """Return steps of the relative IOR for some dielectrics: `step`, unless it is None or too large for the IOR."""
     if not rows:
         return jnp.asarray(np.zeros(0, scene.camera.origin.dtype))
     return _steps(scene, np.array(rows, np.int32), step)
@@ -38,7 +38,7 @@ def steps(scene: Scene, rows: tuple[int, ...], step: float | Float[Array, ""] | 
 def _steps(scene, rows, step):
     ratio = dielectric.relative_ior(ior.table(scene))[rows]
     if step is not None:
-        # Twice the step must leave a positive IOR.
+        # The IOR must stay positive at twice the step.
         return jnp.minimum(jnp.asarray(step, ratio.dtype), 0.4 * ratio)
     motion = motions(scene, rows)
     wished = STEP_PIXELS / jnp.where(motion > 0, motion, 1)
@@ -49,10 +49,10 @@ def _steps(scene, rows, step):
 
 @jax.jit
 def motions(scene: Scene, rows: Int[Array, " G"]) -> Float[Array, " G"]:
-    """Median number of pixels by which what is seen through glass moves per unit of relative IOR; 0: not seen."""
+    """Return the median motion of the image seen through glass, in pixels per unit of relative IOR; 0: not seen."""
     count = film.pixel_count(scene.film)
     pilots = jnp.asarray(np.unique(np.linspace(0, count - 1, min(_PILOTS, count)).astype(np.int32)))
-    # Lanes would take longer to compile, four times, than so few rays take in any form.
+    # Lanes take four times as long to compile, which costs more than so few rays take in any form.
     form = "loop" if native() else None
     return jax.vmap(lambda row: _median(native_map(_motion, pilots, scene, row, form=form)))(rows)
 
@@ -63,7 +63,7 @@ def _median(x):
 
 
 def _motion(pixel_number, scene, row):
-    """Pixels per unit of relative IOR of one dielectric, for the ray through the middle of a pixel; NaN: not seen."""
+    """Return the motion of the image at a pixel's centre per unit of a dielectric's relative IOR; NaN: not seen."""
     table = ior.table(scene)
     ratios = dielectric.relative_ior(table)
     ratio = at(ratios, row)
@@ -72,7 +72,7 @@ def _motion(pixel_number, scene, row):
     size = jnp.array([scene.film.width, scene.film.height], ratio.dtype)
 
     def seen(x):
-        """Where the ray ends that refracts wherever it can: a point, or a direction if it hits nothing."""
+        """Return where a ray ends that refracts wherever it can: a point, or its direction if it hits nothing."""
         varied = ior.with_table(scene, dielectric.with_relative_ior(table, x[0], jnp.arange(len(ratios)) == row))
         ray = scene.camera.sample_ray(middle + x[1:] / size, half)
         refracts = jnp.full((bsdf_dimensions(scene.materials),), 1 - 2**-24, ratio.dtype)
@@ -95,7 +95,7 @@ def _motion(pixel_number, scene, row):
     start = jnp.concatenate([ratio[None], jnp.zeros((2,), ratio.dtype)])
     basis = jnp.eye(3, dtype=ratio.dtype)
     moved, met = jax.vmap(lambda t: jax.jvp(seen, (start,), (t,), has_aux=True)[1:], out_axes=(0, None))(basis)
-    # Least squares: which shift in the image would move the end as the IOR does.
+    # Least squares: the shift in the image that would move the end as the IOR does.
     by_ior, by_x, by_y = moved
     xx, xy, yy, bx, by = dot(by_x, by_x), dot(by_x, by_y), dot(by_y, by_y), dot(by_ior, by_x), dot(by_ior, by_y)
     determinant = xx * yy - xy * xy

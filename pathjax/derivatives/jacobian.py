@@ -1,9 +1,9 @@
-"""Image and Jacobian: how every pixel changes with the parameters of materials and lights.
+"""Image and Jacobian: the derivatives of every pixel in the parameters of materials and lights.
 
-Most parameters (reflectances, radiances, roughnesses) change what paths carry, not where they go: the derivative is
-that of the weights (detached sampling), unbiased (`tangents`; of many numbers `backward`). The IOR of smooth glass
-moves the path itself, which takes differences (`ior_difference`). No general derivative exists here for moving geometry
-or cameras.
+Most parameters (reflectances, radiances, roughnesses) change what paths carry, not where they go. Their derivative is
+that of the weights (detached sampling) and unbiased (`tangents`, or `backward` for many scalars). The IOR of smooth
+glass moves the path itself, which takes differences (`ior_difference`). Derivatives in moving geometry or cameras are
+not supported.
 """
 
 from __future__ import annotations
@@ -39,10 +39,10 @@ from pathjax.system import memory
 
 Slopes = Mapping[str, Float[Array, "..."]]
 METHODS = ("difference", "attached")
-# Up to so many colours tangents are the cheaper way: for 1, 2, 3 colours of the Cornell box, image and Jacobian took
-# 1.14, 1.24, 1.44 images of CPU time, and by a recorded sweep 1.23, 1.24, 1.26.
+# Up to this many parameters tangents are cheaper: for 1, 2, 3 colours of the Cornell box, image and Jacobian took 1.14,
+# 1.24, 1.44 images of CPU time by tangents, and 1.23, 1.24, 1.26 by a recorded sweep.
 MOST_TANGENTS = 2
-# Where a sweep finds them, `takes_sweep`.
+# Ends an error message: when a texture has a Jacobian (`takes_sweep`).
 UNLESS = (
     " unless no IOR of smooth glass is named with it, and none of the textures named stands for colours and for "
     "numbers both"
@@ -52,12 +52,12 @@ UNLESS = (
 @register_dataclass
 @dataclass(frozen=True, eq=False)
 class Jacobian(Mapping[str, Array]):
-    """Derivatives of an image by the names of parameters: `J[name]` is (H, W, 3, *shape of the parameter).
+    """Derivatives of an image by parameter name: `J[name]` is (H, W, 3, *shape of the parameter).
 
-    derivatives: of many numbers, `RowSlopes`, which make each when it is read.
-    bias: of those that are differences, an estimate of derivative minus truth (H, W, 3) from a second step; noisy in a
-        single pixel, meant for averages.
-    step: of those, the change of the relative IOR to either side.
+    derivatives: for many scalars `RowSlopes`, which build each derivative when it is read.
+    bias: for differences only: an estimate (H, W, 3) of derivative minus truth, from a second step; noisy in a single
+        pixel, meant for averages.
+    step: for differences only: the change of the relative IOR to either side.
     """
 
     derivatives: Mapping[str, jax.Array]
@@ -81,8 +81,8 @@ class Jacobian(Mapping[str, Array]):
 class Wanted:
     """What the kernel differentiates; static."""
 
-    colors: tangents.Places  # of the colours that get a tangent
-    glass: tuple[int, ...]  # rows of the dielectrics that get a difference
+    colors: tangents.Places  # parameters that get a tangent
+    glass: tuple[int, ...]  # table rows of the dielectrics that get a difference
 
 
 @by_all
@@ -97,23 +97,23 @@ def jacobian(
     method: str = "difference",
     step: float | Float[Array, ""] | None = None,
 ) -> tuple[Float[Array, "height width 3"], Jacobian]:
-    """Image and its derivative with respect to named parameters, from the same paths, in one kernel.
+    """Render an image and its derivatives in named parameters, from the same paths, in one kernel.
 
     Pure; may be called inside `jax.jit`, and under `jax.vmap` over scenes that differ in parameters or cameras.
 
     Args:
         names: of parameters, as `parameters` lists them.
-        spp, seed, strategy: of `render`; the image is that of `render`, to rounding.
+        spp, seed, strategy: as for `render`; the image is that of `render`, to rounding.
         method: how the IOR of smooth glass is differentiated: "difference" (central, common random numbers), or
-            "attached", which follows points that move and is right only where no edge is seen through glass. An
-            attached image chooses its branches otherwise than `render`, without bias.
-        step: of differences, in relative IOR; None: what moves the image by about a third of a pixel.
+            "attached", which follows moving points and is right only where no edge is seen through glass. The attached
+            image has other branch probabilities than that of `render`, without bias.
+        step: of differences, in relative IOR; None: one that moves the image by about a third of a pixel.
     Returns:
-        image and Jacobian.
+        Image and Jacobian.
     Raises:
-        InputError: unknown name, method or strategy; spp, seed or step out of range; a texture beside the IOR of smooth
-            glass, or one that stands for colours and for numbers both; a value that counts as a larger one, as a
-            roughness of 0 does; more derivatives than fit into memory.
+        InputError: unknown name, method or strategy; spp, seed or step out of range; a texture named together with the
+            IOR of smooth glass, or used both as colours and as scalars; a value below the least that has an effect,
+            such as a roughness of 0; more derivatives than fit into memory.
     """
     if isinstance(names, str):
         raise InputError(f"names is a list of names; write [{names!r}]")
@@ -160,12 +160,12 @@ def pixel_jacobians(
     ring: int | None = None,
     **how,
 ) -> tuple[Float[Array, "N 3"], Slopes, Slopes, Slopes]:
-    """Means, and by name: derivatives (N, 3, *shape), biases (N, 3), steps ().
+    """Return the means of pixels and, by name, derivatives (N, 3, *shape), biases (N, 3) and steps ().
 
     Args:
         scene: without names.
-        first_sample, spp, seed: each one number, or one of each pixel.
-        ring: of `backward.longest_ring`; None: that of the scene.
+        first_sample, spp, seed: each a scalar, or one per pixel.
+        ring: as returned by `backward.longest_ring`; None: that of the scene.
         how: `form` and `devices` of `native_map`.
     """
     scene = on_all_devices(scene, how.get("devices"))
@@ -204,7 +204,7 @@ def pixel_jacobians(
     return image, derivatives, biases, used
 
 
-# One program for each of these, where JAX would compile one for each operation.
+# Compiled as one program each; JAX would compile every operation by itself.
 @partial(jax.jit, static_argnums=2)
 def _slope_of(by_color, place, of_color):
     return tangents.in_parameter(by_color[:, place], of_color)
@@ -216,9 +216,9 @@ def _of_glass(by_ior, bias, steps, place, scale):
 
 
 def takes_sweep(scene: Scene, parameters, options: Options, form: str | None = None, devices: int | None = None):
-    """Whether a recorded sweep finds all derivatives: of textures, or of so many numbers that tangents would cost more.
+    """Return whether a recorded sweep makes all derivatives: in textures, or in more parameters than tangents are for.
 
-    It knows of native kernels alone.
+    A sweep needs native kernels.
     """
     lanes = form == "lanes" or (form is None and native())
     few = len(parameters) <= MOST_TANGENTS and not any(parameter.is_texture for parameter in parameters)
@@ -226,7 +226,7 @@ def takes_sweep(scene: Scene, parameters, options: Options, form: str | None = N
 
 
 def has_rows(scene: Scene, parameters) -> bool:
-    """Whether `backward.rows` finds the derivatives in them, which move no path."""
+    """Return whether `backward.rows` gives the derivatives in these parameters. They must move no path."""
     parameters = list(parameters)
     known = differentiated.paths(scene)
     return all(each.path in known and not differentiated.is_both(scene, each) for each in parameters)
@@ -234,7 +234,7 @@ def has_rows(scene: Scene, parameters) -> bool:
 
 @partial(jax.custom_jvp, nondiff_argnums=(0, 1, 2, 3))
 def _swept(wanted, options, ring, how, scene, pixels, *numbers):
-    """Means and derivatives, by name. how: `form` and `devices`; lanes are the only form."""
+    """Return means and, by name, derivatives. how: `form` and `devices`; lanes are the only form."""
     kept = kept_of(scene, wanted.values())
     options = replace(options, derivative=True, by_vertex=True)
     image, rows = backward.rows(
@@ -248,7 +248,7 @@ def _swept(wanted, options, ring, how, scene, pixels, *numbers):
 @partial(_swept.defjvp, symbolic_zeros=True)
 @usual_promotion
 def _swept_jvp(wanted, options, ring, how, primals, changes):
-    """No derivative goes through a sweep: second ones are those of the same Jacobian, made by tangents."""
+    """Second derivatives: a sweep has none of its own, so they are those of the same Jacobian made by tangents."""
     tangents.refuse_textures(wanted)
     scene, *work = primals
     leaves, tree = jax.tree.flatten(scene)
@@ -274,7 +274,7 @@ def _swept_jvp(wanted, options, ring, how, primals, changes):
 
 
 def choosing_by_present_iors(scene: Scene, rows: tuple[int, ...]) -> Scene:
-    """The scene whose dielectrics of some rows choose their branches by the IOR that they have now, detached."""
+    """Return the scene in which some dielectrics have branch probabilities at their present IOR, detached."""
     table = ior.table(scene)
     ratio = lax.stop_gradient(dielectric.relative_ior(table))
     chosen = jnp.isin(jnp.arange(len(ratio)), jnp.asarray(rows, jnp.int32))
@@ -293,7 +293,7 @@ def _jacobians(scene, pixels, first_sample, spp, seed, steps, *, wanted, options
 
 
 def _pixel_jacobian(work: pixel.Work, scene, choice, unit_tangents, steps, wanted: Wanted, options: Options):
-    """Means of a pixel: radiance (3,), tangents (T, 3), differences (G, 3) and their biases (G, 3)."""
+    """Return means of a pixel: radiance (3,), tangents (T, 3), differences (G, 3) and their biases (G, 3)."""
 
     def of(scene):
         if wanted.glass:

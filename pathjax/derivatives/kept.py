@@ -1,6 +1,6 @@
-"""Which entries of the list of `differentiated` are kept: those of what is asked for, not of all around it.
+"""Which entries of the list of `differentiated` are kept: those of the requested parameters, not of whole arrays.
 
-The texels of all textures of a scene stand in one array, of which one small texture may be asked for.
+The texels of all textures of a scene stand in one array, and the requested texture may be a small part of it.
 """
 
 from __future__ import annotations
@@ -17,26 +17,26 @@ from pathjax.kinds.parameter import Parameter
 from pathjax.scene import parameters as named
 from pathjax.scene.scene import Scene
 
-# At each look-up the place is compared with the ends of all runs.
+# Each look-up compares its index with the ends of all runs.
 MOST_RUNS = 4
 
 
 @dataclass(frozen=True)
 class Kept:
-    """Runs of entries that are kept, ascending; static."""
+    """Runs of kept entries, ascending; static."""
 
-    paths: differentiated.Paths  # of the arrays of the list
+    paths: differentiated.Paths  # of the arrays in the list
     runs: tuple[range, ...]
-    all: bool  # nothing else is in the list
-    fields: differentiated.Fields = None  # of `differentiated.places_of_textures`
+    all: bool  # whether the runs cover the list
+    fields: differentiated.Fields = None  # as returned by `differentiated.places_of_textures`
 
     @property
     def count(self) -> int:
-        """Entries that are kept, and one more, behind them, for all others, unless there are none."""
+        """Number of kept entries, plus one last entry that collects all others, if there are others."""
         return sum(map(len, self.runs)) + (not self.all)
 
     def place(self, entry: Int[Array, ""] | int) -> Int[Array, ""]:
-        """Where an entry of the list stands among those kept."""
+        """Return the index among the kept entries of an entry of the list."""
         if self.all:
             return jnp.asarray(entry)
         found, first = jnp.int32(self.count - 1), 0
@@ -47,11 +47,11 @@ class Kept:
         return found
 
     def of(self, scene: Scene, parameter: Parameter) -> range:
-        """Where the entries of a parameter that is asked for stand among those kept."""
+        """Return the indices of a requested parameter's entries among those kept."""
         return self.places(entries(scene, self.paths, parameter))
 
     def places(self, entries: range) -> range:
-        """The same of entries that are neighbours in the list."""
+        """Return the indices among those kept of consecutive entries of the list."""
         first = 0
         for run in self.runs:
             if entries.start in run:
@@ -62,7 +62,7 @@ class Kept:
 
 
 def kept(scene: Scene, parameters: Iterable[Parameter]) -> Kept:
-    """What is kept for derivatives in some parameters."""
+    """Return the entries to keep for derivatives in some parameters."""
     parameters = list(parameters)
     paths = tuple(dict.fromkeys(parameter.path for parameter in parameters))
     _, count = differentiated.firsts(scene, paths)
@@ -71,7 +71,7 @@ def kept(scene: Scene, parameters: Iterable[Parameter]) -> Kept:
 
 
 def entries(scene: Scene, paths: differentiated.Paths, parameter: Parameter) -> range:
-    """Where the entries of a parameter stand in the list."""
+    """Return the indices of a parameter's entries in the list."""
     first, _ = differentiated.firsts(scene, paths)
     shape, width = named.get(scene, parameter.path).shape, 3 if differentiated.of_colors(scene, parameter.path) else 1
     begin = sum(place * math.prod(shape[axis + 1 :]) for axis, place in enumerate(parameter.index))
@@ -83,14 +83,14 @@ def entries(scene: Scene, paths: differentiated.Paths, parameter: Parameter) -> 
 def of_parameter(
     parameter: Parameter, array: tuple[int, ...], found: Float[Array, "entries ..."]
 ) -> Float[Array, "..."]:
-    """Derivatives in a parameter, of its shape, from those in its entries; array: shape of what it lives in."""
+    """Return derivatives of a parameter's shape from those in its entries. array: shape of the array that holds it."""
     if not parameter.is_texture:
         return found.reshape(parameter.shape)
     return replace(parameter, index=(0,)).transposed(found.reshape(parameter.rows, *array[1:]))
 
 
 def of_entries(scene: Scene, parameter: Parameter, change: Float[Array, "..."]) -> Float[Array, "entries 3"]:
-    """Changes of the entries of a parameter, from that of the parameter; of a number the same in all channels."""
+    """Return the changes of a parameter's entries from that of the parameter; scalars change all channels alike."""
     if parameter.is_texture:
         mine = jnp.zeros((parameter.rows, *named.get(scene, parameter.path).shape[1:]), change.dtype)
         change = replace(parameter, index=(0,)).put(mine, change)
@@ -99,7 +99,7 @@ def of_entries(scene: Scene, parameter: Parameter, change: Float[Array, "..."]) 
 
 
 def few(runs: Sequence[range]) -> tuple[range, ...]:
-    """Runs, sorted by where they start, joined where they touch; and across the smallest gaps, if they are many."""
+    """Join sorted runs that touch and, if there are many, those with the smallest gaps between them."""
     gaps = sorted(later.start - run.stop for run, later in zip(runs[:-1], runs[1:], strict=True))
     least = max(gaps[-MOST_RUNS + 1 :][0], 1) if len(gaps) >= MOST_RUNS else 1
     joined = [runs[0]]

@@ -1,6 +1,6 @@
-"""J v and J^T v of the means of pixels, without J: each at the price of about one image, whatever the size of v.
+"""J v and J^T v for the means of pixels, without J: each costs about one image, whatever the size of v.
 
-J v goes along with paths (`forward`), J^T v comes by a recorded sweep when they have ended (`backward`).
+J v is carried along paths (`forward`); J^T v is made by a recorded sweep when they have ended (`backward`).
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ Changes = dict[str, Float[Array, "..."]]
 
 
 def is_swept(scene: Scene, parameter: Parameter) -> bool:
-    """Whether the recorded sweep finds the parameter at the vertices of paths."""
+    """Return whether the recorded sweep can differentiate in the parameter."""
     return not parameter.moves_paths and parameter.path in differentiated.paths(scene)
 
 
@@ -34,7 +34,7 @@ def is_swept(scene: Scene, parameter: Parameter) -> bool:
 def push(
     scene: Scene, wanted: Mapping[str, Parameter], changes: Changes, pixels, first_sample, spp, seed, options, **how
 ) -> Float[Array, "N 3"]:
-    """J v. changes: of parameters, by name; the rest as for `jacobian.pixel_jacobians`."""
+    """Return J v. changes: v, by parameter name; the rest as for `jacobian.pixel_jacobians`."""
     kept = kept_of(scene, wanted.values())
     moved = {name: of_entries(scene, wanted[name], change) for name, change in changes.items()}
     if len(wanted) == 1 and kept.all:
@@ -62,11 +62,11 @@ def pull(
     ring: int | None = None,
     **how,
 ) -> Changes:
-    """J^T v: by name, of the parameter's shape.
+    """Return J^T v, by name, of each parameter's shape.
 
     Args:
         adjoint: v.
-        ring: of `backward.longest_ring`; None: that of the scene.
+        ring: as returned by `backward.longest_ring`; None: that of the scene.
         others: as for `push`.
     """
     numbers = pixel.numbers(pixels, first_sample, spp, seed)

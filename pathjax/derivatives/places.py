@@ -1,4 +1,4 @@
-"""Where the numbers that a vertex looks up stand in the list of `differentiated`, by slot, and the share of each."""
+"""Which entries of the list of `differentiated` a vertex looks up for each slot, and the weight (share) of each."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ from pathjax.scene.scene import Scene
 from pathjax.shapes import geometry
 from pathjax.textures import Pairs, alike
 
-# Of one number: places in the list, and their shares where there are several.
+# Of one value: indices in the list, and their shares; None: there is one index, of share 1.
 Entries = tuple[tuple[Int[Array, ""], ...], tuple[Float[Array, "..."], ...] | None]
 
 
 def of_bsdf(scene: Scene, paths: Paths, slots: Slots, slot: int, here: Vertex) -> Entries:
-    """Entries of the number that the bsdf of a vertex looks up for a slot; of any, where it looks up none."""
+    """Return the entries that the bsdf of a vertex looks up for a slot; arbitrary ones if it looks up none."""
     first, _ = firsts(scene, paths)
     found = [
         partial(_of_row, scene, first, (*BSDFS, number), columns[slot], here.row, TEXTURES, here.surface, here.entries)
@@ -50,7 +50,7 @@ def of_bsdf(scene: Scene, paths: Paths, slots: Slots, slot: int, here: Vertex) -
 
 
 def by_choices(slots: Slots, here: Vertex) -> Float[Array, " slots"]:
-    """Derivatives of `here.weight` in the numbers of the wrappers that were chosen from."""
+    """Return the derivatives of `here.weight` in the slots of choices."""
 
     def of(step, number):
         others = (each.factor for other, each in enumerate(here.chosen) if other != step)
@@ -60,7 +60,7 @@ def by_choices(slots: Slots, here: Vertex) -> Float[Array, " slots"]:
 
 
 def of_choice(scene: Scene, paths: Paths, slots: Slots, slot: int, here: Vertex) -> Entries:
-    """Entries of a number of `by_choices`."""
+    """Return the entries for a slot of `by_choices`."""
     first, _ = firsts(scene, paths)
     step, place, number = slots.choices[slot]
     column, row = slots.wrappers[place][number], here.chosen[step].row
@@ -69,7 +69,7 @@ def of_choice(scene: Scene, paths: Paths, slots: Slots, slot: int, here: Vertex)
 
 
 def of_passed(scene: Scene, paths: Paths, slots: Slots, slot: int, passed: Passed) -> Entries:
-    """Entries of a number that is looked up at a surface that a shadow ray passes."""
+    """Return the entries for a slot at a surface that a shadow ray passes."""
     place, number = divmod(slot, len(slots.wrappers[0]))
     kind, row = passed.held[place]
     first, _ = firsts(scene, paths)
@@ -94,11 +94,12 @@ def of_grid(
     u: Bounce,
     shadow: Dimmed,
 ) -> Entries:
-    """Entries of what is looked up in a grid for a nudge, times the length that a point stands for.
+    """Return the entries looked up in a grid for a nudge; shares are times the length that a point stands for.
 
     Args:
+        nudge: name of a field of `media.Nudges`.
         medium: of the flight along the ray to its end.
-        shadow: on the way of the light sample.
+        shadow: point on the shadow ray of the light sample.
     """
     path = path_of_grid(nudge)
     values, first, length = named.get(scene, path[:-1]), firsts(scene, paths)[0][path], 1
@@ -107,13 +108,13 @@ def of_grid(
     elif nudge == "shadow":
         medium, p, length = shadow.medium, shadow.p, shadow.length
     else:
-        p = ray.o + jnp.where(end < jnp.inf, end, 0) * ray.d  # where there is no particle, nothing changes with it
+        p = ray.o + jnp.where(end < jnp.inf, end, 0) * ray.d  # without a particle any point will do: derivative 0
     places, shares = zip(*media.entries(values, medium, p), strict=True)
     return tuple(first + place for place in places), tuple(length * share for share in shares)
 
 
 def of_hit(scene: Scene, paths: Paths, slots: Slots, slot: int, ray: Ray, hit: Hit, here: Vertex | None) -> Entries:
-    """Entries of the number that the light looks up that a ray meets; of any, where it meets none."""
+    """Return the entries that the light hit by a ray looks up for a slot; arbitrary ones if it hits none."""
     first, _ = firsts(scene, paths)
     found, starts, number = [partial(_of_background, scene, first, slots, slot, ray.d)], [], jnp.int32(0)
     if here is not None:
@@ -134,7 +135,7 @@ def of_hit(scene: Scene, paths: Paths, slots: Slots, slot: int, ray: Ray, hit: H
 def of_light_sample(
     scene: Scene, choice: Choice, paths: Paths, slots: Slots, slot: int, here: Vertex, u: Bounce
 ) -> Entries:
-    """Entries of the number that a sampled light looks up; of any, where it looks up none."""
+    """Return the entries that a sampled light looks up for a slot; arbitrary ones if it looks up none."""
     first, _ = firsts(scene, paths)
     number, _, _ = emitters.choose(choice, here.surface.p, u.light)
     whole, behind = _whole(scene, paths), emitters.backgrounds(scene.emitters)
@@ -156,13 +157,13 @@ def of_light_sample(
 
 
 def _whole(scene: Scene, paths: Paths) -> bool:
-    """Whether each number that a light looks up is one entry, and not the sum of some."""
-    own = {("emitters", i, "table") for i in range(len(scene.emitters))}  # else a texture's
+    """Return whether each value that a light looks up is one entry, and not a sum of several."""
+    own = {("emitters", i, "table") for i in range(len(scene.emitters))}  # not the table of a texture
     return all(path[:3] in own and not declared(scene, path).shared for path in paths if path[0] == "emitters")
 
 
 def _lit(scene: Scene, number: int, light: Int[Array, ""], here: Vertex, drawn: EmitterSample):
-    """Where a sampled light looks up its textures."""
+    """Return the surface point, or just its uv, at which a sampled light looks up its textures."""
     lights = scene.emitters[number]
     if not lights.kind.on_surfaces:
         return SimpleNamespace(uv=lights.kind.uv(lights.parameters(light), drawn.d))
@@ -191,9 +192,9 @@ def _of_background(scene: Scene, first: dict, slots: Slots, slot: int, d) -> Pai
 
 
 def _of_row(scene: Scene, first: dict, path: tuple, column: int | None, row, of_textures, surface, known=None) -> Pairs:
-    """Pairs of a column of the table at a path, and of the textures at another one, looked up on a surface.
+    """Return the Pairs of a column of the table at `path`, or of its texture at `of_textures`, looked up on a surface.
 
-    known: what was found of the textures already, for each of `Table.textured`.
+    known: Pairs of the textures where the vertex has them, for each of `Table.textured`.
     """
     if column is None:
         return ()
@@ -214,6 +215,6 @@ def _of_row(scene: Scene, first: dict, path: tuple, column: int | None, row, of_
 
 
 def _entries(pairs: Pairs, whole: bool) -> Entries:
-    """whole: each number is one entry."""
+    """Return Pairs as Entries. whole: each value is one entry."""
     places, shares = zip(*pairs, strict=True)
     return places, None if whole else shares

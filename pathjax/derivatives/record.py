@@ -1,13 +1,13 @@
-"""What a vertex of a path tells derivatives: how its light and its weight change with the numbers that it looks up.
+"""The record of a path vertex: the derivatives of its light and its weight in the values that it looks up.
 
-`forward` and `backward` make J v and J^T v of these. With
+`forward` and `backward` make J v and J^T v from records. The equations are
 
-    R_{k-1} = Le_k + n_k + w_k R_k                     radiance that arrives at vertex k-1; behind the last vertex 0
+    R_{k-1} = Le_k + n_k + w_k R_k                     radiance that arrives at vertex k-1; 0 after the last vertex
     dI/d theta = beta_k (dLe_k/d theta + dn_k/d theta + (dw_k/d theta) R_k)
 
-Le is what the path ends on and n the light sample, each with its share, w the weight of the bsdf sample over the
-survival of roulette, and beta the throughput before the vertex. Nothing is divided by a reflectance, so what is black
-keeps its derivative. What directions and probabilities depend on is detached, as in all of pathjax.
+where Le is the emission that the path meets and n the light sample, both with their MIS weights, w the weight of the
+bsdf sample over the survival probability of roulette, and beta the throughput before the vertex. Nothing is divided by
+a reflectance, so black surfaces keep their derivative. Directions and probabilities are detached, as in all of pathjax.
 """
 
 from __future__ import annotations
@@ -34,22 +34,22 @@ from pathjax.scene.scene import Scene
 @register_dataclass
 @dataclass(frozen=True)
 class Slot:
-    """What a vertex adds to the derivatives in one number that it looked up, times the adjoint and the throughput."""
+    """Derivatives of a vertex in one value that it looked up, times the throughput and the caller's scale."""
 
-    places: tuple[Int[Array, ""], ...]  # of the number, in the list of derivatives
-    # The share of each place in the number, or in each of its channels; None: there is one place.
+    places: tuple[Int[Array, ""], ...]  # indices, in the list of derivatives, of the entries that the value depends on
+    # Weight of each entry in the value, or in each of its channels; None: there is one entry, of weight 1.
     shares: tuple[Float[Array, "..."], ...] | None
     now: Float[Array, "3"]  # d(Le + n)
-    later: Float[Array, "3"] | None  # dw, to be multiplied by R
-    # The number may be the luminance of a texture.
+    later: Float[Array, "3"] | None  # dw, to be multiplied by R; None: 0
+    # The value may be the luminance of a texture.
     by_luminance: bool = field(default=False, metadata={"static": True})
 
 
 class Record(NamedTuple):
     """What the sweep needs of a vertex."""
 
-    begins: Bool[Array, ""]  # the first of its path
-    ends: Bool[Array, ""]  # the last one
+    begins: Bool[Array, ""]  # first vertex of its path
+    ends: Bool[Array, ""]  # last vertex of its path
     gathered: Float[Array, "3"]  # Le + n
     weight: Float[Array, "3"]  # w
     slots: list[Slot]
@@ -66,14 +66,15 @@ def extend(
     scale: Float[Array, "3"],
     number: Int[Array, ""],
 ) -> tuple[path.Path, Record, Bool[Array, ""]]:
-    """`path.extend`, the Record of the vertex, whose `begins` is not known here, and whether it is the vertex itself.
+    """Extend a path as `path.extend` does; return it, a Record, and whether that is the Record of the vertex itself.
 
-    Each surface that the vertex's shadow ray passes has a Record of its own, before that of the vertex.
+    Each surface that the vertex's shadow ray passes has a Record of its own, before that of the vertex. The caller sets
+    `begins`.
 
     Args:
-        options: by vertex.
-        scale: what derivatives are multiplied by, beside the throughput.
-        number: of the Record among those of the vertex.
+        options: with `by_vertex`.
+        scale: factor of the derivatives, beside the throughput.
+        number: index of the Record among those of the vertex.
     """
     scene = differentiated.prepared(scene, paths, slots, number)
     hit, here, u = path.meet(scene, now, u, options)
@@ -122,7 +123,7 @@ def extend(
     if not of_passed:
         return on, record, jnp.bool_(True)
 
-    # What is passed has nothing but its own derivatives.
+    # The Record of a passed surface has only the derivatives in that surface's own slots.
     passed, on = on.L.nudged, on._replace(L=on.L._replace(nudged=None))
     itself = number >= passed.count
     found = [jax.tree.map(lambda x: jnp.where(itself, x, 0).astype(x.dtype), slot) for slot in found]

@@ -1,4 +1,4 @@
-"""Derivatives in many colours and numbers, of which no more is kept than may differ from 0."""
+"""Derivatives in many colours and scalars, stored without the entries that are always 0."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from pathjax.scene.scene import Scene
 
 
 class Place(NamedTuple):
-    """Where the derivatives in a parameter stand; static."""
+    """The rows that hold the derivatives in a parameter; static."""
 
     rows: range
     parameter: Parameter
-    array: tuple[int, ...]  # shape of what it lives in
-    of_colors: bool  # else it holds numbers
+    array: tuple[int, ...]  # shape of the array that holds the parameter
+    of_colors: bool  # whether that array holds colours; else scalars
 
     @classmethod
     def of(cls, scene: Scene, rows: range, parameter: Parameter) -> Place:
@@ -37,12 +37,12 @@ class Place(NamedTuple):
 @register_dataclass
 @dataclass(frozen=True, eq=False)
 class RowSlopes(Mapping[str, Array]):
-    """Derivatives by the names of parameters, (*shape, 3, *shape of the parameter) each, made when they are read.
+    """Derivatives by parameter name, (*shape, 3, *shape of the parameter) each, built when they are read.
 
-    Light keeps its channel, so of a colour a third of the numbers says all.
+    Light keeps its channel, so only a third of the derivatives in a colour can differ from 0, and is stored.
     """
 
-    rows: Rows  # (N, 4), of each channel in its own; the last number is none
+    rows: Rows  # (N, 4): derivative of each channel in the same channel; the last column is unused
     places: tuple[tuple[str, Place], ...] = field(metadata={"static": True})  # by name
     shape: tuple[int, ...] = field(metadata={"static": True})  # of the N pixels
 
@@ -86,18 +86,18 @@ def _slopes(rows: Rows, place: Place, shape: tuple[int, ...]) -> Float[Array, ".
 
 
 def by_channel(place: Place, row: Float[Array, "entries 3"]) -> Float[Array, "3 ..."]:
-    """Derivatives of the channels of a pixel in a parameter, from those of each in its own entries."""
+    """Return the derivatives of a pixel's channels in a parameter, from those of each channel in its own entries."""
     if place.parameter.is_color:
         of_channels = row * jnp.eye(3, dtype=row.dtype)[:, None]
     else:
         of_channels = row.T
-        if place.of_colors:  # which are all as the number
+        if place.of_colors:  # texels whose channels all equal the scalar
             of_channels = of_channels[..., None] * jnp.asarray(LUMINANCE, row.dtype)
     return jax.vmap(partial(of_parameter, place.parameter, place.array))(of_channels)
 
 
 def by_column(place: Place, row: Float[Array, "entries 3"]) -> Float[Array, "Q 3"]:
-    """The same, of each channel in each number; in colours in the same channel, as all else is 0."""
+    """Return the derivative of each channel in the same channel of Q colours (others are 0), or in Q scalars."""
     if place.parameter.is_color:
         return of_parameter(place.parameter, place.array, row).reshape(-1, 3)
     return by_channel(place, row).reshape(3, -1).T

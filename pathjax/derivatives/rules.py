@@ -1,13 +1,13 @@
-"""The rule of differentiation of whatever is estimated of a scene: in named parameters, and in nothing else.
+"""The differentiation rule of all estimates of a scene: they are differentiable in named parameters, and nothing else.
 
-An estimate E(theta) is differentiated by the Jacobian J that its own kernel makes beside it: the tangent of E is
-J d(theta). That is linear in d(theta), so JAX transposes it: `jax.jvp`, `jax.linearize`, `jax.jacfwd`, `jax.grad` and
-optimistix's solvers all work, and what they ask of the kernel is always the same. Of many numbers, as those of
-textures, J is never made: J v and J^T v come by kernels of their own, the transpose of each other.
+The kernel of an estimate E(theta) also makes its Jacobian J, and the tangent of E is J d(theta). That is linear in
+d(theta), so JAX transposes it: `jax.jvp`, `jax.linearize`, `jax.jacfwd`, `jax.grad` and optimistix's solvers all work,
+and all run the same kernel. For many scalars, such as textures, J is never made: J v and J^T v have kernels of their
+own, each the transpose of the other.
 
-What d(theta) is, the scene says: `with_parameters` keeps traced values by name in `Scene.varied`, and puts them into
-the tables detached. A derivative that arrives by a table all the same was asked for by other means; it is that of all
-parameters in the table, and where there are none it is refused.
+The scene says what d(theta) is: `with_parameters` keeps traced values by name in `Scene.varied`, and puts them into the
+tables detached. A tangent that arrives through a table all the same was set by other means: it counts as the tangent of
+all parameters in that table, and is refused where there are none.
 """
 
 from __future__ import annotations
@@ -25,40 +25,40 @@ from pathjax.kinds.parameter import Parameter
 from pathjax.scene import parameters as named
 from pathjax.scene.scene import Scene
 
-# The field of a step down to a leaf that says where it goes.
+# Type of a key in the path to a leaf -> the attribute that holds its name or index.
 KEYS = {jax.tree_util.GetAttrKey: "name", jax.tree_util.SequenceKey: "idx", jax.tree_util.DictKey: "key"}
 
 
 @runtime_checkable
 class Estimator(Protocol):
-    """Something that is estimated of a scene."""
+    """An estimate of a scene."""
 
     def value(self, scene: Scene, *work) -> jax.Array: ...
 
     def jacobian(self, scene: Scene, wanted: dict[str, Parameter], *work) -> tuple[jax.Array, dict[str, jax.Array]]:
-        """The value, and by name its derivative, (*shape of the value, *shape of the parameter).
+        """Return the value and, by name, its derivative (*shape of the value, *shape of the parameter).
 
         Raises:
-            InputError: what it is not differentiated in.
+            InputError: the estimate cannot be differentiated in one of the parameters.
         """
 
     def matrix_free(self, scene: Scene, wanted: dict[str, Parameter]) -> set[str]:
-        """Names in which it is better differentiated by `push` and `pull` than by the Jacobian."""
+        """Return the names in which differentiating by `push` and `pull` is better than by the Jacobian."""
 
 
 @runtime_checkable
 class MatrixFree(Estimator, Protocol):
-    """What is estimated, and differentiated without its Jacobian too."""
+    """An estimate that can be differentiated without its Jacobian too."""
 
     def push(self, scene: Scene, wanted: dict[str, Parameter], changes: dict[str, jax.Array], *work) -> jax.Array:
-        """J v of such names."""
+        """Return J v for names from `matrix_free`."""
 
     def pull(self, scene: Scene, wanted: dict[str, Parameter], adjoint: jax.Array, *work) -> dict[str, jax.Array]:
-        """J^T v of such names."""
+        """Return J^T v for names from `matrix_free`."""
 
 
 def estimate(estimator: Estimator, scene: Scene, *work) -> jax.Array:
-    """`estimator.value` of a scene without names, differentiable in the named parameters of the scene."""
+    """Return `estimator.value` of the scene without names, differentiable in the scene's named parameters."""
     parameters = {} if scene.about is None else scene.about.parameters
     return _estimate((estimator, parameters), named.nameless(scene), scene.varied, *work)
 
@@ -80,10 +80,10 @@ def _estimate_jvp(static, primals, tangents):
     named.refuse_constant(scene, wanted)
     free = {name: wanted.pop(name) for name in sorted(estimator.matrix_free(scene, wanted))}
     if free:
-        # Not attached, which would copy texels.
+        # Attaching the values would copy texels.
         scene, _ = differentiated_once((scene, varied), "an image in a texture, or in many colours,")
     else:
-        # Attached, for derivatives of the derivative.
+        # Values are attached for second derivatives.
         scene = named.with_values(scene, varied, parameters)
     value, J = estimator.jacobian(scene, wanted, *work) if wanted else (estimator.value(scene, *work), {})
     tangent = jnp.zeros_like(value)
@@ -109,7 +109,7 @@ def _moved(estimator: MatrixFree, free: dict[str, Parameter], changes: dict[str,
 
 
 def _changes(parameters: Mapping[str, Parameter], scene_tangent, varied_tangent) -> dict[str, jax.Array]:
-    """Tangents of named parameters, by name; those that are known to be zero are left out."""
+    """Return the tangents of named parameters, by name, without those that are symbolic zeros."""
     changes = {name: x for name, x in varied_tangent.items() if not is_symbolic_zero(x)}
     leaves, _ = jax.tree_util.tree_flatten_with_path(scene_tangent, is_leaf=is_symbolic_zero)
     for keys, leaf in leaves:
@@ -130,7 +130,7 @@ def _changes(parameters: Mapping[str, Parameter], scene_tangent, varied_tangent)
 
 @partial(jax.custom_jvp, nondiff_argnums=(1,))
 def differentiated_once(scene, where: str):
-    """The scene; a derivative in it is refused. where: what is differentiated, in words."""
+    """Return the scene, refusing derivatives in it. where: words for the error: what is differentiated already."""
     return scene
 
 

@@ -1,6 +1,6 @@
-"""Derivatives in colours, which change what paths carry: detached sampling, all tangents in one pass of a kernel.
+"""Derivatives in colours and other parameters that change what paths carry: detached sampling, all tangents at once.
 
-Light does not change its channel on the way, so one tangent stands for the three channels of a colour.
+Light keeps its channel, so one tangent covers the three channels of a colour.
 """
 
 from __future__ import annotations
@@ -16,14 +16,17 @@ from pathjax.kinds.parameter import Parameter
 from pathjax.scene import parameters as named
 from pathjax.scene.scene import Scene
 
-# The path to the table of each colour, and its index there.
+# Per parameter: the path to its array, and its index there.
 Places = tuple[tuple[tuple, tuple], ...]
 
 
 def refuse_textures(wanted: Mapping[str, Parameter], unless: str = "") -> None:
-    """Raises InputError: one of the parameters is a texture, whose entries are too many for a tangent each.
+    """Refuse textures, whose entries are too many for one tangent each.
 
-    unless: where there would be derivatives.
+    Args:
+        unless: words for the error: the condition under which a texture has derivatives.
+    Raises:
+        InputError: one of the parameters is a texture.
     """
     for name, parameter in wanted.items():
         if parameter.is_texture:
@@ -38,12 +41,12 @@ def places(parameters: Iterable[Parameter]) -> Places:
 
 
 def in_parameter(slope: Float[Array, "*shape 3"], of_color: bool) -> Float[Array, "..."]:
-    """In a colour (*shape, 3, 3), from the derivative of each channel in its own; in a number, that of each channel."""
+    """Return the derivative in a colour, (*shape, 3, 3), from that of each channel in its own; in a scalar, `slope`."""
     return slope[..., None] * jnp.eye(3, dtype=slope.dtype) if of_color else slope
 
 
 def unit_tangents(scene: Scene, colors: Places) -> list[Float[Array, "colors ..."]]:
-    """A unit change of all channels of each colour: for every table, of the shape of the table."""
+    """Return, for every table, one tangent per colour of the table's shape: 1 in all channels of the colour."""
     tangents = []
     for table_path in _tables(colors):
         table = named.get(scene, table_path)
@@ -58,9 +61,11 @@ def unit_tangents(scene: Scene, colors: Places) -> list[Float[Array, "colors ...
 def by_tangent(
     of: Callable, scene: Scene, colors: Places, tangents: list[Float[Array, "colors ..."]]
 ) -> tuple[Float[Array, "*shape"], Float[Array, " colors *shape"], object]:
-    """A value of the scene, its derivatives, and what comes with it: `of(scene)` is value and company.
+    """Return a value of the scene, its derivatives, and its auxiliary output.
 
-    tangents: `unit_tangents` of the colors.
+    Args:
+        of: scene -> (value, auxiliary output).
+        tangents: `unit_tangents` of the colors.
     """
     if not colors:
         value, company = of(scene)
@@ -80,5 +85,5 @@ def by_tangent(
 
 
 def _tables(colors: Places):
-    """Paths of the tables that hold the colours, each once."""
+    """Return the paths of the tables that hold the colours, each once."""
     return list(dict.fromkeys(table_path for table_path, _ in colors))

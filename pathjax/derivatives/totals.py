@@ -1,6 +1,6 @@
-"""What the derivatives of all vertices are added up in: a list, whose entries are colours, or a column for each number.
+"""The totals of the derivatives of all vertices: a list with a row per entry or, for few entries, a column per scalar.
 
-XLA's own scatter would break the native kernel, so lanes add to a list one after another, some of them in a trip.
+XLA's own scatter would break the native kernel, so lanes add to a list one after another, several of them per trip.
 """
 
 from __future__ import annotations
@@ -16,39 +16,39 @@ from jaxtyping import Array, Float, Int
 from pathjax.core.math import at
 from pathjax.derivatives.record import Slot
 
-# Entries of a list that every lane sums up by itself.
+# Up to this many entries every lane sums up by itself.
 FEW = 8
-# Bytes of a list that stay in near caches.
+# Bytes of a list that stays in near caches.
 NEAR = 1 << 19
-# Numbers of an entry of a list: three, and one more, so that they are added at once, and lie on one line of a cache.
+# Scalars of a list entry: three, and one more so that they are one vector, added at once, and lie in one cache line.
 WIDTH = 4
-# Lanes that add to a list in one trip of a loop, which takes as long as some of them.
+# Lanes that add to a list in one trip of a loop: the overhead of a trip is that of several adds.
 AT_ONCE = 4
 
-# Of few entries, a column for each number of theirs; or the list, of which whole vectors are added up.
+# For few entries, a column for each of their scalars; else the list, to which whole vectors are added.
 Total = list[Float[Array, " W"]] | Float[Array, "entries 4"]
 
 
 def start(entries: int, lanes: int, dtype) -> Total:
-    """Zeros."""
+    """Return a total of zeros."""
     few = entries <= FEW
     return [jnp.zeros((lanes,), dtype)] * (3 * entries) if few else jnp.zeros((entries, WIDTH), dtype)
 
 
 def count(total: Total) -> int:
-    """Its entries."""
+    """Return the number of entries."""
     return len(total) // 3 if isinstance(total, list) else len(total)
 
 
 def finish(total: Total) -> Float[Array, "entries 4"]:
-    """The list, whatever it was added up in."""
+    """Return the list, from either form of total."""
     if isinstance(total, list):
         total = jnp.pad(jnp.stack([jnp.sum(x) for x in total]).reshape(-1, 3), [(0, 0), (0, WIDTH - 3)])
     return total
 
 
 def add(total: Total, slot: Slot, change: list[Float[Array, " W"]]) -> Total:
-    """The total to which each lane's change (3) is added."""
+    """Return the total with each lane's change (3) added."""
     if isinstance(total, list):
         for place, share in zip(slot.places, slot.shares or [None], strict=True):
             total = [t + jnp.where(place == k // 3, _part(change, share)[k % 3], 0) for k, t in enumerate(total)]
@@ -60,7 +60,7 @@ def add(total: Total, slot: Slot, change: list[Float[Array, " W"]]) -> Total:
         places = [jnp.where(adds, place, 0) for place in places]
         first = _read_ahead(total, places)
 
-    # A lane that adds nothing adds 0.
+    # A lane without a change adds 0.
     def one(lane, total):
         of_lane = partial(jax.tree.map, lambda column: at(column, lane))
         x = _as_entry(of_lane(change))
@@ -82,7 +82,7 @@ def add(total: Total, slot: Slot, change: list[Float[Array, " W"]]) -> Total:
 
 
 def _as_entry(numbers: list[Float[Array, ""]]) -> Float[Array, "1 4"]:
-    """Three numbers as the list has them. Stacked, they would be laid side by side by branches, one after another."""
+    """Return three scalars as a list entry. `jnp.stack` would compile to branches, one after another."""
     k = jnp.arange(WIDTH)
     x = jnp.zeros_like(numbers[0])
     for channel, number in enumerate(numbers):
@@ -91,17 +91,17 @@ def _as_entry(numbers: list[Float[Array, ""]]) -> Float[Array, "1 4"]:
 
 
 def _read_ahead(total: Float[Array, "entries 4"], places: Sequence[Int[Array, " W"]]) -> Int[Array, ""]:
-    """0, when all places have been read, and so are in a near cache.
+    """Read all places, so that they are in a near cache, and return 0.
 
-    Processors read far memory many places at a time, but add to few: each add holds the ones behind it up. The result
-    depends on what was read, so that no compiler leaves the reading out.
+    Processors have many reads of far memory in flight at a time but few adds, since each add delays those after it. The
+    result depends on the values read, so that the compiler keeps the reads.
     """
     read = sum(total.at[place.astype(jnp.uint32), 0].get(mode="promise_in_bounds") * 0 for place in places)
     return jnp.where(jnp.sum(read) > 0, 1, 0)
 
 
 def _part(change, share):
-    """Three numbers times their share, which is one for all, or one of each; None: all of them."""
+    """Return three scalars times their share: one for all, or one of each; None: 1."""
     if share is None:
         return change
     return [s * x for s, x in zip(share if isinstance(share, list) else [share] * 3, change, strict=True)]
