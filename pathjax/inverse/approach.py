@@ -1,4 +1,4 @@
-"""The first stage of a fit: least squares of renders with a fixed seed, which are a deterministic function."""
+"""The first stage of a fit: least squares on renders with a fixed seed, which are a deterministic function."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ MAX_STEPS, MAX_REJECTED = 30, 3
 
 
 def approach(state: State) -> None:
-    """Move the values to a minimum near them, as far as few samples tell."""
+    """Move the values to a nearby minimum, as precisely as few samples allow."""
     spp, vector = min(APPROACH_SPP, state.spp), state.vector
     state.weigh(spp)
     x = jnp.asarray(vector.unbounded(state.values), state.dtype)
-    # In units of the noise at this level; but a start far off is no more than 1 on average, since the first steps of
-    # solvers suppose numbers of that size.
+    # Residuals in units of the noise at this level; but scaled down to 1 on average where the start is far off, since
+    # solvers assume numbers of that size in their first steps.
     squares = state.weights * state.normal.residuals[0] ** 2
     shrink = 1 / max(1, float(squares.mean()))
     weights = jnp.asarray(state.weights * shrink)
@@ -34,8 +34,8 @@ def approach(state: State) -> None:
         loss = float(loss) / shrink
         state.values = np.asarray(vector.bounded(x), float)
         state.record("approach", spp, loss)
-        # The solver tells the loss one step late, and the same one again after a step that it took back. A step that
-        # gains less than the loss is uncertain by is left to the next stage.
+        # The solver reports the loss one step late, and repeats it after a step that it took back. Gains below the
+        # uncertainty of the loss are left to the next stage.
         rejected = rejected + 1 if loss == lowest else 0
         if bool(done) or rejected > MAX_REJECTED or 0 < lowest - loss < max(len(x) / 2, np.sqrt(loss)):
             break

@@ -1,4 +1,4 @@
-"""Solvers as compiled programs, kept for the next fit of the same problem."""
+"""Compiled programs, such as solvers, cached for the next fit of the same problem."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 
 
 class Stepper:
-    """An optimistix solver taken step by step, compiled."""
+    """A compiled optimistix solver that is run step by step."""
 
     def __init__(self, solver, fn: Callable, y, arguments):
         def begin(y, arguments):
@@ -27,13 +27,13 @@ class Stepper:
         self.step = eqx.filter_jit(step).lower(y, self.begin(y, arguments), arguments).compile()
 
 
-# The latest of this process, by solver, parameters and shapes, so that fits of the same problem compile once.
+# The latest programs of this process, by solver, parameters and shapes, so that fits of the same problem compile once.
 _programs: dict = {}
 _MAX_PROGRAMS = 12
 
 
 def compiled(key: Hashable, make: Callable, *arguments):
-    """Return make(*arguments), or what it made for this key and arguments of these shapes before; and its seconds."""
+    """Return make(*arguments), cached by the key and the arguments' shapes, and the seconds that this call took."""
     leaves, tree = jax.tree.flatten(arguments)
     key = key, tree, tuple((leaf.shape, leaf.dtype) for leaf in leaves)
     started = time.perf_counter()
@@ -45,7 +45,7 @@ def compiled(key: Hashable, make: Callable, *arguments):
 
 
 def identity(solver) -> Hashable:
-    """Equal for solvers of one class with the same hyperparameters, functions and arrays, and for no others."""
+    """Return a key: equal for solvers of one class with the same hyperparameters, functions and arrays, else not."""
     leaves, tree = jax.tree.flatten(solver)
     return tree, tuple(_identity(leaf) for leaf in leaves)
 

@@ -1,14 +1,14 @@
-"""Fits of some thousand texels: Gauss-Newton with the matrix itself, solved exactly, which states exact errors.
+"""Fits of some thousand texels: Gauss-Newton with the matrix itself, solved exactly, which gives exact errors.
 
-Light keeps its channel, so of Q colours each channel has equations of its own. Of Q numbers, as roughnesses, all
-channels have the same. Such a system of equations is
+Light keeps its channel, so Q colours have one system of equations for each channel. Q scalars, such as roughnesses,
+have one system from all channels. A system is
 
     (J' W J + P) step = J' W (target - image) + P (mean - values),        errors C (J' W V W J + P) C
 
-with C = (J' W J + P)^-1 and V the variance of what pixels miss. J is the mean of two independent renders, whose
-difference D, halved, tells how much of it is noise. That noise adds D' W D to J' W J, as if texels were known that no
-pixel knows: to first order C is too small by C D' W D C, so J has as many samples as make this a small part of C. Where
-they cannot be had, a pixel weighs as much less as its row is less than sure, and what is missing is added to errors.
+with C = (J' W J + P)^-1 and V the variance of the residuals. J is the mean of two independent renders, and half their
+difference, D, shows how noisy it is. That noise adds D' W D to J' W J, as if pixels determined texels that they do not.
+To first order C is then too small by C D' W D C, so J gets enough samples to make this a small part of C. Against what
+remains, a pixel weighs less the noisier its row of J is, and the missing variance is added to the errors.
 """
 
 from __future__ import annotations
@@ -25,23 +25,23 @@ from pathjax.inverse.prior import waves_of
 from pathjax.inverse.problem import Problem
 from pathjax.inverse.uncertainty import MAX_RELATIVE_ERROR
 
-# Up to so many colours, or numbers: a matrix is then 8 MB, and solved within a second. And up to so many products of
-# two entries of a pixel's row: to sum them up takes some seconds.
+# Most colours, or scalars: a matrix is then 8 MB, and solved within a second. And most products of two entries of a
+# pixel's row: summing them takes some seconds.
 MOST_COLUMNS, MOST_PRODUCTS = 1024, 1 << 34
-# Samples of each of the two J: at most so many times those of the image; and for errors they are raised so often, if
-# they are too few.
+# Samples of each of the two J: at most this many times those of the image. Where errors need more samples than a first
+# try had, they are raised at most this often.
 MOST_SAMPLES, RAISED = 4, 2
-# What noise of J pretends to know is found with so many signs drawn for each pixel, and is to be small for all but this
-# part of the texels that are known.
+# Random signs per pixel that estimate the information falsely added by noise of J; and the part of the determined
+# texels for which that need not be small.
 SIGNS, LEFT_OUT = 16, 0.05
-# Where the last step led is looked at with this part of the samples.
+# The result of the last step is checked with the samples divided by this.
 CHECK_PART = 4
-# How often a step solves its equations, at most, to find which values stay at a bound: some 50 rounds are usual.
+# Most rounds, each a solution of the equations, to find the values that a step leaves at a bound; about 50 are usual.
 ROUNDS = 500
 
 
 def is_dense(problem: Problem) -> bool:
-    """Whether the fit is of colours alone, or of numbers alone, few enough for `Dense`."""
+    """Return whether the fitted parameters are all colours, or all scalars, and few enough for `Dense`."""
     pixels, systems = sum(target.image.size // 3 for target in problem.targets), problem.vector.systems
     columns = problem.vector.count // max(systems, 1)
     if not systems or columns > MOST_COLUMNS or pixels * columns**2 > MOST_PRODUCTS:
@@ -52,17 +52,17 @@ def is_dense(problem: Problem) -> bool:
 def least_within(
     A: np.ndarray, gradient: np.ndarray, x: np.ndarray, low: np.ndarray, high: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Where a quadratic is least within bounds, and which values are at none of them: (n,), (n,) bool.
+    """Minimise a quadratic within bounds; return the minimum and which values are free, at no bound: (n,), (n,) bool.
 
-    By an active set (Nocedal and Wright 2006, Numerical Optimization, 16.5). Values at a bound are held there; the
-    others go to where the quadratic is least, or as far on the way as bounds allow, and those that meet one are held.
-    When none does, those are let go that the quadratic draws inwards. It becomes less in each round: pivoting without
-    that guarantee goes round in circles where values are strongly correlated.
+    By an active set (Nocedal and Wright 2006, Numerical Optimization, 16.5). Values at a bound are held there. The
+    others move to the minimum, or towards it as far as the bounds allow, and those that meet a bound are held. When
+    none does, held values that the quadratic draws inwards are released. The quadratic decreases in each round:
+    pivoting without that guarantee cycles where values are strongly correlated.
 
     Args:
         A: (n, n) symmetric, positive definite.
         gradient: (n,) at x.
-        x: (n,) within the bounds.
+        x: (n,) start, within the bounds.
     """
     start, slope = x, gradient
     held = (x <= low) & (slope > 0) | (x >= high) & (slope < 0)
@@ -80,7 +80,7 @@ def least_within(
         if beyond.any():
             part = np.where(beyond, (bound - x) / np.where(beyond, step, 1), np.inf)
             first = np.where(part <= part.min(), bound, np.clip(x + part.min() * step, low, high))
-            # To cut off what is beyond may be better, and holds more values at once.
+            # Clipping the whole step may be better, and holds more values at once.
             x = min(first, np.clip(x + step, low, high), key=change)
             held |= (x == bound) & (step != 0)
         else:
@@ -95,19 +95,19 @@ def least_within(
 
 
 class Equations(NamedTuple):
-    """The normal equations of S systems: of each channel, for Q colours, or of all together, for Q numbers."""
+    """The normal equations of S systems: one per channel for Q colours, or a single one for Q scalars."""
 
     matrix: np.ndarray  # (S, Q, Q) J' W J
     gradient: np.ndarray  # (Q, S) J' W (image - target)
     known: np.ndarray  # (Q, S) diagonal of J' V^-1 J, to which noise of J adds nothing
-    pretended: np.ndarray  # (S, Q, K), of which the squares have the mean D' W D
-    scatter: np.ndarray  # (S, Q, Q) J' W V W J, if asked for
+    pretended: np.ndarray  # (S, Q, K) random vectors whose outer products have the mean D' W D
+    scatter: np.ndarray  # (S, Q, Q) J' W V W J, if requested
 
 
 class Dense(Search):
-    """`Search`, of few enough numbers that their matrix is kept."""
+    """A `Search` with so few parameters that it stores their matrix."""
 
-    # All pixels count: few would save little, and one may be the only one that knows of a texel.
+    # All pixels are used: fewer would save little, and a single one may be all that determines a texel.
     least_told = 0.0
 
     def step(self) -> None:
@@ -118,9 +118,9 @@ class Dense(Search):
         self.values = self.bounded(gradient, damping)
 
     def bounded(self, gradient: np.ndarray, damping: np.ndarray) -> np.ndarray:
-        """Where the quadratic of this gradient and of `times` is least within the bounds.
+        """Return the minimum within the bounds of the quadratic with this gradient and the matrix of `times`.
 
-        A step that is merely clipped leaves neighbours where they made up for what was cut off.
+        If a step were merely clipped, neighbours would still compensate for the part that was cut off.
         """
         values = self.by_system(self.values).copy()
         self.free = np.ones(values.shape, bool)
@@ -131,20 +131,20 @@ class Dense(Search):
         return values.ravel()
 
     def by_system(self, x: np.ndarray) -> np.ndarray:
-        """(n,) as (Q, S)."""
+        """Return x (n,) as (Q, S)."""
         return x.reshape(-1, self.vector.systems)
 
     def solved(self, variance: np.ndarray | None = None) -> Equations:
-        """Find the equations and their inverse; for errors (variance: of `sums`) with as many samples of J as it takes.
+        """Sum up and invert the equations; for errors (`variance` as for `sums`) with as many samples of J as needed.
 
-        Steps have as many as those before asked for.
+        Steps take the number of samples that the equations before were found to need.
         """
         most = MOST_SAMPLES * self.samples
         for _ in range(1 if variance is None else 1 + RAISED):
             self.product_spp = min(max(self.sharp, PRODUCT_SPP), most)
             self.equations = found = self.sums(variance)
             self.inverse = np.stack([linalg.inv(m + self.prior_matrix) for m in found.matrix])
-            self.pretended = ((self.inverse @ found.pretended) ** 2).mean(-1).T.ravel()  # (n,) of their variances
+            self.pretended = ((self.inverse @ found.pretended) ** 2).mean(-1).T.ravel()  # (n,) missing variance
             variances = np.einsum("sqq->qs", self.inverse).ravel()
             known = variances < (MAX_RELATIVE_ERROR * self.prior.scale) ** 2
             part = (self.pretended / variances)[known if known.any() else ...]
@@ -154,14 +154,14 @@ class Dense(Search):
         return found
 
     def times(self, x: np.ndarray) -> np.ndarray:
-        """The matrix of the equations of the last step times x (n,)."""
+        """Return the matrix of the last step's equations times x (n,)."""
         x = self.by_system(x)
         return (np.einsum("sqr,rs->qs", self.equations.matrix, x) + self.prior_matrix @ x).ravel()
 
     def sums(self, variance: np.ndarray | None = None) -> Equations:
-        """Sum up the normal equations over the kept pixels; with `scatter`, if their variance (N, 3) is given.
+        """Sum up the normal equations over the kept pixels; with `scatter` if the residuals' variance (N, 3) is given.
 
-        Parts of the pixels are dealt to devices, and to processes, and added up in their order.
+        Parts of the pixels are dealt to devices and to processes, and summed in their order.
         """
         products, systems = self.products, self.vector.systems
         draws, scatter = (products.next_draw(), products.next_draw()), variance is not None
@@ -172,7 +172,7 @@ class Dense(Search):
         ends = np.cumsum([x.size for x in found])
 
         def of_part(part) -> np.ndarray:
-            """Equations of a part of the pixels, and their trust, as words of float64, which JAX would round."""
+            """Return the equations of some pixels, and their trust, as words of float64, which JAX would round."""
             a, b = part.rows()
             J = (a + b) / 2
             whole = (J * J).sum((0, 2))
@@ -181,7 +181,7 @@ class Dense(Search):
             trusts[: len(trust)] = trust
 
             def rows(x):
-                """Of the equations of each system: (3, n, ...) -> (S, 3/S n, ...)."""
+                """Assign rows to systems: (3, n, ...) -> (S, 3/S n, ...)."""
                 return x.reshape(systems, -1, *x.shape[2:])
 
             w = self.weights[part.places].T
@@ -208,7 +208,7 @@ class Dense(Search):
         return found
 
     def solve(self, right: np.ndarray, damping: np.ndarray | float = 0.0) -> np.ndarray:
-        """What solves the equations of the last step; 0 where values stay at a bound."""
+        """Solve the equations of the last step; 0 where values stay at a bound."""
         right, free = self.by_system(right), self.by_system(self.free)
         more = self.by_system(np.broadcast_to(damping, len(self.values)))
         solution = np.zeros_like(right)
@@ -237,13 +237,13 @@ class Dense(Search):
         return self.solve(np.stack(score, -1).ravel())
 
     def check(self) -> float:
-        """Look at where the last step led. Returns the variance of target and image, over that of one sample."""
+        """Check the result of the last step; return the variance of target and image over that of one sample."""
         equations = self.weights, self.render_part, self.samples, self.variances, self.renders
         self.excess = self.look(whole(self.spp / CHECK_PART))
-        # Of few samples the noise is another, as they are spread less evenly: it is that of the renders before.
+        # Fewer samples are spread less evenly and have other noise per sample, so that of the earlier renders is kept.
         self.weights, self.render_part, self.samples, self.variances, self.renders = equations
-        # As many values as the pixels determine are fitted to the noise of target and image: with H what that makes of
-        # pixels, these miss (1 - H) times the noise of the target, and H times that of the image that was stepped from.
+        # Values were fitted to the noise of target and image, as many as the pixels determine: with H the hat matrix,
+        # residuals are (1 - H) times the noise of the target, and H times that of the image before the step.
         used = (self.weights > 0) * self.trust
         count, told, image = used.sum(), self.told.sum(), 1 / (BATCHES * self.each)
         single = self.products.kept([variance / self.renders for variance in self.variances])
@@ -251,13 +251,13 @@ class Dense(Search):
         missed = self.missed / share if share > 0 else 0.0
         target = float(np.clip((missed - image * told) / max(count - told, 1), 0, 1))
         self.target_part = share * target
-        # The variance (N, 3) of what the image misses, of each pixel by itself: noisy, but not biased.
+        # The variance (N, 3) of each pixel's residual, from this pixel alone: noisy, but not biased.
         steps = self.products.kept([np.broadcast_to(t.step, t.image.shape) for t in self.problem.targets])
         self.missing = single * (image + target) + steps**2 / 12 + self.problem.rounding**2
         return self.render_part + self.target_part
 
     def find_errors(self, larger: float) -> None:
-        """Standard errors, by what pixels miss by themselves, which holds how much larger their noise is."""
+        """Set the standard errors, from the variance of each pixel's own residual, which includes `larger`."""
         found, C = self.solved(self.missing), self.inverse
         variances = (C @ (found.scatter + self.prior_matrix) * C).sum(-1).T.ravel() + self.pretended
         most = (MAX_RELATIVE_ERROR * self.prior.scale) ** 2

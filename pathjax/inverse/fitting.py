@@ -1,14 +1,14 @@
 """Parameters from images, with their uncertainty.
 
 A fixed seed makes a rendered image a deterministic function, which an optimistix solver can fit to a target; but the
-square of its noise moves the minimum. So a fit goes in two stages. A solver of least squares approaches, with few
-samples. Then two independent renders A and B replace the square by a product: the score
+square of its noise moves the minimum. So a fit has two stages. First a least-squares solver approaches the minimum with
+few samples. Then two independent renders A and B replace the square by a product: the score
 
     g = (J_A' W r_B + J_B' W r_A) / 2,    r = image - target,
 
-has mean 0 at the truth, whatever the noise of the renders, and its matrix (J_A' W J_B + J_B' W J_A) / 2 is not too
-large either. Newton's method finds its root; its scatter over the pixels gives the covariance. Pixels of the renders
-are independent. Those of a target may share samples under a wide filter: then the scatter is that of blocks of pixels.
+has mean 0 at the truth, whatever the noise of the renders, and noise does not enlarge its matrix (J_A' W J_B + J_B' W
+J_A) / 2 either. Newton's method finds its root; its scatter over pixels gives the covariance. Pixels of the renders are
+independent. Those of a target may share samples under a wide filter: then the scatter is taken over blocks of pixels.
 """
 
 from __future__ import annotations
@@ -47,27 +47,27 @@ Seen = Target | Real[Array | np.ndarray, "height width 3"]
 
 @dataclass
 class Fit:
-    """What the images say about the parameters.
+    """The result of a fit: values of the parameters and their uncertainty.
 
-    Components are the parameters, or the channels of colours: `white.reflectance.r`.
+    Components are scalar parameters, or the channels of colours: `white.reflectance.r`.
     """
 
     values: dict[str, np.ndarray]
     standard_errors: dict[str, np.ndarray]  # inf: the images do not determine it
-    # (n, n) in the order of `components`; rows of what is not determined: inf, nan beside it. None: of many numbers.
+    # (n, n) in the order of `components`; undetermined ones have inf, and nan beside it. None: fits of many scalars.
     covariance: np.ndarray | None
     components: list[str]
     undetermined: list[dict[str, float]]  # directions that the images do not determine: component -> change
     at_bound: list[str]  # components that ended at a bound of their parameter
     converged: bool
-    message: str  # why it ended, and what to mind
-    images: list[np.ndarray]  # of each view (H, W, 3), at the end
-    residuals: list[np.ndarray]  # of each view (H, W, 3): image - target, in standard deviations; nan where left out
-    history: list[dict]  # of each step: stage, spp, values, loss, seconds
+    message: str  # why the fit ended, and warnings
+    images: list[np.ndarray]  # (H, W, 3) per view, at the end
+    residuals: list[np.ndarray]  # (H, W, 3) per view: image - target, in standard deviations; nan where left out
+    history: list[dict]  # per step: stage, spp, values, loss, seconds
     compile_seconds: float
     run_seconds: float
     scenes: list[Scene]  # the views, at the fitted values
-    # Of each texture with `smoothness`: how much neighbours were supposed to differ, and the power (`inverse.prior`).
+    # Per texture with `smoothness`: the assumed difference of neighbours, and the power (`inverse.prior`).
     smoothness: dict[str, tuple[float, float]] = field(default_factory=dict)
 
     @property
@@ -77,7 +77,7 @@ class Fit:
 
     @property
     def seen(self) -> dict[str, np.ndarray]:
-        """By name, which texels and other parameters the images determine: bool, of the shape but for channels."""
+        """By name, which texels and other parameters the images determine: bool, of their shape without channels."""
         known = self.scene.described.parameters
         return {
             name: np.isfinite(error).all(-1) if known[name].is_color else np.isfinite(error)
@@ -86,7 +86,7 @@ class Fit:
 
     @property
     def correlation(self) -> np.ndarray | None:
-        """(n, n); nan beside what is not determined. None: of many numbers."""
+        """(n, n) correlation; nan for undetermined components. None: fits of many scalars."""
         if self.covariance is None:
             return None
         sigma = np.sqrt(np.diag(self.covariance))
@@ -115,35 +115,34 @@ def fit(
     Args:
         scene: a scene, or a list of views; views share parameters by name.
         target: linear RGB or a `Target`, as `read_target` returns it; or a list of them, one for each view.
-            Its noise must be independent from pixel to pixel, but for what they share under the filter of the scene's
-            film; the fit finds out how large it is.
-        names: of parameters to recover, as `parameters` lists them.
-        start: values to begin with, by name; default: the scene's.
+            Its noise must be independent from pixel to pixel, except where pixels share samples under the filter of
+            the scene's film; the fit estimates how large it is.
+        names: of the parameters to recover, as `parameters` lists them.
+        start: initial values by name; default: the scene's.
         spp: samples per pixel of each of the two independent renders of the last stage.
         seed: of the first render; all others follow from it.
         solver: an optimistix least-squares solver or minimiser for the approach; default: LevenbergMarquardt.
         scan: try indices of refraction over their whole range first, since a local method finds the nearest minimum.
-        smoothness: of textures, how much neighbouring texels are expected to differ, in the root mean square and in
-            units of the parameter; "auto" finds it out, and the power of the Laplacian; None: nothing is supposed of
-            neighbours.
-        prior: "laplacian", of differences that are alike everywhere; or "total variation", of few large ones, as at
-            edges, whose mean is then `smoothness`: see `inverse.prior.Prior`.
+        smoothness: for textures, the expected root mean square difference of neighbouring texels, in units of the
+            parameter; "auto" estimates it, and the power of the Laplacian; None: nothing is assumed about neighbours.
+        prior: "laplacian", for differences that are alike everywhere; or "total variation", for a few large ones, as
+            at edges, whose mean is then `smoothness`: see `inverse.prior.Prior`.
         progress: True for a line on stderr at each step, or a function that is called with each entry of the history;
-            of several processes, in the first.
+            with several processes, only in the first.
     Returns:
-        Fit. Ctrl-C ends it with what it has, marked as not converged.
+        Fit. Ctrl-C ends it with the values so far, marked as not converged.
     Raises:
-        InputError: an unknown or repeated name, a start outside its bounds, a target of another size, with negative or
-            non-finite values, fewer measured pixels than unknowns that are no texels; smoothness without a texture;
-            more numbers than memory has room for.
-    Standard errors come from the scatter of the scores over pixels (White 1980). They hold the noise of target, its
-    rounding, renders and Jacobians, and suppose that the scene can look like the target: `converged` is False where
-    neighbouring residuals agree too well for noise (`uncertainty.structure`). The differences that stand for
-    derivatives in an IOR have a bias (`jacobian`), which does not move the root of the score.
-    Those of textures, and of more than 300 numbers together, are those of the posterior, from a few draws of it
-    (`many`): uncertain by 10 to 20 %, and inf where no pixel tells anything of a texel, which keeps what was supposed.
-    Clipped pixels are left out, and so are those that noise may have clipped: to leave out only those that it did clip
-    would keep the darker ones. Which these are is told by renders and the noise around, never by the pixel itself.
+        InputError: an unknown or repeated name, a start outside its bounds, a target of another size or with negative
+            or non-finite values, fewer measured pixels than unknowns other than texels; smoothness without a texture;
+            more parameters than fit into memory.
+    Standard errors come from the scatter of the scores over pixels (White 1980). They include the noise of target, its
+    rounding, renders and Jacobians, and assume that the scene can look like the target: `converged` is False where
+    neighbouring residuals agree too well for noise (`uncertainty.structure`). The differences that replace derivatives
+    in an IOR have a bias (`jacobian`), which does not move the root of the score.
+    For textures, and for more than 300 scalars together, they are those of the posterior, from a few draws of it
+    (`many`): uncertain by 10 to 20 %, and inf where pixels tell nothing about a texel, which keeps its prior value.
+    Clipped pixels are left out, and so are those that noise may have clipped: leaving out only those that it did clip
+    would keep the darker ones. Renders and the noise around decide which these are, never the pixel itself.
     """
     check_counts(spp, seed)
     chosen, solver = solver, solver or optx.LevenbergMarquardt(rtol=1e-4, atol=1e-4)
@@ -208,15 +207,15 @@ def step_text(entry: dict) -> str:
 
 
 def _print_step(entry: dict) -> None:
-    with contextlib.suppress(OSError):  # a terminal that is gone costs no fit
+    with contextlib.suppress(OSError):  # the fit goes on if the terminal is gone
         print(step_text(entry), file=sys.stderr)
 
 
 def _stages(state: State, scan: bool) -> tuple[bool, str]:
-    """Approach from each of the values to begin with until residuals are noise, and refine the best."""
+    """Approach from each of the initial values until residuals are noise, and refine the best result."""
     best = None
     for values in scanned(state) if scan else [state.values]:
-        # A local method ends in the nearest minimum; a wrong one shows in its residuals.
+        # A local method ends in the nearest minimum; residuals with structure show a wrong one.
         state.values = values
         approach(state)
         state.weigh(state.spp, refining=True)
@@ -263,12 +262,12 @@ def _result(state: State, converged: bool, message: str) -> Fit:
 
 
 def _seen(problem: Problem, halves: weights.Halves, noise: weights.Noise):
-    """Images of the views (H, W, 3), and residuals in standard deviations."""
+    """Return the images of the views (H, W, 3), and their residuals in standard deviations."""
     images, residuals = [], []
     for (a, b), target, variance in zip(halves, problem.targets, noise.values, strict=True):
         mean = (a + b) / 2
         images.append((mean + target.image) / problem.exposure)
-        # The noise of both: the scatter of the residuals themselves says how noisy the target is.
+        # Divide by the noise of both: the scatter of the residuals themselves shows how noisy the target is.
         relative = np.where(target.usable, mean / np.sqrt(variance), np.nan)
         spread = np.nanstd(relative) if target.usable.any() else 1.0
         residuals.append(relative / max(spread, np.finfo(float).tiny))

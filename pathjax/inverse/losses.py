@@ -1,6 +1,6 @@
-"""What the first stages of a fit evaluate: pure functions of the parameters, given views with their targets.
+"""Losses of the first stages of a fit: pure functions of the parameters, given views with their targets.
 
-Values of all views stand one after another, (N, 3), in the order of the groups of `problem.Problem`.
+Pixels of all views are concatenated, (N, 3), in the order of the groups of `problem.Problem`.
 """
 
 from __future__ import annotations
@@ -13,10 +13,10 @@ from pathjax.rendering.render import render
 
 
 def residuals(x, arguments, vector):
-    """Return n + 1 residuals that tell a solver everything, and half their sum of squares; x: unbounded numbers (n,).
+    """Return n + 1 residuals that are enough for a solver, and half their sum of squares; x: unbounded vector (n,).
 
-    The weighted residuals of all views are as good as these: with J = Q R and the rest e = r - Q Q' r, which no x
-    changes to first order, Q' r and |e| have the same sum of squares, gradient and R' R = J' J. All follow from the
+    They replace the weighted residuals r of all views. With J = Q R and the rest e = r - Q Q' r, which no x changes to
+    first order, Q' r and |e| have the same sum of squares and gradient as r, and R' R = J' J. All follow from the
     normal equations of one render, so that neither J nor Q is made.
     """
     groups, weights, spp, seed, draw = arguments
@@ -24,7 +24,7 @@ def residuals(x, arguments, vector):
     def reduced(x):
         values, slopes = jax.jvp(vector.bounded, (x,), (jnp.ones_like(x),))
         normal = sums(groups, values, slopes, weights, spp, seed, draw, vector=vector, halves=1)
-        # The root of the matrix, in units in which its diagonal is 1: what is left of float32 is the same for all.
+        # The root of the matrix, in units in which its diagonal is 1, so that float32 resolves all components alike.
         diagonal = jnp.diagonal(normal.matrix)
         unit = jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1))
         square, vectors = jnp.linalg.eigh(normal.matrix / jnp.outer(unit, unit))
@@ -49,13 +49,13 @@ def residuals(x, arguments, vector):
 
 
 def loss(x, arguments, vector):
-    """Half the sum of squares, twice: what a minimiser minimises, and what it reports."""
+    """Return half the sum of squares, twice: as the value to minimise, and as the one to report."""
     _, half_squares = residuals(x, arguments, vector)
     return half_squares, half_squares
 
 
 def misfits(candidates, arguments, vector):
-    """(K,) weighted sums of squares of candidate values (K, n)."""
+    """Return weighted sums of squared residuals (K,) for candidate values (K, n)."""
     groups, weights, spp, seed, draw = arguments
 
     def misfit(values):

@@ -1,13 +1,13 @@
-"""Fits of many numbers, such as the texels of textures: Gauss-Newton without J, on J v and J^T v. `dense` keeps J' W J.
+"""Fits of many scalars, such as texels: Gauss-Newton with J v and J^T v, without J. (`dense` stores J' W J.)
 
     (J' W J + P + damping) step = J' W (target - image) + P (mean - values)
 
-by conjugate gradients, with the precision P of a `Prior`. The paths of J are the same for all products of a step, and
+is solved by conjugate gradients, with P the precision of a `Prior`. All products of a step use the same paths for J,
 independent of those of the image, so that noise does not bias the right-hand side; every step has fresh ones. Samples
-are few at first, and grow when the image misses the target by no more than its noise. Pixels that tell nearly nothing
+are few at first, and more once the image misses the target by no more than its noise. Pixels that tell nearly nothing
 are left out.
 
-Standard errors come from draws of the posterior: with e1 and e2 of unit normal numbers, the solution for the right-hand
+Standard errors come from draws of the posterior: with e1 and e2 unit normal vectors, the solution for the right-hand
 side J' W^(1/2) e1 + P^(1/2) e2 has the covariance (J' W J + P)^-1 (Papandreou and Yuille 2010, NIPS).
 """
 
@@ -30,37 +30,37 @@ from pathjax.inverse.uncertainty import MAX_RELATIVE_ERROR
 from pathjax.system import memory
 from pathjax.system.interrupts import Interrupts
 
-# The samples of each level, as parts of those of the last.
+# The samples of the last level are divided by these at each level.
 LEVELS = 16, 4, 1
-# Samples of the products of J: at least, and at most those of the image. Noise of J adds to J' W J what no pixel knows,
-# as if texels were known apart that share a pixel: it may pretend to know this part of what pixels do.
+# Least samples of the products of J, which have at most those of the image. Noise of J adds false information to
+# J' W J, as if texels that share a pixel were known apart: it may be this part of the pixels' information.
 PRODUCT_SPP, PRETENDED = 8, 0.1
 MAX_STEPS, MAX_ITERATIONS, TOLERANCE = 4, 30, 0.03
-# A level is left when what the image misses is no more than this part of the variance of noise.
+# A level ends when the squared misfit is below this part of the variance of noise.
 SETTLED = 1.0
-# What pixels miss tells the target's noise where numbers leave at least this part of what pixels tell unexplained;
-# elsewhere the noise is taken to be no less than that of the image.
+# Residuals show the target's noise where the parameters leave at least this part of the pixels unexplained; elsewhere
+# the noise is taken to be no less than that of the image.
 LEAST_LEFT = 0.1
-# A step is taken back if what the image misses has grown by so many standard errors.
+# A step is taken back if the misfit has grown by this many standard errors; and the least damping from then on.
 GROWN, DAMPING = 4, 0.1
-# Steps are made with other weights, if the target's noise turns out so many times what it was taken for.
+# More steps are taken, with new weights, if the noise turns out to differ from what was assumed by this factor.
 OTHER_NOISE = 1.5
-# Neighbouring residuals may be correlated by so much: what is supposed of texels shows in many pixels, faintly.
+# Tolerated correlation of neighbouring residuals: the prior of texels shows in many pixels, faintly.
 MOST_AGREEMENT = 0.05
-# Draws of the posterior: variances of texels are means over windows of so many texels, those of other numbers are not.
+# Draws of the posterior. Variances of texels are averaged over windows of this width, those of other parameters not.
 TEXEL_DRAWS, OTHER_DRAWS, WINDOW = 4, 16, 5
-# Renders from which the variance of a pixel is found, smoothed over so many pixels; and floors: parts of what it is
-# around, over so many pixels, and of its mean over all.
+# Renders that give the variance of a pixel; widths in pixels to smooth it, and to average its surroundings; and floors,
+# as parts of that average and of the mean over all pixels.
 BATCHES, SMOOTHED, FLOOR, LEAST = 4, (0.8, 2.0), 0.1, 1e-3
-# Arrays of the size of the parameters, in float64, that a fit holds at once.
+# float64 arrays of the size of the parameters that a fit holds at once.
 ARRAYS = 24
 
 
 class Search:
-    """The state of a fit: its values, and what the last renders said of them."""
+    """The state of a fit: its values, and what the last renders showed."""
 
-    # Of what pixels tell, half comes from the best of them. Those that tell less than this part of what the worst of
-    # these does are left out.
+    # Half of all information comes from the most informative pixels. Pixels are left out that have less than this part
+    # of what the least informative of these has.
     least_told = 0.02
 
     def __init__(
@@ -73,18 +73,18 @@ class Search:
         self.values = problem.start.astype(float)
         self.low, self.high = self.vector.bounds.T
         self.spp = 2 * spp
-        self.target_part: float | None = None  # variance of the target, over that of one sample; None: not known
+        self.target_part: float | None = None  # variance of the target over that of one sample; None: unknown
         self.standard_errors = np.full(len(self.values), np.nan)
-        self.halves: weights.Halves = []  # of all pixels, when they were surveyed last
+        self.halves: weights.Halves = []  # of all pixels, from the last survey
         self.noise: weights.Noise | None = None
-        self.accepted: tuple[np.ndarray, np.ndarray] | None = None  # values, (N, 3) what their image misses, squared
+        self.accepted: tuple[np.ndarray, np.ndarray] | None = None  # values, (N, 3) squared misfits
         self.damping = 0.0
         self.sharp = PRODUCT_SPP  # samples that J needs, as far as known
         self.history: list[dict] = []
         self.tell, self.interrupts, self.started = tell, interrupts, time.perf_counter()
 
     def run(self) -> tuple[bool, str]:
-        """Find values and standard errors. Returns whether it converged, and what to mind."""
+        """Find values and standard errors; return whether the fit converged, and a message."""
         self.survey()
         for part in LEVELS:
             if part == LEVELS[-1]:
@@ -99,7 +99,7 @@ class Search:
         return self.verdict()
 
     def descend(self, samples: int, last: bool) -> None:
-        """Take steps with so many samples, until the image misses no more than noise."""
+        """Take steps with this many samples per pixel, until the misfit is no more than noise."""
         for _ in range(MAX_STEPS):
             excess = self.look(samples)
             self.step()
@@ -111,16 +111,16 @@ class Search:
                 break
 
     def check(self) -> float:
-        """Look at where the last step led. Returns the variance of target and image, over that of one sample."""
+        """Check the result of the last step; return the variance of target and image over that of one sample."""
         equations = self.weights, self.render_part
         self.excess = self.look(whole(self.spp))
         self.weights, self.render_part = equations
-        # The expectation of this square is the number of parameters that the pixels determine: so many values are
-        # fitted to noise, and the others miss the noise of the target.
+        # The expectation of `told`, summed, is the number of parameters that the pixels determine: so many pixel values
+        # are fitted with their noise, and the others miss the noise of the target.
         used = ((self.weights > 0) * self.trust).sum()
         left = used - self.told.sum()
-        # Numbers that explain nearly all of what pixels tell leave little that speaks of the target's noise alone, and
-        # noise of J may count more of them than there are pixels.
+        # Where the parameters explain nearly all pixels, little is left that shows the target's noise alone, and with
+        # noise of J more parameters may be counted than there are pixels.
         least = 0.0 if left > LEAST_LEFT * used else self.render_part
         self.target_part = float(np.clip(self.missed / max(left, LEAST_LEFT * used), least, 1))
         return self.render_part + self.target_part
@@ -128,11 +128,11 @@ class Search:
     # ---- pixels -----------------------------------------------------------------------------------------------------
 
     def survey(self) -> None:
-        """Render all pixels with few samples: how noisy each is, what it misses, and which depend on the numbers."""
+        """Render all pixels with few samples for their noise and misfit; keep those that depend on the parameters."""
         problem, products = self.problem, self.products
         products.keep([np.ones(t.image.shape[:2], bool) for t in problem.targets])
-        self.accepted = None  # what was missed is of other pixels from now on
-        self.trust = np.ones((products.count, 1))  # how much of what each pixel tells is no noise of J
+        self.accepted = None  # its misfits are those of the pixels kept before
+        self.trust = np.ones((products.count, 1))  # part of each pixel's information that is not noise of J
         self.renders, self.each, self.variances = 0, 0, [np.zeros(t.image.shape) for t in problem.targets]
         self.target = products.kept([t.image for t in problem.targets])
         spread = [products.spread(half) for half in self.render(2 * weights.NOISE_SPP)]
@@ -152,15 +152,15 @@ class Search:
         self.trust = np.ones((products.count, 1))
 
     def render(self, samples: int) -> tuple[np.ndarray, np.ndarray]:
-        """Residuals (N, 3) of two independent renders, of half the samples each; adds to what is known of noise."""
+        """Return residuals (N, 3) of two independent renders with half the samples each; update the variances."""
         products, each = self.products, samples // BATCHES
         batches = [products.images(self.values, each, products.next_draw()) for _ in range(BATCHES)]
         variance = np.var(batches, axis=0, ddof=1)
         if self.renders:
-            # Means of many samples may be better than the number of samples says.
+            # The variance of a mean may fall faster than as 1 / samples.
             ratio = float(np.mean(variance / products.kept(self.variance())))
             self.render_part = max(ratio, 1 / samples**2) / BATCHES
-        if each > self.each:  # of few samples the noise may be another, as theirs are spread less evenly
+        if each > self.each:  # fewer samples are spread less evenly and may have other noise per sample
             self.each, self.renders, self.variances = each, 0, [np.zeros_like(v) for v in self.variances]
         spread = products.spread(variance * each)
         self.variances = [known + more for known, more in zip(self.variances, spread, strict=True)]
@@ -169,7 +169,7 @@ class Search:
         return a, b
 
     def variance(self) -> list[np.ndarray]:
-        """(H, W, 3) of one sample, of each view."""
+        """Return the variance (H, W, 3) of one sample, for each view."""
         found = []
         for total, mask in zip(self.variances, self.products.masks, strict=True):
             smooth, around = (ndimage.gaussian_filter(total / self.renders, (s, s, 0), truncate=2) for s in SMOOTHED)
@@ -177,12 +177,12 @@ class Search:
         return found
 
     def look(self, samples: int) -> float:
-        """Render the kept pixels at the values. Returns what they miss, over the noise, both squared.
+        """Render the kept pixels at the values; return their squared misfit over the variance of noise.
 
-        If that has grown, the last step is taken back, and damped from now on (Levenberg).
+        If the misfit has grown, the last step is taken back, and the next ones are damped (Levenberg).
         """
         problem, products = self.problem, self.products
-        # The noise is that of earlier renders: pixels that it made bright by chance must not weigh less for it.
+        # The noise is that of earlier renders, so that pixels do not weigh less for being bright by chance.
         variance = products.kept(self.variance())
         rounding = products.kept([np.broadcast_to(t.step, t.image.shape) for t in problem.targets]) ** 2 / 12
         usable = products.kept(self.usable)
@@ -190,7 +190,7 @@ class Search:
         self.samples = samples
         target_part = self.render_part if self.target_part is None else self.target_part
         self.weights = usable / (variance * (self.render_part + target_part) + rounding)
-        # In the same units, though more samples may be spread more evenly, so that the noise of one is another.
+        # Both in the same units: more samples may be spread more evenly, with other noise per sample.
         pairs = a * b, self.accepted[1] if self.accepted else a * b
         here, before = ((usable * self.trust * missed / variance).sum(-1) for missed in pairs)
         error = np.sqrt((here.var() + before.var()) / len(here))
@@ -205,7 +205,7 @@ class Search:
         return 2 * self.loss / max((usable * self.trust).sum(), 1)
 
     def determined(self) -> np.ndarray:
-        """(n,) how much of each parameter the pixels determine, up to chance; and find how many samples J needs."""
+        """Return how much of each parameter the pixels determine (n,), noisy; find the samples that J needs."""
         products, spp, v = self.products, self.product_spp, self.deviation
         other = products.next_draw()
         a, b = products.push(self.values, v, spp, products.next_draw()), products.push(self.values, v, spp, other)
@@ -216,14 +216,14 @@ class Search:
         return told
 
     def told_waves(self) -> dict[str, np.ndarray]:
-        """(h, w) how much of each cosine wave of a texture the pixels determine, in all channels, up to chance."""
+        """Return per texture (h, w) how much of each cosine wave the pixels determine, channels summed; noisy."""
         one, other = self.prior.waves_of(self.deviation), self.prior.waves_of(self.response)
         return {name: (amplitudes * other[name]).sum(-1) for name, amplitudes in one.items()}
 
     # ---- parameters -------------------------------------------------------------------------------------------------
 
     def step(self) -> None:
-        """Gauss-Newton at the values, with what was looked at."""
+        """Take a Gauss-Newton step from the values, with the results of `look`."""
         products, prior, values, w = self.products, self.prior, self.values, self.weights
         draw, n = products.next_draw(), len(values)
         spp = self.product_spp = max(min(self.sharp, self.samples), PRODUCT_SPP)
@@ -231,7 +231,7 @@ class Search:
         self.push = lambda change: products.push(values, change, spp, draw)
         gradient = self.pull(w * self.residual) + prior.gradient(values)
         free = self.inside(gradient)
-        # As J >= 0 for what light is multiplied by, sums of rows are bounds of the diagonal.
+        # J >= 0 for parameters that multiply light, so row sums of J' W J bound its diagonal.
         self.rows = np.abs(self.pull(w * self.push(np.ones(n))))
         self.diagonal = self.rows + prior.diagonal()
         self.free = free
@@ -244,11 +244,11 @@ class Search:
         self.values = np.clip(values + self.solve(-gradient, self.damping * self.diagonal), self.low, self.high)
 
     def inside(self, gradient: np.ndarray) -> np.ndarray:
-        """(n,) bool: False for values at a bound that a step would push beyond it; they stay there."""
+        """Return (n,) bool: False for values at a bound that a step would push beyond it; they stay there."""
         return ~((self.values <= self.low) & (gradient > 0) | (self.values >= self.high) & (gradient < 0))
 
     def solve(self, right: np.ndarray, damping: np.ndarray | float = 0.0) -> np.ndarray:
-        """What solves the equations of the last step; 0 where values stay at a bound."""
+        """Solve the equations of the last step; 0 where values stay at a bound."""
         shape = (len(right), len(right))
         matrix = LinearOperator(shape, lambda x: self.times(x) + damping * x, dtype=float)
         preconditioner = LinearOperator(shape, lambda x: x / (self.diagonal + damping), dtype=float)
@@ -256,7 +256,7 @@ class Search:
         return cg(matrix, np.where(self.free, right, 0), **how)[0]
 
     def draw(self, larger: float = 1.0) -> np.ndarray:
-        """(n,) a deviation from the values, as the posterior has it.
+        """Draw a deviation (n,) from the values from the posterior.
 
         larger: noise of pixels over that in their weights.
         """
@@ -264,15 +264,15 @@ class Search:
         return self.solve(self.pull(np.sqrt(self.weights) * noise) + self.prior.draw(self.random))
 
     def find_errors(self, larger: float) -> None:
-        """Standard errors of all numbers, inf of those of which no pixel knows anything by itself.
+        """Set the standard errors; inf for parameters that the pixels, without the prior, do not determine.
 
-        larger: noise of pixels over that in their weights, for which the target was taken to be as noisy as the image.
+        larger: noise of pixels over that in their weights, in which the target may count as just as noisy as the image.
         """
         grids = all(is_grid(p) for _, p in self.vector.parameters)
         count = TEXEL_DRAWS if grids else OTHER_DRAWS
         draws = [self.draw(larger) for _ in range(count)]
         known = [self.known() for _ in range(count)]
-        # The diagonal says how they differ from texel to texel, and the draws how much larger they are than it says.
+        # The diagonal gives how variances differ from texel to texel, and the draws how much larger they are.
         ratio = self.local_mean(np.mean(np.square(draws), 0) * self.diagonal)
         found = np.sqrt(ratio / self.diagonal)
         rows = np.where(self.rows > 0, self.rows, 1)
@@ -281,14 +281,14 @@ class Search:
         self.standard_errors = np.where(unseen, np.inf, found)
 
     def known(self) -> np.ndarray:
-        """(n,) numbers whose mean is the diagonal of J' W J, from two independent J, whose noise adds nothing."""
+        """Estimate the diagonal (n,) of J' W J without bias, from two independent J, whose noise adds nothing."""
         products = self.products
         noisy = np.sqrt(self.weights) * self.random.normal(size=self.weights.shape)
         a, b = (products.pull(self.values, noisy, self.product_spp, products.next_draw()) for _ in range(2))
         return a * b
 
     def local_mean(self, x: np.ndarray) -> np.ndarray:
-        """(n,) means over windows of texels; other numbers as they are."""
+        """Return means (n,) over windows of texels; other parameters unchanged."""
         parts = self.vector.unpack(x)
         for name, p in self.vector.parameters:
             if is_grid(p):
@@ -329,9 +329,9 @@ class Search:
             self.tell(entry)
 
     def listen(self, _=None) -> None:
-        distributed.heard(self.interrupts)  # its exception may have been lost, while Python collected garbage
+        distributed.heard(self.interrupts)  # its exception may have been lost during garbage collection
 
 
 def whole(samples: float) -> int:
-    """So many samples or fewer, that are as many in each batch."""
+    """Round a number of samples down to a multiple of BATCHES, but not to 0."""
     return max(int(samples) // BATCHES, 1) * BATCHES
