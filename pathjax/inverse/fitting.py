@@ -54,7 +54,7 @@ class Fit:
 
     values: dict[str, np.ndarray]
     standard_errors: dict[str, np.ndarray]  # inf: the images do not determine it
-    # (n, n) in the order of `components`; undetermined ones have inf, and nan beside it. None: fits of many scalars.
+    # (n, n) in the order of `components`; undetermined ones have variance inf, covariances nan. None: many scalars.
     covariance: np.ndarray | None
     components: list[str]
     undetermined: list[dict[str, float]]  # directions that the images do not determine: component -> change
@@ -139,8 +139,9 @@ def fit(
     rounding, renders and Jacobians, and assume that the scene can look like the target: `converged` is False where
     neighbouring residuals agree too well for noise (`uncertainty.structure`). The differences that replace derivatives
     in an IOR have a bias (`jacobian`), which does not move the root of the score.
-    For textures, and for more than 300 scalars together, they are those of the posterior, from a few draws of it
-    (`many`): uncertain by 10 to 20 %, and inf where pixels tell nothing about a texel, which keeps its prior value.
+    For textures, and for more than 300 scalars together, they are those of the posterior: exact for few enough texels
+    and pixels (`dense`), else from a few draws of it and uncertain by 10 to 20 % (`many`); and inf where pixels tell
+    nothing about a texel, which keeps its prior value.
     Clipped pixels are left out, and so are those that noise may have clipped: leaving out only those that it did clip
     would keep the darker ones. Renders and the noise around decide which these are, never the pixel itself.
     """

@@ -1,12 +1,12 @@
-"""Normal equations of least squares: what all pixels together say of some numbers, without a Jacobian of the image.
+"""Normal equations of least squares, summed over all pixels without storing the Jacobian of the image.
 
 With residuals r = image - target and weights W of the pixels' channels, two independent renders A and B give
 
     loss = r_A' W r_B / 2,    gradient = (J_A' W r_B + J_B' W r_A) / 2,    matrix = (J_A' W J_B + J_B' W J_A) / 2,
 
-whose means are those of an image and a Jacobian without noise. Pixels are taken in chunks: the kernel gives the rows
-of J of a chunk, which are multiplied and added up at once. Light keeps its channel on the way, so a row of J in one
-channel knows of the same channel of colours alone: it has one entry for each colour, and one for each number.
+whose means are those of a noise-free image and Jacobian. Pixels are processed in chunks: the kernel makes the rows of J
+of a chunk, which are multiplied and summed at once. Light keeps its channel on the way, so a row of J in one channel
+depends on the same channel of colours only: it has one entry for each colour, and one for each scalar.
 """
 
 from __future__ import annotations
@@ -37,30 +37,30 @@ from pathjax.scene.alike import by_all
 from pathjax.scene.scene import Scene
 from pathjax.system import memory
 
-# The matrix is summed up in so many groups of pixels, whose differences tell its noise to 13 %.
+# Groups of pixels over which the matrix is summed; their differences give its noise to 13 %.
 GROUPS = 32
-# Blocks whose sums are taken for independent. Of more, some far apart are one: the scatter is known to 2 % then.
+# Most blocks whose sums are taken to be independent; more are merged, far apart ones. They give the scatter to 2 %.
 MOST_BLOCKS = 4096
-# Of the rows of J of one chunk.
+# Bytes of the rows of J of one chunk.
 CHUNK_BYTES = 1 << 25
-# Parts of a sum that are dealt to devices: enough of them that many devices do as much.
+# Parts of a sum that are dealt to devices: enough to share the work evenly among many devices.
 LEAST_PARTS, MOST_PARTS = 64, 1024
 
 
 @register_dataclass
 @dataclass(frozen=True, eq=False)
 class NormalEquations:
-    """What images say of P numbers, near the values that these have.
+    """Normal equations of P scalars at their present values.
 
     Attributes:
-        matrix: (P, P) of Gauss and Newton; unbiased, so it may be indefinite.
+        matrix: (P, P) Gauss-Newton matrix; unbiased, so it may be indefinite.
         gradient: (P,) of the loss.
-        loss: (), half the weighted square of the misfit; unbiased, so it may be negative.
+        loss: (), half the weighted squared misfit; unbiased, so it may be negative.
         scatter: (P, P) covariance of the gradient, from its scatter over pixels.
-        matrices: (G, P, P) of groups of pixels chosen by chance, whose sum is `matrix`: their scatter is its noise.
-        residuals: (2, N, 3) image - target of the two renders, of the pixels of all views.
-        pulled: (3, P, K), by channel J' W times K images, if some were given.
-        components: names of the P numbers: `white.reflectance.r`.
+        matrices: (G, P, P) of random groups of pixels; their sum is `matrix`, and their scatter gives its noise.
+        residuals: (2, N, 3) image - target of the two renders, for the pixels of all views.
+        pulled: (3, P, K) J' W times K images, per channel; None if no images were given.
+        components: names of the P scalars, such as `white.reflectance.r`.
     """
 
     matrix: jax.Array
@@ -83,23 +83,23 @@ def normal_equations(
     spp: int = 64,
     seed: int = 0,
 ) -> NormalEquations:
-    """What least squares needs of images that should look like targets, without the Jacobian of the images.
+    """Return the normal equations of images and their targets, without the Jacobian of the images.
 
-    A step to where they look more alike is -matrix^-1 gradient, and matrix^-1 scatter matrix^-1 is the covariance of
-    what such steps arrive at.
+    The Gauss-Newton step is -matrix^-1 gradient, and matrix^-1 scatter matrix^-1 is the covariance of the values at
+    which such steps arrive.
 
     Args:
         scene: a scene, or a list of views, which share parameters by name.
         names: of parameters, as `parameters` lists them.
         target: linear RGB or a `Target`; or a list of them, one for each view.
-        weights: of the values of the target, 1/variance; or a list of them; None: 1. Values that are clipped or not
-            measured weigh nothing.
+        weights: of the values of the target, 1/variance; or a list of them; None: 1. Clipped or unmeasured values
+            have weight 0.
         spp: samples per pixel of each of the two renders.
-        seed: other seeds give independent numbers. Sums have a fixed order, whatever the number of devices.
+        seed: other seeds give independent renders. Sums have a fixed order, whatever the number of devices.
     Raises:
-        InputError: as for `fit`; weights that are negative, not finite or nothing but 0; more numbers than fit into
-            memory.
-    Pixels share no samples here, and noise of targets that share some, under a wide filter, is scattered by blocks.
+        InputError: as for `fit`; weights that are negative, not finite or all 0; more parameters than fit into memory.
+    Pixels of the renders share no samples here. Where those of a target do, under a wide filter, the scatter is taken
+    over blocks of pixels.
     """
     check_counts(spp, seed)
     views = problem.build(scene, target, names, {})
@@ -131,9 +131,9 @@ def _weights(weights, target: Target) -> np.ndarray:
 
 
 def check_memory(vector: ParameterVector, dtype) -> None:
-    """Refuse so many numbers that their matrices do not fit into memory."""
+    """Refuse parameters whose matrices do not fit into memory."""
     count = vector.count
-    # Of groups by channel and by component, each with a copy; and what solving takes, in float64.
+    # Matrices of groups by channel and by component, each with a copy; and the solver's, in float64.
     needed = 4 * GROUPS * count**2 * np.dtype(dtype).itemsize + 8 * count**2 * 8 + 6 * CHUNK_BYTES
     memory.check(needed, f"the normal equations of {count} numbers", "name fewer parameters")
 
@@ -153,14 +153,15 @@ def sums(
     halves: int = 2,
     devices: int | None = None,
 ) -> NormalEquations:
-    """The normal equations of some views, in units of `scale` of the numbers.
+    """Return the normal equations of some views, with parameters in units of `scale`.
 
     Args:
         weights: of all pixels, in the order of `Problem.flat`; so are `images`, for `NormalEquations.pulled`.
-        spp: of each render. seed, draw: of `Views.seeds`.
+        spp: of each render.
+        seed, draw: as for `Views.seeds`.
         side: of squares of pixels beyond which the noise of a target is independent.
-        halves: 2, or 1: a single render, whose noise is in all that is quadratic.
-        devices: of `native_map`; of the same rows, sums are bitwise the same for every number of them.
+        halves: 2, or 1: a single render, whose noise biases all that is quadratic.
+        devices: as for `native_map`; from the same rows, sums are bitwise the same for every number of devices.
     """
     by_name, by_column = vector.unpack(values), vector.by_column(scale)
     groups = [views.placed(by_name) for views in groups]
@@ -189,7 +190,7 @@ def sums(
 
 
 def _rows(numbers, vector, devices, pixels, there):
-    """Images (R, V, n, 3) and rows of J (R, V, n, Q, 3) of n pixels, for seeds (R, V)."""
+    """Return images (R, V, n, 3) and rows of J (R, V, n, Q, 3) of n pixels, for seeds (R, V)."""
     views, by_name, scale, spp, seeds = numbers
     counts = jnp.where(there, spp, 1)
 
@@ -211,16 +212,18 @@ def _of_views(
     groups: int,
     devices: int | None,
 ) -> tuple[Float[Array, "R N 3"], dict]:
-    """Residuals of the N pixels of views of one size, and sums over them.
+    """Return the residuals of the N pixels of views of one size, and sums over them.
 
-    numbers: the views, values by name, scale of the columns of J, spp and seeds (R, V).
-    given: target, weights, and images if any, of each view. groups: of `_chunks`.
+    Args:
+        numbers: the views, values by name, scale of the columns of J, spp and seeds (R, V).
+        given: target, weights, and images if any, of each view.
+        groups: as for `_chunks`.
     """
     views, height, width, *_ = given[0].shape
     given = [x.reshape(views, height * width, *x.shape[3:]) for x in given]
     dtype, (column, _) = given[0].dtype, vector.entries
     columns, components, halves = int(column[-1]) + 1, len(column), len(numbers[-1])
-    # Noise of J is independent from pixel to pixel: where blocks are few, their pixels are groups of their own.
+    # Noise of J is independent from pixel to pixel: where blocks are few, each pixel of a block forms its own groups.
     summed = groups * (side**2 if groups < GROUPS else 1)
     shapes = {
         "matrices": (summed, 3, columns, columns),
@@ -240,7 +243,7 @@ def _of_views(
         each = jnp.maximum(pixels.ravel(), 0)
         target, w, *images = (x[:, each] for x in given)
         w = jnp.where(there[:, None], w, 0)
-        # Apart from the kernel, sums are the same program whatever the number of devices.
+        # The barrier keeps the sums one program, apart from the kernel, whatever the number of devices.
         r, J = lax.optimization_barrier(_rows(numbers, vector, devices, each, there))
         r = r - target
         (ra, Ja), (rb, Jb) = (r[0], J[0]), (r[-1], J[-1])
@@ -271,28 +274,28 @@ def _of_views(
         of_part = partial(of_chunks, devices=1)
         total, residuals = sum_of_parts(of_part, dealt, numbers, given, devices=devices)
         residuals = residuals.reshape(-1, *residuals.shape[2:])
-    # (chunks, R, V, n, 3), to the order of pixels.
+    # (chunks, R, V, n, 3) to the order of pixels.
     place = np.argsort(np.where(chunks < 0, chunks.size, chunks).ravel())[: height * width]
     residuals = jnp.moveaxis(residuals, 0, 2).reshape(*residuals.shape[1:3], -1, 3)[:, :, place]
     return residuals.reshape(residuals.shape[0], -1, 3), {**total, "blocks": views * len(blocks)}
 
 
 def _parts(pixels: int, bytes_of_sums: int) -> int:
-    """In how many parts the sums over pixels are dealt to devices, and added up: as many for any number of devices.
+    """Return the number of parts in which sums over pixels are dealt to devices, the same for any number of devices.
 
-    1: too few for many devices, which rather share each kernel, and gather its rows to multiply them.
+    1: too few parts for many devices, so these share each kernel, and its rows are gathered and multiplied.
     """
     parts = min(pixels // ITEMS_OF_A_PART, MOST_BYTES // bytes_of_sums, MOST_PARTS)
     return 1 << (parts.bit_length() - 1) if parts >= LEAST_PARTS else 1
 
 
 def _blocks(height: int, width: int, side: int) -> Int[np.ndarray, "B S"]:
-    """Pixels of blocks that are independent of each other, -1 beyond the image."""
+    """Return the pixels of blocks that are independent of each other, -1 beyond the image."""
     down, right = -(-height // side), -(-width // side)
     pixels = np.full((down * side, right * side), -1, np.int32)
     pixels[:height, :width] = np.arange(height * width).reshape(height, width)
     blocks = pixels.reshape(down, side, right, side).swapaxes(1, 2).reshape(-1, side * side)
-    # By chance, so that groups differ as pixels do, and chunks cost the same.
+    # In random order, so that groups differ as pixels do, and chunks cost the same.
     blocks = blocks[np.random.default_rng(0).permutation(len(blocks))]
     together = -(-len(blocks) // MOST_BLOCKS)
     count = -(-len(blocks) // together)
@@ -302,7 +305,7 @@ def _blocks(height: int, width: int, side: int) -> Int[np.ndarray, "B S"]:
 def _chunks(
     blocks: Int[np.ndarray, "B S"], groups: int, bytes_of_pixel: int, parts: int = 1
 ) -> Int[np.ndarray, "C each G S"]:
-    """The blocks of each group in each chunk; of each part of them as many."""
+    """Return the blocks of each group in each chunk, with the same number of chunks in each part."""
     chunks = parts * -(-blocks.size * bytes_of_pixel // (parts * CHUNK_BYTES))
     each = -(-len(blocks) // (chunks * groups))
     return _padded(blocks, chunks * each * groups).reshape(chunks, each, groups, -1)

@@ -14,13 +14,13 @@ import numpy as np
 
 from pathjax.kinds.parameter import Parameter
 
-# Starts this close to a bound, relative to the range, are moved inwards: beyond, unbounded coordinates hardly move.
+# Starts closer to a bound than this, relative to the range, are moved inwards: there unbounded coordinates hardly move.
 _EDGE = 1e-3
 
 
 @dataclass(frozen=True)
 class ParameterVector:
-    """The components of parameters one after another, such as the r, g, b of a colour. Static and hashable."""
+    """The components of parameters in one vector, such as the r, g, b of a colour. Static and hashable."""
 
     parameters: tuple[tuple[str, Parameter], ...]
 
@@ -36,17 +36,17 @@ class ParameterVector:
 
     @property
     def bounds(self) -> np.ndarray:
-        """(n, 2) between which values count."""
+        """(n, 2) bounds between which values have an effect."""
         limits = [(max(p.bounds[0], p.least), p.bounds[1]) for _, p in self.parameters]
         return np.repeat(limits, [math.prod(p.shape) for _, p in self.parameters], axis=0)
 
     def pack(self, values: Mapping) -> np.ndarray:
-        """(n,) float64."""
+        """Return the vector (n,), float64, of values by name."""
         parts = [np.broadcast_to(np.asarray(values[name]), p.shape).ravel() for name, p in self.parameters]
         return np.concatenate(parts).astype(float)
 
     def unpack(self, vector) -> dict:
-        """(n,) -> name -> array of the parameter's shape."""
+        """Return the parts of a vector (n,) by name, each of its parameter's shape."""
         values, first = {}, 0
         for name, p in self.parameters:
             size = math.prod(p.shape)
@@ -56,19 +56,19 @@ class ParameterVector:
 
     @property
     def runs(self) -> list[tuple[bool, int]]:
-        """Runs of columns that are alike: whether they are colours, and how many. A column is a number or a colour."""
+        """Runs of columns of one type: whether they are colours, and how many. A column is a scalar or a colour."""
         kinds = itertools.groupby(self.parameters, lambda item: item[1].is_color)
         return [(color, sum(map(_count, (p for _, p in group)))) for color, group in kinds]
 
     @property
     def systems(self) -> int:
-        """Into how many systems its linear equations part: 3, a channel each, of colours; 1 of numbers; 0 of both."""
+        """Number of independent linear systems: 3, one per channel, for colours; 1 for scalars; 0 for both together."""
         kinds = {p.is_color for _, p in self.parameters}
         return 0 if len(kinds) > 1 else 3 if kinds.pop() else 1
 
     @property
     def entries(self) -> tuple[np.ndarray, np.ndarray]:
-        """For n components: the column (n,) that holds each, and the channels (3, n) in which it shows, 1 or 0."""
+        """For n components: the column (n,) of each, and the channels (3, n) that depend on it, 1 or 0."""
         columns, seen, first = [], [], 0
         for color, count in self.runs:
             here = np.arange(first, first + count)
@@ -78,9 +78,9 @@ class ParameterVector:
         return np.concatenate(columns), np.concatenate(seen, 1)
 
     def columns(self, jacobian: Mapping, image: jax.Array) -> jax.Array:
-        """A Jacobian by name of an image (..., 3) as (..., Q, 3); 0 for names that it lacks.
+        """Return the Jacobian by name of an image (..., 3) as (..., Q, 3); 0 for names that it lacks.
 
-        Light keeps its channel, so what a channel knows of a colour is one number.
+        Light keeps its channel, so each channel has one derivative in a colour.
         """
         parts = []
         for name, p in self.parameters:
@@ -92,7 +92,7 @@ class ParameterVector:
         return jnp.concatenate(parts, -2)
 
     def by_column(self, values: jax.Array) -> jax.Array:
-        """(n,) as (Q, 3): a number is the same in all channels."""
+        """Return values (n,) as (Q, 3): a scalar is the same in all channels."""
         parts, first = [], 0
         for color, count in self.runs:
             part = values[first : first + count * (3 if color else 1)]
@@ -101,7 +101,7 @@ class ParameterVector:
         return jnp.concatenate(parts)
 
     def by_component(self, columns: jax.Array) -> jax.Array:
-        """(..., Q, 3) as (..., n): of a number, the sum over channels."""
+        """Return columns (..., Q, 3) as (..., n): for a scalar, the sum over channels."""
         parts, first = [], 0
         for color, count in self.runs:
             part = columns[..., first : first + count, :]
@@ -111,24 +111,24 @@ class ParameterVector:
 
     @property
     def _logarithmic(self) -> np.ndarray:
-        """(n,) bool: what counts is the ratio of two values, as of roughnesses, which begin at their least."""
+        """(n,) bool: fitted by the logarithm, since ratios of values matter, as for roughnesses, which have a least."""
         return np.array([math.isfinite(p.least) for _, p in self.parameters for _ in range(math.prod(p.shape))])
 
     @property
     def _limits(self) -> tuple[np.ndarray, np.ndarray]:
-        """(2, n) bounds, of their logarithms where these are what counts; and whether they are two."""
+        """(2, n) bounds, of the logarithm where that is fitted; and (n,) bool whether the upper one is finite."""
         bounds = self.bounds.T
         limits = np.where(self._logarithmic, np.log(np.where(self._logarithmic, bounds, 1)), bounds)
         return limits, np.isfinite(limits[1])
 
     def bounded(self, x):
-        """Unbounded (n,) to values: logistic between two bounds; above one, exponential where small, else linear."""
+        """Map unbounded x (n,) to values: logistic between two bounds; above one, exponential at first, then linear."""
         (low, high), two = self._limits
         width = jnp.asarray(np.where(two, high - low, 1), x.dtype)
         return _bounded(x, jnp.asarray(low, x.dtype), width, two, self._logarithmic)
 
     def unbounded(self, values) -> np.ndarray:
-        """Inverse of `bounded`; values at a bound are taken a little inside."""
+        """Inverse of `bounded`; values at a bound are moved a little inside."""
         (low, high), two = self._limits
         values = np.where(self._logarithmic, np.log(np.where(self._logarithmic, values, 1)), values)
         width = np.where(two, high - low, 1)
@@ -136,7 +136,7 @@ class ParameterVector:
         return np.where(two, np.log(share) - np.log1p(-np.where(two, share, 0)), share + np.log(-np.expm1(-share)))
 
     def scale(self, values) -> np.ndarray:
-        """(n,) what counts as a large change: the range between two bounds, else the value itself."""
+        """Return the size (n,) of a large change: the range between two bounds, else the value itself."""
         low, high = self.bounds.T
         ranges = np.isfinite(high) & ~self._logarithmic
         origin = np.where(self._logarithmic, 0, np.maximum(low, 0))
@@ -152,12 +152,12 @@ def _bounded(x, low, width, two, logarithmic):
 
 
 def _count(parameter: Parameter) -> int:
-    """The number of colours, or of numbers, in a parameter."""
+    """Return the number of colours, or of scalars, in a parameter."""
     return math.prod(parameter.shape[:-1] if parameter.is_color else parameter.shape)
 
 
 def _suffixes(parameter: Parameter) -> list[str]:
-    """What is added to a parameter's name for each of its components."""
+    """Return the suffix of a parameter's name for each of its components."""
     channels = [".r", ".g", ".b"] if parameter.is_color else [""]
     places = np.ndindex(parameter.shape[:-1] if parameter.is_color else parameter.shape)
     return [f"{list(place) if place else ''}{channel}" for place in places for channel in channels]

@@ -1,4 +1,4 @@
-"""What is to be fitted: views, targets and parameters, checked before anything is rendered, stacked for the kernel."""
+"""The problem of a fit: views, targets and parameters, checked before anything is rendered, stacked for the kernel."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from pathjax.scene.metadata import Names
 from pathjax.scene.scene import Scene
 from pathjax.sensors import film
 
-# Up to so many numbers are fitted by their Jacobian.
+# Up to this many scalars are fitted by their Jacobian.
 MOST_COLUMNS = 300
 
 
@@ -32,13 +32,13 @@ class Views:
 
     scene: Scene
     targets: jax.Array  # (V, H, W, 3), exposed
-    exposure: jax.Array  # () that renders are multiplied by
-    names: tuple[str, ...] = field(metadata={"static": True})  # of the fitted parameters, those that these views hold
-    axes: tuple[int | None, ...] = field(metadata={"static": True})  # of each leaf of the scene: 0 where stacked
-    numbers: tuple[int, ...] = field(metadata={"static": True})  # of each view, its place in the caller's list
+    exposure: jax.Array  # () factor of renders
+    names: tuple[str, ...] = field(metadata={"static": True})  # fitted parameters that these views hold
+    axes: tuple[int | None, ...] = field(metadata={"static": True})  # per leaf of the scene: 0 where stacked
+    numbers: tuple[int, ...] = field(metadata={"static": True})  # index of each view in the caller's list
 
     def map(self, f, seeds):
-        """f(scene, seed) of one view after the other, by one kernel; seeds: (V,) uint32."""
+        """Return f(scene, seed) for one view after the other, by one kernel; seeds: (V,) uint32."""
         leaves, tree = jax.tree.flatten(self.scene)
 
         def one(varying, seed):
@@ -50,7 +50,7 @@ class Views:
         return lax.map(lambda each: one(*each), (stacked, seeds))
 
     def seeds(self, seed, draw, half: int):
-        """(V,) uint32 of one of two independent halves, others for every draw.
+        """Return seeds (V,) uint32 for one of two independent halves, different for every draw.
 
         Their upper bit keeps them apart from any seed that a user can give.
         """
@@ -63,9 +63,9 @@ class Views:
         return {name: named.find(self.scene, name) for name in self.names}
 
     def placed(self, values) -> Views:
-        """The views with the values of textures in their arrays, for `with_values`.
+        """Return the views with the values of textures in their arrays, for `with_values`.
 
-        A kernel that put them there would copy, each time that it runs, the texels of all textures of the scene.
+        A kernel that did this itself would copy the texels of all textures of the scene on each run.
         """
         scene, axes = self.scene, jax.tree.unflatten(jax.tree.structure(self.scene), self.axes)
         for name, parameter in self.wanted.items():
@@ -76,11 +76,11 @@ class Views:
         return replace(self, scene=scene)
 
     def everywhere(self) -> Views:
-        """The views with arrays on all devices, where kernels would copy them each time that they run."""
+        """Return the views with replicated arrays, which kernels on all devices would else copy on each run."""
         return replace(self, scene=on_all_devices(self.scene))
 
     def with_values(self, scene: Scene, values) -> Scene:
-        """A scene of `map` with the values of parameters, of textures those that are `placed`."""
+        """Return a scene of `map` with the values of parameters; those of textures must be `placed` already."""
         textures = {name: values[name] for name, parameter in self.wanted.items() if parameter.is_texture}
         scene = named.with_parameters(scene, {name: values[name] for name in self.names if name not in textures})
         known = {name: lax.stop_gradient(value) for name, value in textures.items()}
@@ -90,7 +90,7 @@ class Views:
 
 @partial(jax.jit, static_argnums=(2, 3))
 def _put(array, value, parameter: Parameter, stacked: bool):
-    """An array where a texture stands, or those of all views, with another value of it."""
+    """Return the array that holds a texture, or those of all views stacked, with a new value of the texture."""
     put = partial(parameter.put, value=value)
     return jax.vmap(put)(array) if stacked else put(array)
 
@@ -98,35 +98,35 @@ def _put(array, value, parameter: Parameter, stacked: bool):
 @dataclass(frozen=True)
 class Problem:
     scenes: list[Scene]
-    targets: list[Target]  # exposed, of arrays (H, W, 3) throughout; the image is 0 where it is not measured
+    targets: list[Target]  # exposed, all fields but the ceiling (H, W, 3); the image is 0 where it is not measured
     exposure: float  # a power of 2 that brings the targets to a level near 1: squares of radiances may leave float32
-    rounding: float  # what float32 leaves of the mean of a pixel at that level; scenes without noise are fitted to it
+    rounding: float  # rounding error of a pixel's mean at that level, to which scenes without noise are fitted
     groups: list[Views]
     vector: ParameterVector
     start: np.ndarray  # (n,) values
 
     @property
     def reach(self) -> int:
-        """How far the noise of targets may be correlated, in pixels: targets look as the scenes that are fitted."""
+        """How far the noise of targets may be correlated, in pixels, assuming the film of the fitted scenes."""
         return max(each.film.reach if each.film.shared else 0 for each in self.scenes)
 
     @property
     def side(self) -> int:
-        """Side of the squares of pixels whose noise is taken to be independent of each other's."""
+        """Side of the squares of pixels that are taken to have independent noise."""
         return 2 * self.reach + 1 if self.reach else 1
 
     @property
     def alike(self) -> float:
-        """Sum of squared correlations of a pixel's noise with that around it."""
+        """Sum of squared correlations of a pixel's noise with that of the pixels around it, and its own."""
         return max(float((film.correlation(each.film) ** 2).sum()) for each in self.scenes)
 
     @staticmethod
     def with_values(scene: Scene, values) -> Scene:
-        """The scene with those of the values by name that it holds."""
+        """Return the scene with those of the values by name that it holds."""
         return named.with_parameters(scene, {name: v for name, v in values.items() if name in scene.about.parameters})
 
     def by_view(self, flat: np.ndarray) -> list[np.ndarray]:
-        """(N, 3) of all groups one after another to (H, W, 3) of each view, in the caller's order."""
+        """Return arrays (H, W, 3) per view, in the caller's order, from (N, 3) of all groups one after another."""
         images, first = {}, 0
         for views in self.groups:
             stack = flat[first : first + views.targets.size // 3].reshape(views.targets.shape)
@@ -140,7 +140,7 @@ class Problem:
 
 
 def build(scene, target, names, start) -> Problem:
-    """Check and stack; arguments and errors are those of `fit`."""
+    """Check and stack the views and targets; arguments and errors are those of `fit`."""
     scenes = [scene] if isinstance(scene, Scene) else list(scene)
     targets = [target] if isinstance(scene, Scene) else list(target)
     if isinstance(names, str):
@@ -177,15 +177,15 @@ def build(scene, target, names, start) -> Problem:
     targets = [
         replace(t, image=t.image * exposure, step=t.step * exposure, ceiling=t.ceiling * exposure) for t in targets
     ]
-    rounding = ROUNDING * max(level * exposure, np.finfo(np.float32).tiny ** 0.25)  # its square must be a number
-    # Pixels that share samples are not independent, as the uncertainty of a fit supposes them to be.
+    rounding = ROUNDING * max(level * exposure, np.finfo(np.float32).tiny ** 0.25)  # its square must not underflow
+    # Pixels that share samples would not be independent, as the uncertainty of a fit assumes.
     own = [replace(each, film=film.with_own_samples(each.film)) for each in scenes]
     groups = _groups(own, targets, exposure, names)
     return Problem(scenes, targets, exposure, rounding, groups, vector, vector.pack(values))
 
 
 def is_many(vector: ParameterVector) -> bool:
-    """Whether there are more numbers than a Jacobian should have columns."""
+    """Return whether there is a texture, or more scalars than a Jacobian should have columns."""
     return vector.count > MOST_COLUMNS or any(p.is_texture for _, p in vector.parameters)
 
 
@@ -230,7 +230,7 @@ def _groups(scenes, targets, exposure, names) -> list[Views]:
             stacked.append(same[0] if equal else jnp.stack(same))
             axes.append(None if equal else 0)
         first = scenes[numbers[0]]
-        # So that a scene that is loaded again has the same structure, and its fit the same programs.
+        # With only these names, a scene that is loaded again has the same structure, and its fit the same programs.
         structure = jax.tree.structure(replace(first, about=held))
         scene = jax.tree.unflatten(structure, stacked)
         dtype = first.camera.origin.dtype

@@ -1,7 +1,7 @@
-"""What a fit of many numbers evaluates: images of some pixels, J v and J^T v, of all views, without J.
+"""Evaluations for a fit of many scalars: images, J v and J^T v for the kept pixels of all views, and rows of J.
 
-What is of pixels is (N, 3), of the kept pixels of all views one after another; what is of parameters (n,), in float64.
-Each evaluation is one kernel for a part of the pixels, so that a fit compiles few kernels, whichever pixels it keeps.
+Arrays over pixels are (N, 3), for the kept pixels of all views one after another; those over parameters are (n,), in
+float64. One kernel evaluates a part of the pixels, so that a fit compiles few kernels, whichever pixels it keeps.
 """
 
 from __future__ import annotations
@@ -26,22 +26,22 @@ from pathjax.inverse.problem import Problem, Views
 from pathjax.rendering.render import render_pixels
 from pathjax.scene import parameters as named
 
-# Pixels are rendered in so many parts, but in parts that are worth a kernel's start.
+# Parts in which pixels are rendered; and the least pixels of a part that are worth the start of a kernel.
 PARTS, LEAST_PART = 8, 4096
-# Rows of J are made for fewer pixels at once, by each device for its own: for all in so many parts, or for so many
-# bytes, but not for too few pixels for a kernel.
+# Rows of J are made for fewer pixels at once, by each device for its own: parts of all pixels, bytes of a part, and the
+# least pixels that are worth a kernel.
 ROWS_PARTS, ROWS_BYTES, LEAST_ROWS = 64, 1 << 26, 1024
 
 
 class RowsPart(NamedTuple):
-    """Some pixels: their places (n,) in (N,), and for each draw a call that renders their rows, in any thread."""
+    """Some pixels: their indices (n,) in (N,), and for each draw a call that renders their rows, in any thread."""
 
     places: np.ndarray
-    new: np.ndarray  # (V, part) bool: of the others another part gives rows
+    new: np.ndarray  # (V, part) bool; the others belong to another part, or are no kept pixels
     calls: list[Callable[[], np.ndarray]]
 
     def rows(self) -> list[np.ndarray]:
-        """(3, n, Q) of J, for each draw."""
+        """Return rows of J (3, n, Q) for each draw."""
         return [np.ascontiguousarray(np.moveaxis(call()[self.new], -1, 0)) for call in self.calls]
 
 
@@ -52,14 +52,14 @@ class Products:
         self.problem, self.vector, self.seed = problem, problem.vector, jnp.uint32(seed)
         self.dtype = problem.groups[0].targets.dtype
         self.compile_seconds, self.draws = 0.0, 0
-        # Values, and the groups that hold them: for kernels of all devices, and for those of one.
+        # Values, and the groups that hold them: for kernels on all devices, and for those on one.
         self.placed: tuple[np.ndarray, list[Views], list[Views]] | None = None
         self.keep([np.ones(t.image.shape[:2], bool) for t in problem.targets])
 
     def keep(self, masks: list[np.ndarray]) -> None:
-        """Evaluate from now on the pixels (H, W) bool of each view."""
+        """Evaluate from now on the pixels in these masks, (H, W) bool per view."""
         self.masks = masks
-        self.parts: list[tuple[int, jax.Array, np.ndarray]] = []  # group, pixels (V, part), where they are in (N,)
+        self.parts: list[tuple[int, jax.Array, np.ndarray]] = []  # group, pixels (V, part), their indices in (N,)
         first = np.cumsum([0, *(int(mask.sum()) for mask in masks)])
         self.count = int(first[-1])
         for group, views in enumerate(self.problem.groups):
@@ -67,7 +67,7 @@ class Products:
             part = min(max(masks[views.numbers[0]].size // PARTS, LEAST_PART), masks[views.numbers[0]].size)
             for begin in range(0, max(map(len, own), default=0), part):
                 pixels = np.zeros((len(own), part), np.int32)
-                places = np.full((len(own), part), self.count)  # beyond the last: of no pixel
+                places = np.full((len(own), part), self.count)  # N: no pixel
                 for row, (number, mine) in enumerate(zip(views.numbers, own, strict=True)):
                     here = mine[begin : begin + part]
                     pixels[row, : len(here)] = here
@@ -75,19 +75,19 @@ class Products:
                 self.parts.append((group, jnp.asarray(pixels), places))
 
     def next_draw(self) -> jax.Array:
-        """A number for renders that are independent of all before."""
+        """Return the number of a new draw, for renders that are independent of all before."""
         self.draws += 1
         return jnp.uint32(self.draws)
 
     def images(self, values: np.ndarray, spp: int, draw) -> np.ndarray:
-        """(N, 3), exposed."""
+        """Return the image (N, 3), exposed."""
         found = np.zeros((self.count + 1, 3))
         for group, pixels, places in self.parts:
             found[places] = self._run(_image, values, group, pixels, spp, draw)
         return found[:-1]
 
     def push(self, values: np.ndarray, change: np.ndarray, spp: int, draw) -> np.ndarray:
-        """J change: (n,) -> (N, 3)."""
+        """Return J change: (n,) -> (N, 3)."""
         found = np.zeros((self.count + 1, 3))
         change = jnp.asarray(change, self.dtype)
         for group, pixels, places in self.parts:
@@ -95,7 +95,7 @@ class Products:
         return found[:-1]
 
     def pull(self, values: np.ndarray, adjoint: np.ndarray, spp: int, draw) -> np.ndarray:
-        """J^T adjoint: (N, 3) -> (n,)."""
+        """Return J^T adjoint: (N, 3) -> (n,)."""
         padded = np.concatenate([adjoint, np.zeros((1, 3))])
         total = np.zeros(len(values))
         for group, pixels, places in self.parts:
@@ -105,21 +105,21 @@ class Products:
 
     @property
     def most_rows(self) -> int:
-        """The most pixels of a part of `rows`."""
+        """Most pixels of a part of `rows`, over all its views."""
         fit = min(ROWS_BYTES // (self.vector.count * 4), self.count // ROWS_PARTS)
         return max(fit, LEAST_ROWS, *(len(pixels) for _, pixels, _ in self.parts))
 
     def rows(self, values: np.ndarray, spp: int, draws: tuple) -> Iterator[RowsPart]:
-        """Yield parts of the pixels, enough of them that many devices do as much, and small enough for memory.
+        """Yield parts of the pixels: enough to share the work evenly among many devices, and small enough for memory.
 
-        All parameters are colours, or all are numbers, Q in all. Light keeps its channel: J[c] is that of channel c, in
-        channel c of colours.
+        Parameters are Q colours or Q scalars. Light keeps its channel: J[c] is the derivative of channel c in channel c
+        of colours.
         """
         for group, pixels, places in self.parts:
             most = max(self.most_rows // len(pixels), 1)
             each = -(-pixels.shape[1] // -(-pixels.shape[1] // most))
             for first in range(0, pixels.shape[1], each):
-                begin = min(first, pixels.shape[1] - each)  # the last one as large as the others: one kernel
+                begin = min(first, pixels.shape[1] - each)  # the last part is as large as the others: one kernel
                 here = places[:, begin : begin + each]
                 new = here < self.count
                 new[:, : first - begin] = False
@@ -127,7 +127,7 @@ class Products:
                 yield RowsPart(here[new], new, calls)
 
     def spread(self, kept: np.ndarray) -> list[np.ndarray]:
-        """(N, C) of the kept pixels to (H, W, C) of each view, with 0 elsewhere."""
+        """Return arrays (H, W, C) per view from (N, C) of the kept pixels, with 0 elsewhere."""
         parts = np.split(kept, np.cumsum([int(mask.sum()) for mask in self.masks])[:-1])
         images = []
         for mask, part in zip(self.masks, parts, strict=True):
@@ -144,7 +144,7 @@ class Products:
         return self._call(*call)()
 
     def _at(self, values: np.ndarray, everywhere: bool = True) -> list[Views]:
-        """The groups with these values in them, whose arrays kernels take as they are: on all devices, or on one."""
+        """Return the groups with these values, on all devices or on one, so that kernels need not copy their arrays."""
         if self.placed is None or not np.array_equal(values, self.placed[0]):
             self.placed = None  # memory for one at a time
             by_name = self.vector.unpack(jnp.asarray(values, self.dtype))
@@ -153,7 +153,7 @@ class Products:
         return self.placed[1 if everywhere else 2]
 
     def _call(self, function: Callable, values, group: int, pixels, spp: int, draw, *more) -> Callable:
-        """Compile, in the thread that asks for it, and return what runs the kernel, in any."""
+        """Compile a kernel in the calling thread, and return a function that runs it in any thread."""
         views = self._at(values, everywhere=function is not _rows)[group]
         values = jnp.asarray(values, self.dtype)
         arguments = values, views, pixels, jnp.uint32(spp), views.seeds(self.seed, draw, 0), *more
@@ -164,7 +164,7 @@ class Products:
 
 
 def _image(values, views: Views, pixels, spp, seeds, vector):
-    """(V, part, 3)."""
+    """Return the images (V, part, 3)."""
     by_name = vector.unpack(values)
 
     def one(scene, work):
@@ -183,7 +183,7 @@ def _pull(values, views, pixels, spp, seeds, adjoint, vector):
 
 
 def _rows(values, views, pixels, spp, seeds, vector):
-    """(V, part, Q, 3), by a kernel for `concurrently`."""
+    """Return rows of J (V, part, Q, 3), by a kernel for `concurrently`."""
     by_name, options = vector.unpack(values), Options(derivative=True, by_vertex=True)
 
     def one(scene, work):

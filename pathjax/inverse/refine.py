@@ -7,15 +7,15 @@ import numpy as np
 from pathjax.inverse import uncertainty, weights
 from pathjax.inverse.state import State
 
-# The first steps are made with this part of the samples.
+# The first steps are made with the samples divided by this.
 COARSE_PART = 4
 MAX_STEPS = 8
-# The method ends with a step below this part of the standard errors, and takes none beyond this part of the scale.
+# The method ends with a step below this part of the standard errors; steps are clipped to this part of the scale.
 SMALL_STEP, LARGE_STEP = 0.3, 0.3
 
 
 def refine(state: State) -> tuple[bool, str]:
-    """Move the values to the root, and find their covariance. Returns whether it converged, and what to mind."""
+    """Move the values to the root, and find their covariance; return whether the fit converged, and a message."""
     low, high = state.vector.bounds.T
     _newton(state, max(state.spp // COARSE_PART, 1), small=1)
     while True:
@@ -24,9 +24,9 @@ def refine(state: State) -> tuple[bool, str]:
         state.values = np.clip(state.values, low, high)
         if not settled or not outside.any():
             break
-        # What wants to leave its bounds stays there, and the others are fitted again.
+        # Values that would leave their bounds stay there, and the others are fitted again.
         state.free &= ~outside
-    # Where a bound holds a component, the curvature still says how well it is known.
+    # The curvature also gives the uncertainty of components that a bound holds.
     state.solve(np.ones_like(state.free))
     rounding = _rounding_covariance(state)
     state.solution = state.solution._replace(covariance=state.solution.covariance + rounding)
@@ -55,7 +55,7 @@ def _newton(state: State, spp: int, small: float) -> bool:
         state.solve(state.free)
         step = np.clip(state.solution.step, -LARGE_STEP, LARGE_STEP)
         state.values = state.values + state.scale * step
-        # The weighted product of the two renders' residuals: the misfit without their noise.
+        # The loss is the weighted product of the two renders' residuals: the misfit without their noise.
         state.record("refine", spp, float(state.normal.loss))
         sigma = np.sqrt(np.diag(state.solution.covariance))
         if np.all(np.abs(step) <= small * sigma + np.finfo(state.dtype).eps):
@@ -64,7 +64,7 @@ def _newton(state: State, spp: int, small: float) -> bool:
 
 
 def _rounding_covariance(state: State) -> np.ndarray:
-    """(n, n) of the error that rounded values have in common, in units of the scale; noise hides it."""
+    """Return the covariance (n, n), in units of the scale, of the error that rounded values share; noise hides it."""
     problem = state.problem
     if not any(target.step.any() for target in problem.targets):
         return np.zeros_like(state.solution.covariance)

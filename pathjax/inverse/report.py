@@ -1,4 +1,4 @@
-"""A fit for people and scripts: a table, JSON-ready values, and a picture of target, fit and residual."""
+"""Reports of a fit: a table, JSON-ready values, and an image of target, fit and residual."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ _FULL_SCALE = 3
 
 
 def textures(fit: Fit) -> list[str]:
-    """Names of the parameters that are images."""
+    """Return the names of the parameters that are images."""
     return [name for name in fit.values if is_grid(_parameter(fit, name))]
 
 
 def summed_up(fit: Fit) -> list[str]:
-    """Names of the parameters of which a summary is told: images, grids of volumes, and what meshes carry."""
+    """Return the names of the parameters that are reported as a summary: images, volume grids and mesh attributes."""
     return [name for name in fit.values if _parameter(fit, name).is_texture]
 
 
@@ -34,7 +34,7 @@ def _parameter(fit: Fit, name: str) -> Parameter:
 
 
 def facts(fit: Fit) -> dict:
-    """What `json_text` writes of a fit. Of textures and grids it is a summary: their numbers belong into files."""
+    """Return what `json_text` writes of a fit, with summaries of textures and grids, whose values belong in files."""
     found = {name: getattr(fit, name) for name in _FACTS}
     images = summed_up(fit)
     if images:
@@ -83,9 +83,9 @@ def text(fit: Fit) -> str:
 
 
 def picture(fit: Fit, targets) -> np.ndarray:
-    """(H, W, 3) linear RGB: a row for each view, of target, fit, and residual: blue too dark, red too bright.
+    """Return linear RGB (H, W, 3): per view a row of target, fit, and residual, blue where too dark, red if too bright.
 
-    What was left out has no residual: nan, which a PNG shows black.
+    Pixels that were left out have the residual nan, which is black in a PNG.
     """
     rows = []
     for target, image, residual in zip(targets, fit.images, fit.residuals, strict=True):

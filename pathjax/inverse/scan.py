@@ -1,4 +1,4 @@
-"""Where a fit should begin: indices of refraction over their whole range, for a local method finds a near minimum."""
+"""Initial values of a fit: a scan of IORs over their whole range, since a local method finds only a near minimum."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from pathjax.inverse import losses
 from pathjax.inverse.approach import approach
 from pathjax.inverse.state import State
 
-# Relative indices of refraction that are tried, from almost none to diamond's; a few at a time.
+# Relative IORs that are tried, from nearly 1 to above diamond's; samples per pixel; and how many are tried at a time.
 RATIOS, SCAN_SPP, CHUNK = np.geomspace(1.02, 2.6, 64), 4, 16
 MOST_CANDIDATES = 3
 
 
 def scan(state: State) -> list[np.ndarray]:
-    """Values (n,) to begin with, the most promising first; the present ones if there is nothing to scan."""
+    """Return initial values (n,), the most promising first; the present ones if there is nothing to scan."""
     parameters = state.vector.parameters
     names = [name for name, parameter in parameters if parameter.moves_paths]
     if not names:
         return [state.values]
     if len(names) < len(parameters):
-        # Colours first: a wrong index of refraction leaves them nearly right, and wrong ones may hide it.
+        # Colours first: a wrong IOR leaves them nearly right, while wrong colours may hide the right IOR.
         approach(state)
     state.weigh(SCAN_SPP)
     for name in names * min(len(names), 2):
@@ -37,7 +37,7 @@ def scan(state: State) -> list[np.ndarray]:
 
 
 def _misfits(state: State, candidates: np.ndarray) -> np.ndarray:
-    """(K,) of values (K, n)."""
+    """Return the misfits (K,) of values (K, n)."""
     candidates, weights = (jnp.asarray(a, state.dtype) for a in (candidates, state.weights))
     # All candidates see the same noise.
     arguments = state.groups, weights, jnp.uint32(SCAN_SPP), state.seed, jnp.uint32(0)
@@ -45,7 +45,7 @@ def _misfits(state: State, candidates: np.ndarray) -> np.ndarray:
 
 
 def _at_ratio(state: State, name: str, ratio: float) -> np.ndarray:
-    """The present values with another index of one glass, given by its relative index."""
+    """Return the present values with the IOR `name` set so that the relative IOR of its glass is `ratio`."""
     scene = next(scene for scene in state.problem.scenes if name in scene.about.parameters)
     values = state.vector.unpack(state.values.copy())
     values[name] = ior.at_ratio(state.problem.with_values(scene, values), name, ratio)

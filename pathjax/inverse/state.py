@@ -1,4 +1,4 @@
-"""What a fit has found so far. The stages `scan`, `approach` and `refine` move it on."""
+"""The state of a fit, which the stages `scan`, `approach` and `refine` advance."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from pathjax.system.interrupts import Interrupts
 
 
 class State:
-    """Values, and what the last renders at them or near them said."""
+    """The values, and the results of the last renders at or near them."""
 
     def __init__(
         self, problem: Problem, spp: int, seed: int, solver, progress: Callable | None, interrupts: Interrupts
@@ -33,7 +33,7 @@ class State:
         normal.check_memory(self.vector, self.dtype)
         self.values = problem.start.astype(float)  # (n,)
         self.scale = self.vector.scale(self.values)  # (n,) units of `solution`
-        self.free = np.ones(len(self.values), bool)  # (n,) the others are held at a bound
+        self.free = np.ones(len(self.values), bool)  # (n,) False: held at a bound
         self.normal: NormalEquations | None = None  # of the last two renders, in units of `scale`
         self.noise: weights.Noise | None = None
         count = sum(views.targets.size for views in self.groups) // 3
@@ -44,12 +44,12 @@ class State:
         self.started, self.compile_seconds = time.perf_counter(), 0.0
 
     def next_draw(self) -> jax.Array:
-        """A number for renders that are independent of all before."""
+        """Return the number of a new draw, for renders that are independent of all before."""
         self.draws += 1
         return jnp.uint32(self.draws)
 
     def program(self, function: Callable, *arguments, solver=None, **static):
-        """A function of the vector compiled for these arguments; if a solver is given, as `Stepper` of it."""
+        """Return a function of the vector, or with a solver a `Stepper` on it, compiled for these arguments."""
         key = function, identity(solver), self.vector, *static.items()
         function = partial(function, vector=self.vector, **static)
         make = partial(Stepper, solver, function) if solver else lambda *a: jax.jit(function).lower(*a).compile()
@@ -58,9 +58,9 @@ class State:
         return program
 
     def evaluate(self, spp: int, draw, images: np.ndarray | None = None) -> None:
-        """Find the normal equations of two renders at the values. images: (N, 3, K) of `normal.sums`."""
+        """Evaluate the normal equations of two renders at the values. images: (N, 3, K) as for `normal.sums`."""
         if images is None and any(target.step.any() for target in self.problem.targets):
-            images = np.zeros((*self.weights.shape, uncertainty.ROUNDING_IMAGES))  # so that there is one program
+            images = np.zeros((*self.weights.shape, uncertainty.ROUNDING_IMAGES))  # for a single program
         arrays = (jnp.asarray(a, self.dtype) for a in (self.values, self.scale, self.weights))
         images = None if images is None else jnp.asarray(images, self.dtype)
         arguments = self.groups, *arrays, jnp.uint32(spp), self.seed, draw, images
@@ -68,10 +68,9 @@ class State:
         self.normal = jax.tree.map(np.asarray, program(*arguments))
 
     def weigh(self, spp: int, refining: bool = False) -> None:
-        """Weights from the noise of renders of `spp` samples at the current values, and of the target's rounding.
+        """Set the weights from the noise of renders of `spp` samples at the current values and the target's rounding.
 
-        While the values are approached, clipped ones have no weight; when they are refined, neither have those that
-        noise may have clipped.
+        Clipped values of the target have weight 0; when refining, so have those that noise may have clipped.
         """
         self.scale = self.vector.scale(self.values)
         self.evaluate(weights.NOISE_SPP, self.next_draw())
@@ -88,11 +87,11 @@ class State:
         self.solution = uncertainty.solve(self.normal, free)
 
     def halves(self) -> weights.Halves:
-        """Residuals of the two renders, (H, W, 3) each, of each view."""
+        """Return the residuals (H, W, 3) of the two renders, for each view."""
         return list(zip(*map(self.problem.by_view, self.normal.residuals), strict=True))
 
     def structure(self) -> tuple[float, bool]:
-        """How well neighbouring residuals agree, and whether that is more than chance."""
+        """Return how well neighbouring residuals agree, and whether that is more than chance."""
         used = [weight > 0 for weight in self.problem.by_view(self.weights)]
         return weights.structure(self.halves(), self.problem, self.noise, used)
 
@@ -102,4 +101,4 @@ class State:
         self.history.append({"stage": stage, "spp": spp, "values": values, "loss": loss, "seconds": seconds})
         if self.progress:
             self.progress(self.history[-1])
-        distributed.heard(self.interrupts)  # its exception may have been lost, while Python collected garbage
+        distributed.heard(self.interrupts)  # its exception may have been lost during garbage collection

@@ -1,4 +1,4 @@
-"""What pixels can tell of parameters: scores of two independent renders, their covariance, what is not determined."""
+"""What pixels tell about parameters: the covariance from scores of two renders, and the undetermined directions."""
 
 from __future__ import annotations
 
@@ -9,47 +9,49 @@ from scipy import ndimage
 
 from pathjax.inverse.normal import NormalEquations
 
-# A direction counts as determined if its curvature stands this many standard errors above 0 ...
+# A direction counts as determined if its curvature is this many standard errors above 0 ...
 MIN_SIGNIFICANCE = 4
 # ... and its standard error is below this part of the parameters' scale.
 MAX_RELATIVE_ERROR = 0.25
 # Shares of an undetermined direction below which a component is not named, and not given an infinite error.
 NAMED_SHARE, TOUCHED_SHARE = 0.2, 0.03
-# Residuals have structure if they agree with this significance; what is beyond so many deviations is clipped, and noise
-# is taken to be alike in windows of so many pixels. Of 900 renders and targets of the shipped scenes, exact, as PNG
-# and with noise added, its standard deviation was 0.9 to 1.1 and none was beyond 4.3: false alarms are below 1e-4.
+# Residuals have structure if they agree with this significance. They are clipped at this many standard deviations, and
+# noise is taken to be uniform in windows of this width. For 900 renders and targets of the shipped scenes, exact, as
+# PNG and with noise added, the significance had a standard deviation of 0.9 to 1.1, and none was beyond 4.3: false
+# alarms are below 1e-4.
 STRUCTURE_SIGNIFICANCE, STRUCTURE_CLIP, STRUCTURE_WINDOW = 5, 5, 7
-# Neighbours are all within two pixels: a misfit is smooth, and most pairs tell most. Each pair once.
+# Neighbours are all pixels within two: a misfit is smooth, and more pairs tell more. Each pair once.
 STRUCTURE_PAIRS = [(down, right) for down in range(3) for right in range(-2, 3) if (down, right) > (0, 0)]
-# Sines and cosines of the series of a rounding error; what is left out is 7 % of its variance.
+# Sines and cosines in the series of a rounding error; the omitted ones hold 7 % of its variance.
 ROUNDING_IMAGES = 16
 
 
 class Solution(NamedTuple):
-    """What one evaluation says about n components, in units of their scale."""
+    """The solution of normal equations of n components, in units of their scale."""
 
-    covariance: np.ndarray  # (n, n) within it
+    covariance: np.ndarray  # (n, n) within the determined directions
     undetermined: np.ndarray  # (n, k) directions, columns
-    step: np.ndarray  # (n,) of Newton's method towards the root, within what is determined
-    inverse: np.ndarray  # (n, n) of the curvature, within what is determined
+    step: np.ndarray  # (n,) of Newton's method towards the root, within the determined directions
+    inverse: np.ndarray  # (n, n) of the curvature, within the determined directions
 
 
 def solve(normal: NormalEquations, free: np.ndarray) -> Solution:
-    """Eigenvectors of the curvature, those kept that noise cannot have made, and the sandwich covariance on them.
+    """Solve on the eigenvectors of the curvature that noise cannot have made, with the sandwich covariance.
 
     Args:
-        normal: in units of the scale. free: (n,) bool, the others stay where they are.
+        normal: in units of the scale.
+        free: (n,) bool; False: the component stays fixed.
     """
     matrices = np.asarray(normal.matrices, np.float64)[:, free][:, :, free]
     matrix, groups = matrices.sum(0), len(matrices)
     curvature, vectors = np.linalg.eigh(matrix)
     by_group = np.einsum("gik,ik->gk", matrices @ vectors, vectors)
     noise = by_group.std(0, ddof=min(1, groups - 1)) * np.sqrt(groups)
-    # What sums in the scene's numbers leave of a curvature that is 0.
+    # Rounding errors of sums in the scene's dtype, where the curvature is 0.
     size = np.abs(vectors).T @ np.sqrt(np.abs(np.diag(matrix)))
     rounding = 10 * np.finfo(normal.matrices.dtype).eps * size**2
     significant = curvature > np.maximum(MIN_SIGNIFICANCE * noise, rounding)
-    # The scatter of pixels is that of the score, with target, renders and Jacobians (White 1980).
+    # The scatter over pixels is that of the score, with the noise of target, renders and Jacobians (White 1980).
     along = np.asarray(normal.gradient, np.float64)[free] @ vectors
     scatter = vectors.T @ np.asarray(normal.scatter, np.float64)[np.ix_(free, free)] @ vectors
     inverse = np.where(significant, 1 / np.where(significant, curvature, 1), 0)
@@ -66,20 +68,22 @@ def solve(normal: NormalEquations, free: np.ndarray) -> Solution:
 
 
 def _not_negative(covariance: np.ndarray) -> np.ndarray:
-    """The covariance without the negative variances that rounding leaves of 0."""
+    """Return the covariance with negative variances, which rounding makes of 0, replaced by 0."""
     variances, vectors = np.linalg.eigh(covariance)
     return vectors * np.maximum(variances, 0) @ vectors.T
 
 
 def rounding_images(step, phase, noise) -> np.ndarray:
-    """(N, 3, ROUNDING_IMAGES) uncorrelated parts of the error of a rounded target, where its noise does not hide it.
+    """Return (N, 3, ROUNDING_IMAGES) uncorrelated parts of a target's rounding error, as far as noise does not hide it.
 
-    Pixels of nearly equal values are rounded alike, so that their errors do not average out as scatter over pixels has
-    it. The error of rounding x is a series of sines in 2 pi k x / step, damped by noise. If what all pixels have in
-    common is uniform over a step, its terms are uncorrelated (Widrow and Kollar, Quantization Noise, 2008).
+    Pixels of nearly equal values are rounded alike, so their errors do not average out as the scatter over pixels
+    assumes. The error of rounding x is a series of sines in 2 pi k x / step, damped by noise. If an offset common to
+    all pixels is uniform over a step, its terms are uncorrelated (Widrow and Kollar, Quantization Noise, 2008).
 
     Args:
-        step: (N, 3); phase: (N, 3) image / step, up to whole numbers; noise: (N, 3) standard deviation / step.
+        step: (N, 3).
+        phase: (N, 3) image / step, up to whole numbers.
+        noise: (N, 3) standard deviation / step.
     """
     k = np.arange(1, ROUNDING_IMAGES // 2 + 1)
     terms = np.exp(2j * np.pi * k * phase[..., None] - 2 * (np.pi * k * noise[..., None]) ** 2)
@@ -88,29 +92,29 @@ def rounding_images(step, phase, noise) -> np.ndarray:
 
 
 def deviation(values) -> float:
-    """Standard deviation of noise, whatever a few of the values are; 1 of none."""
+    """Return the standard deviation of noise, robust to a few outliers; 1 if there are no values."""
     # Half of normal noise lies below 0.6745 standard deviations.
     return float(np.median(np.abs(values)) / 0.6745) if values.size else 1.0
 
 
 def structure(misfits: list[np.ndarray], apart: int = 1, alike: float = 1.0) -> tuple[float, float]:
-    """Moran's I of the residuals, -1 to 1, and its significance.
+    """Return Moran's I of the residuals, -1 to 1, and its significance.
 
-    Noise is independent from pixel to pixel, and a wrong image is not: this tells a local minimum, or a scene that
-    cannot look like its target, from the answer, however large the noise. Large ones are clipped: a firefly must not
-    count for many, nor raise the noise by which a misfit of other pixels is measured. Pixels without a misfit have no
-    noise either, as a background that is exactly right, and say nothing.
+    Noise is independent from pixel to pixel, and the misfit of a wrong image is not: this tells a local minimum, or a
+    scene that cannot look like its target, from the right values, however large the noise. Large residuals are clipped:
+    a firefly must not count for many pixels, nor raise the noise against which the misfit of others is measured. Pixels
+    without a misfit, such as an exactly right background, have no noise either and are left out.
 
     Args:
-        misfits: of each view (H, W, 3) image - target in standard deviations, 0 where the target may look so.
-        apart, alike: where noise is correlated, the distance from which on it is not, and the sum of squared
+        misfits: per view (H, W, 3) image - target in standard deviations, 0 where the target allows the image's value.
+        apart, alike: for correlated noise, the distance from which on it is independent, and the sum of squared
             correlations around a pixel: only pixels that far from each other are compared.
     """
     products, expected, variances = [], [], []
     for misfit in misfits:
         f = np.clip(misfit, -STRUCTURE_CLIP, STRUCTURE_CLIP)
         present = f.any(-1)
-        # (H, W, 3, 3): channels share their noise, and its size differs from place to place all the same.
+        # (H, W, 3, 3): noise is correlated between channels, and its size differs from place to place.
         share = ndimage.uniform_filter(present.astype(float), STRUCTURE_WINDOW, mode="constant")
         size = STRUCTURE_WINDOW, STRUCTURE_WINDOW, 1, 1
         squares = ndimage.uniform_filter(f[..., :, None] * f[..., None, :], size, mode="constant")
