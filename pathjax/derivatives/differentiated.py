@@ -85,7 +85,7 @@ def tables_of_textures(scene: Scene, path: tuple) -> list[tuple]:
 
 
 def paths(scene: Scene) -> set[tuple]:
-    """Return the paths of all arrays that can be differentiated: not those read by kinds that lack `entries`."""
+    """Return the paths of all differentiable arrays: all but those of textures and backgrounds without `entries`."""
     tables = [(*BSDFS, i) for i in range(len(scene.materials.tables))] + [(*WRAPPERS, i) for i in _choosing(scene)]
     covers = tables_of_textures(scene, TEXTURES)
     for i in range(len(scene.emitters)):

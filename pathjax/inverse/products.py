@@ -37,7 +37,7 @@ class RowsPart(NamedTuple):
     """Some pixels: their indices (n,) in (N,), and for each draw a call that renders their rows, in any thread."""
 
     places: np.ndarray
-    new: np.ndarray  # (V, part) bool; the others belong to another part, or are no kept pixels
+    new: np.ndarray  # (V, part) bool; the others belong to another part, or are not kept
     calls: list[Callable[[], np.ndarray]]
 
     def rows(self) -> list[np.ndarray]:
