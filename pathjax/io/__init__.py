@@ -1,1 +1,1 @@
-"""Scene files and meshes: `load.load_scene` makes a scene of a file; the readers below it are plain NumPy."""
+"""Scene files and meshes: `load.load_scene` builds a scene from a file; the readers that it uses are plain NumPy."""

@@ -1,4 +1,4 @@
-"""glTF and bare meshes as scenes, with what a scene needs besides: a camera, light, a film."""
+"""glTF and bare meshes as scenes; a missing camera, light or film is added."""
 
 from __future__ import annotations
 
@@ -13,20 +13,19 @@ from pathjax.errors import InputError
 from pathjax.io import gltf, mesh
 from pathjax.shapes import Shape
 
-# By the end of the file's name.
 SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl")
 WIDTH, ASPECT, SPP = 768, 4 / 3, 64
 FOV = 35.0  # degrees, of the camera that frames the object
-TOWARDS = np.array([0.45, 0.35, 1.0])  # that camera, from the object: y is up, z its front, as in glTF
+TOWARDS = np.array([0.45, 0.35, 1.0])  # direction from the object to that camera; y up, z front, as in glTF
 
 
 def scene(path: Path, parameters: Mapping[str, object]) -> tuple[dict, list[str], list[Path]]:
-    """A scene for `load_dict`, notes, and the files that were read.
+    """Return a scene for `load_dict`, notes for the user, and the files that were read.
 
     Args:
         parameters: `res`, the width of the image in pixels.
     Raises:
-        InputError: the file cannot be read, or holds nothing to be seen; another parameter.
+        InputError: the file cannot be read or has no triangles, or a parameter is unknown.
     """
     if not path.is_file():
         raise InputError(f"{path}: {'not a file' if path.exists() else 'no such file'}")
@@ -52,7 +51,7 @@ def scene(path: Path, parameters: Mapping[str, object]) -> tuple[dict, list[str]
 
 
 def _mesh(path: Path) -> tuple[dict[str, dict], list[str], list[Path]]:
-    """A grey object, or one of the colours of its vertices."""
+    """Return objects, notes and files of a bare mesh: one two-sided diffuse object, grey or in its vertex colours."""
     made, notes = mesh.load(path, path.suffix.lower()[1:], np.eye(4))
     arrays = {"vertices": made.vertices, "faces": made.faces, "normals": made.normals, "uv": made.uv}
     if made.empty:
@@ -67,19 +66,19 @@ def _mesh(path: Path) -> tuple[dict[str, dict], list[str], list[Path]]:
 
 
 def framing(geometries: Sequence[Shape], file: str) -> dict:
-    """A camera from the front, somewhat above, whose view the sphere around the box of all shapes fits into.
+    """Return a camera in front and somewhat above that sees the whole bounding sphere of `around`.
 
     Raises:
-        InputError: they have no extent, or one that is not finite.
+        InputError: the shapes have no extent, or one that is not finite.
     """
     return _framing(*around(geometries, file))
 
 
 def around(geometries: Sequence[Shape], file: str) -> tuple[np.ndarray, float]:
-    """Center (3,) and radius of the sphere around the box of all shapes.
+    """Return the center (3,) and radius of the sphere around the bounding box of all shapes.
 
     Raises:
-        InputError: they have no extent, or one that is not finite.
+        InputError: the shapes have no extent, or one that is not finite.
     """
     corners = [corner for geometry in geometries for corner in geometry.primitives(flip=False).boxes()]
     return _around(np.concatenate([np.reshape(corner, (-1, 3)) for corner in corners]), file)
@@ -102,7 +101,7 @@ def _framing(center: np.ndarray, radius: float) -> dict:
 
 
 def _with_film(camera: dict, width: int) -> dict:
-    """The camera with a film of its aspect ratio."""
+    """Return the camera with a film of its aspect ratio in place of `aspect`, and a sampler."""
     height = max(round(width / (camera["aspect"] or ASPECT)), 1)
     camera = {key: each for key, each in camera.items() if key != "aspect"}
     camera["film"] = {"type": "hdrfilm", "width": width, "height": height}

@@ -1,7 +1,7 @@
-"""Whole scenes of glTF 2.0, with materials, cameras and lights, as dictionaries for `load_dict`.
+"""glTF 2.0 scenes with materials, cameras and lights, as dictionaries for `load_dict`.
 
-Materials become `principled`: roughness and metalness mean the same there. A candela counts as 1 W/sr, a lux as 1 W/m^2
-and emission of 1 as a radiance of 1: so the format relates them, and images have no other unit.
+Materials become `principled`, where roughness and metalness mean the same. One candela is read as 1 W/sr, one lux as
+1 W/m^2 and an emission of 1 as a radiance of 1, which keeps the ratios that the format defines.
 """
 
 from __future__ import annotations
@@ -23,32 +23,32 @@ from pathjax.io.mesh.raw import Raw
 
 WRAPS = {10497: "repeat", 33648: "mirror", 33071: "clamp"}
 NEAREST = 9728
-# Extensions that are modelled: what a file may require.
+# Extensions that are modelled, so that a file may require them.
 KNOWN = re.compile(
     "KHR_(lights_punctual|mesh_quantization|texture_transform|materials_(ior|emissive_strength|transmission|unlit))"
     "|EXT_texture_webp"
 )
 MOST_PIXELS = 10**9
-NO_LIMIT = 1e10  # of what a camera sees: farther than anything
+NO_LIMIT = 1e10  # far clip distance of a camera without one
 
 
 def scene(path: Path) -> tuple[dict[str, dict], list[str], list[Path]]:
-    """Objects of a scene by name, notes on what is left out, and the files that were read.
+    """Return the objects of a scene by name, notes on what is left out, and the files that were read.
 
     Raises:
-        InputError: the file is damaged, a part of it is missing, or it requires what is not modelled.
+        InputError: the file is damaged, a part of it is missing, or it requires a feature that is not modelled.
     """
     try:
         file = gltf.opened(path, KNOWN)
         return *_Scene(file).objects(), [path, *file.beside]
     except InputError:
         raise
-    except Exception as error:  # brought about by a header that is not as the format says
+    except Exception as error:  # any, as a malformed header may fail anywhere
         raise InputError(f"{path}: cannot be read as glTF ({type(error).__name__}: {error})"[:300]) from None
 
 
 def unused(name: str, taken: Mapping[str, object]) -> str:
-    """The name, or with a number where it is taken, or means something else in a dictionary."""
+    """Return the name, with a number appended if it is taken or is a reserved key ("type", "id")."""
     names = itertools.chain([name], (f"{name}_{number}" for number in itertools.count(1)))
     return next(each for each in names if each not in taken and each not in ("type", "id"))
 
@@ -56,9 +56,9 @@ def unused(name: str, taken: Mapping[str, object]) -> str:
 class _Scene:
     def __init__(self, file: gltf.File):
         self.file = file
-        self.notes: dict[str, None] = {}  # each once
+        self.notes: dict[str, None] = {}  # an ordered set
         self.made: dict[str, dict] = {}
-        self.materials: dict[tuple[int | None, bool], str] = {}  # by number, and whether vertices have colours
+        self.materials: dict[tuple[int | None, bool], str] = {}  # (index, whether vertices have colours) -> name
         self.emissions: dict[int | None, dict | None] = {}
         self.pictures: dict[int, np.ndarray] = {}
 
@@ -88,13 +88,13 @@ class _Scene:
             self.made[self.free(node.get("name") or kind)] = made
 
     def free(self, name: str) -> str:
-        """The name as a key, and with a number where it is taken."""
+        """Return the name as a valid key, with a number appended if it is taken."""
         return unused(re.sub(r"[^\w-]+", "_", name) or "_", self.made)
 
-    # ---- where it is seen from, and lit
+    # ---- cameras and lights
 
     def camera(self, camera: dict, matrix: np.ndarray) -> dict:
-        """A camera, with `aspect` in place of a film."""
+        """Return a camera, with `aspect` in place of a film."""
         seen = camera[camera["type"]]
         to_world = _looking(matrix)
         clip = {"near_clip": float(seen["znear"] or 1e-2), "far_clip": float(seen.get("zfar", NO_LIMIT))}
@@ -149,7 +149,7 @@ class _Scene:
         return made
 
     def colors(self, primitive: dict, part: Raw) -> np.ndarray | None:
-        """(V, 3) by which the colours of a material are multiplied."""
+        """Return (V, 3) vertex colours in [0, 1], which multiply those of the material; None: there are none."""
         if "COLOR_0" not in primitive["attributes"]:
             return None
         colors = self.file.accessor(primitive["attributes"]["COLOR_0"])
@@ -160,7 +160,7 @@ class _Scene:
         return np.clip(colors[:, :3], 0, 1)
 
     def bsdf(self, material: dict, colored: bool) -> dict:
-        """Both sides alike, as path tracers have them; the format would show one of them alone. But for solid glass."""
+        """Return the BSDF, two-sided unless it transmits (the format would by default show front faces only)."""
         pbr = material.get("pbrMetallicRoughness", {})
         factor = np.array(pbr.get("baseColorFactor", [1.0, 1.0, 1.0, 1.0]))
         base = self.texture(pbr.get("baseColorTexture"))
@@ -200,14 +200,14 @@ class _Scene:
         return {"type": "mask", "opacity": opacity, "bsdf": bsdf}
 
     def transmission(self, extensions: dict) -> float | dict | None:
-        """The share of light that is let through; None where there is none."""
+        """Return the share of light that is transmitted; None: none."""
         extension = extensions.get("KHR_materials_transmission", {})
         factor = float(extension.get("transmissionFactor", 0.0))
         picture = self.texture(extension.get("transmissionTexture")) if factor else None
         return picture.times(slice(0, 1), factor, raw=True) if picture is not None else factor or None
 
     def glass(self, bsdf: dict, extensions: dict) -> dict:
-        """A `principled` that lets light through: solid where it has a thickness, else a sheet of no metal."""
+        """Return the transmitting bsdf: `principled` for a solid, which has a thickness, else a sheet without metal."""
         if extensions.get("KHR_materials_volume", {}).get("thicknessFactor", 0.0):
             return bsdf
         if bsdf.pop("metallic") != 0:
@@ -215,7 +215,7 @@ class _Scene:
         return bsdf | {"type": "principledthin"}
 
     def emission(self, material: dict) -> dict | None:
-        """Radiance; None where there is none."""
+        """Return the emitted radiance; None: the material does not emit."""
         factor = np.array(material.get("emissiveFactor", [0.0, 0.0, 0.0]))
         extension = material.get("extensions", {}).get("KHR_materials_emissive_strength", {})
         factor = factor * extension.get("emissiveStrength", 1.0)
@@ -231,7 +231,7 @@ class _Scene:
     # ---- textures
 
     def coordinates(self, material: dict) -> int:
-        """Which texture coordinates of a mesh its textures use."""
+        """Return the index of the texture coordinates that the textures of a material use."""
         pbr = material.get("pbrMetallicRoughness", {})
         infos = [pbr.get("baseColorTexture"), pbr.get("metallicRoughnessTexture")]
         infos += [material.get("normalTexture"), material.get("emissiveTexture")]
@@ -264,7 +264,7 @@ class _Scene:
         return _Picture(self.pictures[source], how)
 
     def picture(self, number: int) -> np.ndarray:
-        """(H, W, 4) uint8 of an image."""
+        """Return (H, W, 4) uint8 pixels of an image."""
         from PIL import Image
 
         data = self.file.image(number)
@@ -275,14 +275,14 @@ class _Scene:
                 return np.asarray(image.convert("RGBA"))
         except InputError:
             raise
-        except Exception as error:  # of the decoder, as the image's bytes have it
+        except Exception as error:  # the decoder raises many kinds
             raise InputError(
                 f"{self.file.path}: image {number} cannot be read: {' '.join(str(error).split())}"
             ) from None
 
 
 class _Picture:
-    """An image, and how it lies on a surface."""
+    """An image, and how it is filtered, wrapped and mapped to a surface."""
 
     def __init__(self, pixels: np.ndarray, how: dict):
         self.pixels, self.how = pixels, how
@@ -291,14 +291,14 @@ class _Picture:
         return {"type": "bitmap", "data": data, "raw": raw, **self.how, **more}
 
     def times(self, channels: slice, factor: float | np.ndarray, raw: bool) -> dict:
-        """Some of its channels times a factor; raw: they are plain numbers, not sRGB. Stored bytes where that is 1."""
+        """Return some channels times a factor, or their stored bytes if that is 1. raw: plain values, not sRGB."""
         stored = self.pixels[..., channels]
         if np.all(factor == 1):
             return self.bitmap(stored, raw)
         return self.bitmap(decoded(stored, raw) * np.asarray(factor, np.float32), raw=True)
 
     def normals(self, scale: float) -> dict:
-        """A normal map whose x and y are scaled."""
+        """Return the normal map with x and y scaled."""
         if scale == 1:
             return self.bitmap(self.pixels[..., :3], raw=True)
         normal = (2 * decoded(self.pixels[..., :3], raw=True) - 1) * np.array([scale, scale, 1], np.float32)
@@ -306,7 +306,7 @@ class _Picture:
         return self.bitmap((normal / length + 1) / 2, raw=True)
 
     def alpha(self, factor: float, cutoff: float | None) -> dict:
-        """Opacity; with a cutoff texels are there or not."""
+        """Return the opacity; with a cutoff it is 0 or 1."""
         alpha = decoded(self.pixels[..., 3:], raw=True) * np.float32(factor)
         if cutoff is None:
             return self.bitmap(alpha, raw=True)
@@ -322,6 +322,6 @@ def _transform_of(info: dict) -> dict:
 
 
 def _looking(matrix: np.ndarray) -> Transform:
-    """The turned and moved frame whose z axis points where cameras and lights of the format look, along -z."""
+    """Return the frame, without scale, whose z axis is where the format's cameras and lights look: along -z."""
     origin = matrix[:3, 3]
     return Transform().look_at(origin, origin - matrix[:3, 2] / np.linalg.norm(matrix[:3, 2]), matrix[:3, 1])

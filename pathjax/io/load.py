@@ -1,4 +1,4 @@
-"""From a scene file to a scene."""
+"""Load scenes from files and dictionaries, and save them."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ from pathjax.scene.scene import Scene
 def load_dict(
     scene: Mapping[str, object], *, sensor: int | str = 0, dtype: DTypeLike = jnp.float32, split_rule: str = "sah"
 ) -> Scene:
-    """Load a scene that a dictionary describes as Mitsuba's `load_dict` has it.
+    """Load a scene from a dictionary in the form of Mitsuba's `load_dict`.
 
-    Arrays of NumPy or JAX stand for textures, {"type": "mesh", "vertices": (V, 3), "faces": (F, 3), ...} and objects of
-    trimesh for meshes, and `Transform`, Mitsuba's transforms and (4, 4) arrays for transforms. Keys at the top are ids.
+    A texture may be a NumPy or JAX array, a mesh {"type": "mesh", "vertices": (V, 3), "faces": (F, 3), ...} or a
+    trimesh object, and a transform a `Transform`, a Mitsuba transform or a (4, 4) array. Keys at the top level are ids.
 
     Args:
         scene: of "type": "scene".
         sensor, dtype, split_rule: as in `load_scene`.
     Raises:
-        InputError: what is wrong and what to do, with the keys that lead there.
+        InputError: the scene is invalid; the message has the cause, the remedy and the keys that lead there.
     Warns:
         InputWarning: images will be black, as nothing in the scene emits light, or nothing reflects it.
     """
@@ -49,18 +49,18 @@ def load_scene(
     parameters: Mapping[str, object] | None = None,
     **keywords: object,
 ) -> Scene:
-    """Load a scene file of Mitsuba 3, or glTF or a bare mesh as a scene.
+    """Load a scene from a Mitsuba 3 scene file, a glTF file or a bare mesh.
 
     Args:
-        file: path of the file, whose suffix says what it is.
-        sensor: which of several to use: its number, from 0, or its id.
-        dtype: of all real numbers; float64 needs `jax_enable_x64`.
+        file: path of the file; its suffix is its format.
+        sensor: which of several sensors to use: its index, from 0, or its id.
+        dtype: dtype of all real arrays; float64 needs `jax_enable_x64`.
         split_rule: how hierarchies are split, for experiments: "sah" (least expected cost), "equal" (equal counts) or
             "middle" (in the middle of the centroids' bounds). Images are the same; only their cost differs.
         parameters: values that replace the defaults of the file's `$parameters`, by name.
-        keywords: the same, as `res=128`. A `$parameter` named like an argument of this function is set by `parameters`.
+        keywords: more of these, as in `res=128`. Use `parameters` for a `$parameter` named like an argument above.
     Raises:
-        InputError: what is wrong and what to do; in a file, also the file and the line.
+        InputError: the scene is invalid; the message has the cause, the remedy and, for files, the file and line.
     Warns:
         InputWarning: images will be black, as nothing in the file emits light, or nothing reflects it.
     """
@@ -71,18 +71,18 @@ def load_scene(
 
 
 def save_scene(scene: Scene, file: str | os.PathLike) -> list[Path]:
-    """Write a scene that was loaded as a scene file of Mitsuba, with the present values of its parameters.
+    """Write a loaded scene as a Mitsuba scene file, with the current values of its parameters.
 
-    Loaded again it is the same scene. Textures and meshes that were given as arrays, and meshes in formats that Mitsuba
-    does not read, become files beside it, `NAME_*.exr`, `.png` and `.ply`; other files are named where they are. What
-    exists is overwritten, but no file that the scene was loaded from.
+    Loading that file gives the same scene. Textures and meshes that were given as arrays, and meshes in formats that
+    Mitsuba does not read, are written beside it as `NAME_*.exr`, `.png` and `.ply`; other files are referenced where
+    they are. Existing files are overwritten, except those that the scene was loaded from.
 
     Args:
         file: ends in `.xml`.
     Returns:
-        all files that were written, the scene file last.
+        All files that were written, the scene file last.
     Raises:
-        InputError: a file cannot be written, the scene's values are traced, or no scene file can say what has changed.
+        InputError: a file cannot be written, the scene's values are traced, or a change cannot be stored in a file.
     """
     values = parameters_of(scene)
     if any(is_traced(value) for value in values.values()):
@@ -99,13 +99,13 @@ def save_scene(scene: Scene, file: str | os.PathLike) -> list[Path]:
 
 
 def _equal(one: object, other: object) -> bool:
-    """Whether two pytrees have the same structure and arrays."""
+    """Return whether two pytrees have the same structure and arrays."""
     alike = jax.tree.structure(one) == jax.tree.structure(other)
     return alike and all(map(np.array_equal, jax.tree.leaves(one), jax.tree.leaves(other)))
 
 
 def _lit(scene: Scene, file: str | os.PathLike) -> Scene:
-    """Return the scene, after a warning if it is dark."""
+    """Warn if images of the scene are black; return the scene."""
     if dark := emitters.darkness(scene.emitters, scene.samples_lights):
         warnings.warn(f"{file}: {dark}, so images of it are black", InputWarning, stacklevel=3)
     return scene

@@ -1,4 +1,4 @@
-"""What was rendered as a file, with how it was made."""
+"""Write a rendered image to a file, with the settings that it was rendered with."""
 
 from __future__ import annotations
 
@@ -21,13 +21,14 @@ def write(
     parameters: Mapping[str, object],
     seed: int,
 ) -> None:
-    """Write an image, `.png` or `.exr`; of the latter also further channels, and what it is of in the header.
+    """Write an image as `.png` or `.exr`; EXR files also get the further channels, and the settings in their header.
 
     Args:
         channels: name to (H, W).
-        scene: what it was loaded from; parameters: what was set, by name.
+        scene: what the scene was loaded from.
+        parameters: values that were set, by name.
     Raises:
-        InputError: it cannot be written, and nothing is.
+        InputError: the file cannot be written; nothing is written then.
     """
     if path.suffix.lower() == ".png":
         images.write_png(path, result.image)
