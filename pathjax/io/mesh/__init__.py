@@ -1,11 +1,11 @@
-"""Triangle meshes from OBJ, PLY, STL, glTF and Mitsuba's serialized files, in world space and fit to be traced.
+"""Triangle meshes from OBJ, PLY, STL, glTF and Mitsuba's serialized files, validated and in world space.
 
-A file for each format says what is in it (`Raw`); `load` checks that, cuts polygons into triangles, and carries them to
-world space.
+A module for each format parses its files into a `Raw`; `load` checks that, triangulates polygons and transforms the
+mesh to world space.
 
-uv of a `Mesh` points v downwards: (u, v) looks up `texels[int(v * H), int(u * W)]`, the top row of the image first.
-glTF files store it like that. OBJ files count v from the bottom of the image, so it is flipped (`flip_tex_coords`
-true by default); of PLY and serialized files, Mitsuba assumes that nothing is to be flipped, and so does this loader.
+In the uv of a `Mesh`, v points downwards: (u, v) looks up `texels[int(v * H), int(u * W)]`, the image's top row first.
+glTF files store uv like that. In OBJ files v starts at the bottom of the image, so it is flipped (`flip_tex_coords`
+true by default); in PLY and serialized files it is not flipped, as in Mitsuba.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ READERS = {
     "gltf": gltf.read,
     "serialized": serialized.read,
 }
-# Faces that are computed at once: their numbers stay in the cache.
+# Faces per block of a computation: few enough that their values stay in the cache.
 BLOCK = 1 << 15
-# Formats whose meshes are shaded smoothly where the file has no normals.
+# Formats whose meshes get smooth shading normals if the file has none.
 SMOOTH = ("obj", "ply", "serialized")
 
 
@@ -43,21 +43,21 @@ def load(
     flip_tex_coords: bool | None = None,
     part: int | None = None,
 ) -> tuple[Mesh, list[str]]:
-    """Read a mesh, carry it to world space, and leave out degenerate triangles.
+    """Read a mesh, transform it to world space, and leave out degenerate triangles.
 
-    Shading normals are the file's; where OBJ, PLY and serialized files have none they are means of the faces around,
-    weighted by angle, as Mitsuba makes them, and where these cancel the faces are flat. STL and glTF without normals
-    are flat. A mirroring `to_world` turns faces inside out, as in Mitsuba; where the file has normals those decide, and
-    the order of vertices is reversed to agree with them.
+    Shading normals are the file's. Where OBJ, PLY and serialized files have none, vertices get the angle-weighted mean
+    of the normals of the adjacent faces, as in Mitsuba; where these cancel, the faces are flat. STL and glTF meshes
+    without normals are flat. A mirroring `to_world` turns faces inside out, as in Mitsuba; but if the file has normals,
+    the vertex order is reversed to agree with them.
 
     Args:
         kind: "obj", "ply", "stl", "glb", "gltf" or "serialized".
         to_world: (4, 4), affine and invertible.
-        face_normals: flat shading whatever the file has.
-        flip_tex_coords: v to 1 - v; None: what the format needs.
-        part: which mesh of a serialized file.
+        face_normals: flat shading, even if the file has normals.
+        flip_tex_coords: replace v by 1 - v; None: only for OBJ.
+        part: index of the mesh in a serialized file.
     Returns:
-        the mesh, without faces if all its triangles are degenerate, and notes worth telling the user.
+        The mesh, without faces if all its triangles are degenerate, and notes for the user.
     Raises:
         InputError: unreadable file, no triangles, an index out of range, a coordinate that is not finite in float32.
     """
@@ -76,10 +76,9 @@ def of_arrays(
     face_normals: bool = False,
     **attributes: np.ndarray | None,
 ) -> tuple[Mesh, list[str]]:
-    """`load` of arrays: vertices (V, 3), faces (F, 3) integers, normals (V, 3) and uv (V, 2). Without normals the mesh
-    is flat.
+    """Do what `load` does for arrays: vertices (V, 3), faces (F, 3) integers, normals (V, 3) and uv (V, 2).
 
-    place: for messages; attributes: "vertex_*" (V, 3) and "face_*" (F, 3).
+    Without normals the mesh is flat. place: for messages. attributes: "vertex_*" (V, 3) and "face_*" (F, 3).
     """
     attributes = {name: array for name, array in attributes.items() if array is not None}
     shapes = {"vertices": (vertices, 3), "faces": (faces, 3), "normals": (normals, 3), "uv": (uv, 2)}
@@ -103,7 +102,7 @@ def of_arrays(
 def _in_world(
     path: str | Path, raw: Raw, to_world: np.ndarray, face_normals: bool, smooth: bool, flip: bool
 ) -> tuple[Mesh, list[str]]:
-    """What `load` returns. smooth: a mesh without normals is shaded smoothly; flip: v becomes 1 - v."""
+    """Return what `load` returns. smooth: a mesh without normals gets smooth ones; flip: replace v by 1 - v."""
     vertices = _transformed(path, raw.vertices, to_world)
     notes = list(raw.notes)
     attributes = dict(raw.attributes)
@@ -115,7 +114,7 @@ def _in_world(
         if crossing:
             notes.append(f"{crossing} polygons cross themselves; no triangles cover such just once")
     area_vectors = _area_vectors(vertices, faces)
-    # Also false where an index is repeated. Both spaces: a transform rounds a line of three vertices to a sliver.
+    # Also false for repeated indices. In both spaces, as rounding in the transform may give collinear vertices an area.
     solid = area_vectors.any(axis=0)
     if not np.array_equal(vertices, raw.vertices):
         solid &= _area_vectors(raw.vertices, faces).any(axis=0)
@@ -138,7 +137,7 @@ def _in_world(
                 faces, area_vectors = faces[:, ::-1], -area_vectors
             if lacking[faces].any():
                 notes.append(f"{np.unique(faces[lacking[faces]]).size} vertices without a normal got a smooth one")
-        flat = np.zeros_like(faces, bool)  # corners that get the normal of their face, as vertices of their own
+        flat = np.zeros_like(faces, bool)  # corners that become separate vertices with the normal of their face
         if lacking.any():
             means, cancel = _smooth_normals(vertices, faces, area_vectors)
             given[lacking] = means[lacking]
@@ -161,17 +160,17 @@ def _in_world(
 
 
 def _by_kind(attributes: dict[str, np.ndarray], kind: str, change: Callable) -> dict[str, np.ndarray]:
-    """The attributes, those whose names begin like this changed."""
+    """Return the attributes, after applying `change` to those whose names begin with `kind`."""
     return {name: change(values) if name.startswith(kind) else values for name, values in attributes.items()}
 
 
 def _read(path: Path, kind: str, part: tuple[int, ...]) -> Raw:
-    """What the file says; all indices and all normals and uv are sound."""
+    """Parse the file, and check its indices, normals and uv."""
     try:
         raw = READERS[kind](path, *part)
     except InputError:
         raise
-    except Exception as error:  # of the libraries, or brought about by a header that is not as the format says
+    except Exception as error:  # any, from the libraries or due to a malformed header
         reason = f"{type(error).__name__}: {error}"[:200]
         raise InputError(f"{path}: cannot be read as {kind.upper()} ({reason})") from None
     _check(path, raw)
@@ -192,9 +191,9 @@ def _check(path: str | Path, raw: Raw) -> None:
 
 
 def _transformed(path: str | Path, vertices: np.ndarray, to_world: np.ndarray) -> np.ndarray:
-    """(V, 3) float64; finite also when rounded to float32, as everything downstream does."""
+    """Return (V, 3) float64 vertices in world space, checked to be finite after rounding to float32, as done later."""
     with np.errstate(over="ignore", invalid="ignore"):
-        # Where nothing moves, as zero is added, -0 becomes 0 all the same.
+        # Adding 0 turns -0 into 0, as the product and sum do.
         still = np.array_equal(to_world, np.eye(4))
         world = vertices + 0.0 if still else _product(vertices, to_world[:3, :3].T) + to_world[:3, 3]
         finite = np.isfinite(world.astype(np.float32)).all() and np.isfinite(vertices).all()
@@ -205,7 +204,7 @@ def _transformed(path: str | Path, vertices: np.ndarray, to_world: np.ndarray) -
 
 
 def _product(vertices: np.ndarray, matrix: np.ndarray) -> np.ndarray:
-    """vertices @ matrix, in blocks: of many rows BLAS begins threads, which take longer than the product."""
+    """Return vertices @ matrix, in blocks: for many rows BLAS starts threads, which takes longer than the product."""
     product = np.empty_like(vertices)
     for begin in range(0, len(vertices), BLOCK):
         np.matmul(vertices[begin : begin + BLOCK], matrix, out=product[begin : begin + BLOCK])
@@ -217,7 +216,7 @@ def _first_bad(values: np.ndarray) -> int:
 
 
 def _area_vectors(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """(3, F) twice the area along the normal; 0 for what has no area once rounded to float32."""
+    """Return (3, F) normals of length twice the area; 0 for triangles without area after rounding to float32."""
     with np.errstate(over="ignore"):
         rounded = vertices.T.astype(np.float32).astype(np.float64, order="C")
 
@@ -230,7 +229,7 @@ def _area_vectors(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 def _in_blocks(of_block: Callable[[slice], np.ndarray], shape: tuple[int, ...]) -> np.ndarray:
-    """What a function returns of blocks of the last axis, joined."""
+    """Return an array of this shape, computed in parallel by calling `of_block` on blocks of the last axis."""
     joined = np.empty(shape)
 
     def fill(begin: int) -> None:
@@ -243,10 +242,10 @@ def _in_blocks(of_block: Callable[[slice], np.ndarray], shape: tuple[int, ...]) 
 
 
 def _smooth_normals(vertices: np.ndarray, faces: np.ndarray, area_vectors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Sums of unit face normals weighted by the angle at the vertex (Thuermer and Wuethrich 1998).
+    """Return sums of unit face normals weighted by the angle at the vertex (Thuermer and Wuethrich 1998).
 
     Returns:
-        (V, 3) the sums, and (V,) where they cancel, as for a sheet that has a face for each of its sides, or are empty.
+        (V, 3) sums, and a (V,) mask where they cancel, as for a sheet with a face for each side, or have no terms.
     """
     columns = np.ascontiguousarray(vertices.T)
 
@@ -259,7 +258,7 @@ def _smooth_normals(vertices: np.ndarray, faces: np.ndarray, area_vectors: np.nd
         return np.arccos(np.clip(cosines, -1, 1))
 
     def total(weights: np.ndarray) -> np.ndarray:
-        """(V,) of weights (F,) times the angles."""
+        """Return (V,) sums of weights (F,) times the angles."""
         each = zip(faces.T, angles, strict=True)
         return sum(np.bincount(at, angle * weights, len(vertices)) for at, angle in each)
 
@@ -274,7 +273,7 @@ def _smooth_normals(vertices: np.ndarray, faces: np.ndarray, area_vectors: np.nd
 
 
 def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Scalar products of columns, (3, N) each."""
+    """Return the dot products of columns, (3, N) each."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 

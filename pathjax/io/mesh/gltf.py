@@ -1,7 +1,7 @@
-"""glTF 2.0, also as GLB: all triangles of the default scene, where its nodes place them.
+"""glTF 2.0, also as GLB: all triangles of the default scene, placed by its nodes.
 
-Materials, cameras, lights and animations are not read. What would change the triangles and is not modelled here, as
-skins or compression, is refused by name. trimesh 5.2 leaves out sparse accessors and triangle fans without a word.
+Materials, cameras, lights and animations are not read. Features that change the triangles and are not modelled, such as
+skins or compression, are refused by name. trimesh 5.2 silently leaves out sparse accessors and triangle fans.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from pathjax.io.mesh.raw import Raw
 
 COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
-TRIANGLES, STRIP, FAN = 4, 5, 6  # the modes below draw points and lines
+TRIANGLES, STRIP, FAN = 4, 5, 6  # modes; lower ones draw points and lines
 
-# Extensions that files may require: they leave the triangles alone, or are modelled.
+# Extensions that files may require: they do not affect the triangles, or are modelled.
 HARMLESS = re.compile(r"(KHR_materials|KHR_texture|EXT_texture)_\w+|KHR_lights_punctual|KHR_mesh_quantization")
-# Extensions of nodes that change which triangles there are, also where they are not required.
+# Node extensions that change which triangles exist; refused even where the file does not require them.
 PLACING = ("EXT_mesh_gpu_instancing", "KHR_node_visibility")
 
 
@@ -43,7 +43,7 @@ class File:
         return InputError(f"{self.path}: glTF with {what} is not supported; export it without")
 
     def entry(self, kind: str, number: int) -> dict:
-        """`number` of one of the header's lists; negative numbers do not count from its end."""
+        """Return entry `number` of a list of the header; negative numbers are refused."""
         there = len(self.header.get(kind, ()))
         if not 0 <= number < there:
             raise InputError(f"{self.path}: {kind} {number} does not exist; there are {there}")
@@ -64,9 +64,9 @@ class File:
         if uri[:5].lower() == "data:":
             kind, _, data = uri.partition(",")
             return base64.b64decode(unquote(data)) if kind.endswith(";base64") else unquote_to_bytes(data)
-        if re.match(r"\w{2,}:", uri):  # one letter is a drive of Windows
+        if re.match(r"\w{2,}:", uri):  # a single letter is a Windows drive
             raise self.refuse(f"the address {uri[:60]}")
-        names = [unquote(uri), uri]  # the second: written by programs that do not know of percent-encoding
+        names = [unquote(uri), uri]  # the second for programs that write names without percent-encoding
         found = next((file for name in names if (file := self.path.parent / name).is_file()), None)
         if found is None:
             raise InputError(f"{self.path}: {unquote(uri)[:200]}, which it names, is not beside it")
@@ -74,7 +74,7 @@ class File:
         return found.read_bytes()
 
     def image(self, number: int) -> bytes | None:
-        """An image file, whole."""
+        """Return the bytes of an image file."""
         this = self.entry("images", number)
         if "bufferView" not in this:
             return self._fetch(this["uri"])
@@ -83,7 +83,7 @@ class File:
         return self.buffer(view["buffer"])[start : start + view["byteLength"]]
 
     def accessor(self, number: int) -> np.ndarray:
-        """(count, width): float64, or where integers are meant as such, integers."""
+        """Return (count, width) values: float64, or integers if the stored ones are not normalized."""
         this = self.entry("accessors", number)
         layout = this["componentType"], this["type"], this["count"]
         if "bufferView" in this:
@@ -100,7 +100,7 @@ class File:
         return values if values.dtype.kind in "iu" else values.astype(np.float64)
 
     def _view(self, where: dict, component: int, kind: str, count: int) -> np.ndarray:
-        """(count, width) as stored from `byteOffset` of a bufferView on."""
+        """Return (count, width) stored values, beginning at `byteOffset` in a bufferView."""
         view, offset = self.entry("bufferViews", where["bufferView"]), where.get("byteOffset", 0)
         data, dtype, width = self.buffer(view["buffer"]), np.dtype(COMPONENTS[component]), WIDTHS[kind]
         start = view.get("byteOffset", 0)
@@ -127,18 +127,18 @@ def read(path: Path) -> Raw:
     lacking = sum(len(part.vertices) for part in parts if part.uv is None)
     if lacking and any(part.uv is not None for part in parts):
         notes.append(f"{lacking} vertices without texture coordinates got (0, 0)")
-    if any(part.normals is not None for part in parts):  # the format says that the others are flat
+    if any(part.normals is not None for part in parts):  # glTF: primitives without normals are flat
         parts = [part if part.normals is not None else _flat(part) for part in parts]
     return _joined(parts, tuple(notes))
 
 
 def opened(path: Path, known: re.Pattern = HARMLESS) -> File:
-    """The file.
+    """Open a glTF file.
 
     known: extensions that it may require.
 
     Raises:
-        InputError: it requires others, or has what would change its triangles and is not modelled.
+        InputError: it requires others, or has features that change its triangles and are not modelled.
     """
     file = _parsed(path, path.read_bytes())
     header = file.header
@@ -176,7 +176,7 @@ def _parsed(path: Path, data: bytes) -> File:
 
 
 def placed(file: File) -> Iterator[tuple[dict, np.ndarray]]:
-    """The nodes of the default scene, or where there are no scenes all, each with the matrix that places it."""
+    """Yield the nodes of the default scene, or all nodes if there are no scenes, with their matrices to world space."""
     nodes = file.header.get("nodes", [])
     if file.header.get("scenes"):
         roots = file.entry("scenes", file.header.get("scene", 0)).get("nodes", [])
@@ -211,7 +211,7 @@ def _local(node: dict) -> np.ndarray:
 
 
 def triangles_of(file: File, primitive: dict, matrix: np.ndarray, uv: int = 0) -> Raw:
-    """A primitive of a mesh, in the space of the scene. uv: which of its texture coordinates."""
+    """Return a primitive of a mesh, in world space. uv: index of the texture coordinates."""
     attributes, mode = primitive["attributes"], primitive.get("mode", TRIANGLES)
     vertices = file.accessor(attributes["POSITION"]).astype(np.float64)
     index = file.accessor(primitive["indices"])[:, 0] if "indices" in primitive else np.arange(len(vertices))
@@ -242,17 +242,17 @@ def triangles_of(file: File, primitive: dict, matrix: np.ndarray, uv: int = 0) -
     linear = matrix[:3, :3]
     normals = attribute("NORMAL", 3)
     if normals is not None:
-        # The inverse transpose but for its scale; it exists where `linear` flattens, too.
+        # The inverse transpose up to scale; unlike that, it exists for a singular `linear` too.
         cofactors = np.stack([np.cross(linear[k - 2], linear[k - 1]) for k in range(3)])
         normals = normals @ cofactors.T * np.copysign(1, np.linalg.det(linear))
-    if np.linalg.det(linear) < 0:  # the format says that a mirroring node reverses the winding
+    if np.linalg.det(linear) < 0:  # glTF: a mirroring node reverses the winding
         faces = faces[:, ::-1]
     vertices = vertices @ linear.T + matrix[:3, 3]
     return Raw(vertices, faces.ravel(), normals=normals, uv=attribute(f"TEXCOORD_{uv}", 2))
 
 
 def _flat(part: Raw) -> Raw:
-    """Triangles that share no vertices, with their own normals."""
+    """Return the triangles with separate vertices that have the normals of their triangles."""
     vertices = part.vertices[part.corners]
     a, b, c = (vertices[k::3].T for k in range(3))
     normals = np.repeat(cross(b - a, c - a).T, 3, axis=0)
@@ -260,7 +260,7 @@ def _flat(part: Raw) -> Raw:
 
 
 def _joined(parts: list[Raw], notes: tuple[str, ...]) -> Raw:
-    """One mesh of several; uv that only some have are zeros in the others."""
+    """Join several meshes into one; uv are zeros for meshes without, if others have them."""
     starts = np.cumsum([0] + [len(part.vertices) for part in parts])
 
     def column(name: str, width: int) -> np.ndarray | None:

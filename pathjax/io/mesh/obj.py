@@ -1,9 +1,9 @@
-"""Wavefront OBJ: polygons with uv and normals of their own indices. Materials, points and lines are not read.
+"""Wavefront OBJ: polygons whose uv and normals have separate indices. Materials, points and lines are not read.
 
-trimesh 5.2 takes negative indices from the end of the file rather than from the current line, reads index 0 as 1, and
-leaves out without a word the normals and uv of a file in which one index is wrong.
+trimesh 5.2 counts negative indices from the end of the file rather than from the current line, reads index 0 as 1, and
+silently drops the normals and uv of a file in which one index is wrong.
 
-Large files have millions of lines, so NumPy works on the bytes of all lines at once.
+Large files have millions of lines, so NumPy processes the bytes of all lines at once.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from pathjax.errors import InputError
 from pathjax.io.mesh.polygons import enumerated
 from pathjax.io.mesh.raw import Raw, numbers, plain_text
 
-# Lines of numbers, and how many of these they need; a weight, a colour or a third coordinate of uv may follow.
+# Keyword of a line of numbers -> count it needs; a weight, a colour or a third uv coordinate may follow.
 TABLES = {"v": 3, "vt": 1, "vn": 3}
-FACE, OTHER, EMPTY = range(len(TABLES), len(TABLES) + 3)  # the further kinds of line
+FACE, OTHER, EMPTY = range(len(TABLES), len(TABLES) + 3)  # further kinds of lines
 
 # Keywords of lines that say nothing about triangles, or draw points and lines.
 WITHOUT_SURFACE = frozenset("o g s mg usemtl mtllib usemap maplib l p bevel c_interp d_interp lod".split())
@@ -32,7 +32,7 @@ SPACE[list(b" \t\v\f\n")] = True
 
 
 def read(path: Path) -> Raw:
-    """Corners that share position, uv and normal become one vertex."""
+    """Read a file; corners with the same position, uv and normal become one vertex."""
     text = _logical_lines(plain_text(path.read_bytes()) + b"\n")
     data = np.frombuffer(text, np.uint8).copy()
     lines = np.diff(np.flatnonzero(data == NEWLINE), prepend=-1)
@@ -63,9 +63,9 @@ def read(path: Path) -> Raw:
 
 
 def _logical_lines(text: bytes) -> bytes:
-    """The text without comments and with continued lines joined; empty lines make up for those, for the count's sake.
+    """Remove comments and join continued lines, after which empty lines are added to keep the line numbers.
 
-    A line that ends in a backslash is continued, but not by one that begins with a keyword: names of materials and
+    A line that ends in a backslash is continued, unless the next line begins with a keyword, as names of materials and
     groups may end in a backslash too.
     """
     text = re.sub(rb"#(?<!\.#)[^\n]*", b"", text)  # not "1.#IND", as some programs write NaN
@@ -86,7 +86,7 @@ def _logical_lines(text: bytes) -> bytes:
 
 
 def _keywords(path: Path, text: bytes, data: np.ndarray, lines: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(L,) kinds of the lines, and (L,) how many words follow the keyword, which becomes space in `data`."""
+    """Return (L,) kinds of the lines and (L,) counts of words after the keyword, which is blanked in `data`."""
     starts, ends = np.flatnonzero(_word_starts(SPACE[data])), np.cumsum(lines)
     words = np.diff(np.searchsorted(starts, ends), prepend=0)
     filled = np.flatnonzero(words)
@@ -113,7 +113,7 @@ def _word_starts(space: np.ndarray) -> np.ndarray:
 
 
 def _table(data: np.ndarray, words: np.ndarray, needed: int) -> np.ndarray:
-    """The first three numbers of each line, or of uv, which needs one, the first two."""
+    """Return the first three numbers of each line, or the first two for uv, whose second defaults to 0."""
     values = numbers(data.tobytes(), np.float64)
     if len(values) != words.sum() or (words < needed).any():
         raise ValueError
@@ -124,10 +124,10 @@ def _table(data: np.ndarray, words: np.ndarray, needed: int) -> np.ndarray:
 
 
 def _corners(data: np.ndarray, words: np.ndarray) -> np.ndarray:
-    """(C, 3) the three indices of each corner, `v`, `v/vt`, `v//vn` or `v/vt/vn`, as they are written; 0: none."""
+    """Return (C, 3) indices of the corners as written, `v`, `v/vt`, `v//vn` or `v/vt/vn`; 0: none."""
     space, slash = SPACE[data], data == SLASH
     starts = _word_starts(space)
-    fields = starts.copy()  # a field begins where a word does, and behind a slash
+    fields = starts.copy()  # a field begins at the start of a word and after a slash
     fields[1:] |= slash[:-1]
     fields = np.flatnonzero(fields)
     filled = ~(space | slash)[fields]
@@ -145,7 +145,7 @@ def _corners(data: np.ndarray, words: np.ndarray) -> np.ndarray:
 
 
 def _distinct(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(K, 3) the different rows of (C, 3), in order of appearance, and (C,) which of them each row is."""
+    """Return the (K, 3) unique rows of (C, 3), in order of appearance, and (C,) the index into them for each row."""
     key = corners[:, 0]
     for column in corners.T[1:]:
         if column.any():
@@ -158,12 +158,12 @@ def _distinct(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _picked(table: np.ndarray, rows: np.ndarray) -> np.ndarray | None:
-    """Rows of a table, counted from 1; zeros where the row is 0; None if it always is."""
+    """Return rows of a table, counted from 1; zeros for row 0; None if all rows are 0."""
     return np.concatenate([np.zeros((1, table.shape[1])), table])[rows] if rows.any() else None
 
 
 def _refuse(path: Path, text: bytes) -> NoReturn:
-    """Find the line at fault."""
+    """Raise an InputError that names the faulty line."""
     for number, line in enumerate(text.decode("latin-1").split("\n"), start=1):
         name, *words = line.split() or [""]
         try:

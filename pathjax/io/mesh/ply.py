@@ -1,7 +1,7 @@
 """PLY: text, and binary of either byte order, with polygons of any size or triangle strips.
 
-The format (Turk 1994, "The PLY polygon file format"): a header declares elements and the types of their properties,
-then come the numbers. trimesh 5.2 reads rows that are not all of one length wrongly or not at all.
+The format (Turk 1994, "The PLY polygon file format"): a header declares elements and the types of their properties;
+the data follows. trimesh 5.2 reads rows of differing lengths wrongly or not at all.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from pathjax.errors import InputError
 from pathjax.io.mesh.polygons import enumerated, strips
 from pathjax.io.mesh.raw import Raw, numbers
 
-# Codes of NumPy and `struct`.
+# Type codes of NumPy and `struct`.
 TYPES = {
     **{"char": "b", "uchar": "B", "short": "h", "ushort": "H", "int": "i", "uint": "I", "float": "f", "double": "d"},
     **{"int8": "b", "uint8": "B", "int16": "h", "uint16": "H", "int32": "i", "uint32": "I", "int64": "q"},
     **{"uint64": "Q", "float16": "e", "float32": "f", "float64": "d"},
 }
 ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
-# Ends of the names of an attribute's channels; without a stem those of a colour.
+# Suffixes of the channels of an attribute: those of COLORS are whole names, the others follow a stem.
 COLORS = ("r", "red")
 CHANNELS = (("r", "g", "b"), ("red", "green", "blue"), ("_r", "_g", "_b"), ("_x", "_y", "_z"), ("_0", "_1", "_2"))
 UV = (("texture_u", "texture_v"), ("u", "v"), ("s", "t"))
@@ -32,17 +32,17 @@ UV = (("texture_u", "texture_v"), ("u", "v"), ("s", "t"))
 
 @dataclass(frozen=True)
 class _Element:
-    """An element as the header declares it, and its columns by name once they are read."""
+    """An element as the header declares it, and its columns by name after they are read."""
 
     name: str
     rows: int
-    text: bool  # its numbers were text, and are doubles now
-    types: dict[str, tuple[str, str | None]] = field(default_factory=dict)  # of the numbers; of a list's length
-    columns: dict[str, np.ndarray] = field(default_factory=dict)  # (rows,); of a list all numbers in one row
-    lengths: dict[str, np.ndarray] = field(default_factory=dict)  # (rows,) of the lists
+    text: bool  # the file is text, whose numbers were converted to doubles
+    types: dict[str, tuple[str, str | None]] = field(default_factory=dict)  # type of the numbers; of a list's length
+    columns: dict[str, np.ndarray] = field(default_factory=dict)  # (rows,); for lists, all their numbers concatenated
+    lengths: dict[str, np.ndarray] = field(default_factory=dict)  # (rows,) lengths of lists
 
     def layout(self) -> list[tuple[str, str, str | None]]:
-        """Name, code of the numbers and code of a list's length, as the bytes hold them."""
+        """Return name, type code of the numbers and type code of a list's length, as in the bytes to be read."""
         each = [(name, *codes) for name, codes in self.types.items()]
         return [(name, "=d", length and "=d") for name, _, length in each] if self.text else each
 
@@ -74,7 +74,7 @@ def read(path: Path) -> Raw:
 
 
 def _header(path: Path, data: bytes) -> tuple[dict[str, _Element], int, bool]:
-    """The elements in order, the place where their numbers begin, and whether these are text, read as doubles."""
+    """Return the elements in order, the byte at which their data begins, and whether the data is text."""
     start = re.match(rb"ply[ \t]*(\r\n|\n|\r)", data)
     if not start:
         raise InputError(f'{path}: cannot be read as PLY: the first line is not "ply"')
@@ -103,7 +103,7 @@ def _header(path: Path, data: bytes) -> tuple[dict[str, _Element], int, bool]:
 
 
 def _read_rows(path: Path, data: bytes, at: int, element: _Element) -> int:
-    """Fill the columns of an element that begins at byte `at`; return where it ends."""
+    """Fill the columns of an element that begins at byte `at`; return the byte after its end."""
     lists = [name for name, (_, length) in element.types.items() if length]
     row = _first_row(data, at, element)
     if row is None or at + element.rows * row.itemsize > len(data):
@@ -119,7 +119,7 @@ def _read_rows(path: Path, data: bytes, at: int, element: _Element) -> int:
 
 
 def _first_row(data: bytes, at: int, element: _Element) -> np.dtype | None:
-    """The layout of the first row, and of all if their lists are as long as its lists; None: there is no such row."""
+    """Return the layout of the first row, which all rows have if their lists have equal lengths; None: no such row."""
     layout = []
     for name, kind, length in element.layout():
         shape = ()
@@ -137,7 +137,7 @@ def _first_row(data: bytes, at: int, element: _Element) -> np.dtype | None:
 
 
 def _read_uneven_rows(path: Path, data: bytes, at: int, element: _Element) -> int:
-    """Fill the columns row by row: where a row begins depends on the lists before."""
+    """Fill the columns row by row, as the start of a row depends on the lists before; return the byte after the end."""
     # A row is a stretch of single numbers, a list, the next stretch, and so on.
     place, plan, offset = {}, [], 0
     for name, kind, length in element.layout():
@@ -147,7 +147,7 @@ def _read_uneven_rows(path: Path, data: bytes, at: int, element: _Element) -> in
         if length:
             plan.append((offset, struct.Struct(length), size))
             offset = 0
-    begins: list[list[int]] = [[] for _ in range(len(plan) + 1)]  # of the stretches
+    begins: list[list[int]] = [[] for _ in range(len(plan) + 1)]  # first bytes of the stretches
     lengths: list[list[int]] = [[] for _ in plan]
     for number in range(element.rows if element.types else 0):
         try:
@@ -172,26 +172,26 @@ def _read_uneven_rows(path: Path, data: bytes, at: int, element: _Element) -> in
             element.lengths[name] = np.array(lengths[stretch], np.int64)
             own, within = enumerated(element.lengths[name])
             starts = starts[own] + struct.calcsize(length) + struct.calcsize(kind) * within
-        # One number from each byte on, of which some are wanted.
+        # A view of the number at every byte, from which the wanted ones are taken.
         every = np.ndarray((max(len(data) - struct.calcsize(kind) + 1, 0),), kind, data, strides=(1,))
         element.columns[name] = every[starts]
     return at
 
 
 def _table(path: Path, element: _Element, names: tuple[str, ...]) -> np.ndarray:
-    """(rows, len(names)) float64."""
+    """Return (rows, len(names)) float64 values of these properties."""
     for name in names:
         if name not in element.types or element.types[name][1]:
             raise InputError(f"{path}: element {element.name} lacks the property {name}")
-    with np.errstate(over="ignore"):  # text may hold more than its type; what is not finite is found later
+    with np.errstate(over="ignore"):  # numbers in text may exceed their type; `mesh.load` refuses infinities
         return np.stack([element.columns[name].astype(element.types[name][0]) for name in names], 1).astype(np.float64)
 
 
 def _attributes(elements: dict[str, _Element]) -> tuple[tuple[str, ...], dict[str, np.ndarray]]:
-    """Notes, and what vertices and faces carry, (N, 3) by Mitsuba's names.
+    """Return notes, and (N, 3) attributes of vertices and faces by Mitsuba's names, after "vertex_" or "face_".
 
-    Of properties r, g, b or red, green, blue the name is "color"; of N_r, N_g, N_b "N_color"; of N_x, N_y, N_z or N_0,
-    N_1, N_2 "N". One alone of these stands for three.
+    Properties r, g, b or red, green, blue give "color"; N_r, N_g, N_b "N_color"; N_x, N_y, N_z or N_0, N_1, N_2 "N".
+    N_r, N_x or N_0 alone is used for all three channels.
     """
     found, notes = {}, []
     for element in (elements[kind] for kind in ("vertex", "face") if kind in elements and "tristrips" not in elements):
@@ -213,7 +213,7 @@ def _attributes(elements: dict[str, _Element]) -> tuple[tuple[str, ...], dict[st
 
 
 def _faces(path: Path, elements: dict[str, _Element]) -> tuple[np.ndarray, np.ndarray]:
-    """(C,) vertices of the corners of all polygons, and (F,) the sizes of these."""
+    """Return (C,) vertex indices of the corners of all polygons, and (F,) sizes of the polygons."""
     corners, sizes = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
     for element in (elements[name] for name in ("face", "tristrips") if name in elements):
         if element.lengths.get("texcoord", np.zeros(0)).any():

@@ -1,4 +1,4 @@
-"""Meshes as binary PLY, which Mitsuba reads and `ply.read` gives back as they were."""
+"""Write meshes as binary PLY, which Mitsuba reads and `ply.read` reads back unchanged."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pathjax.system.files import write_whole
 
 
 def write(path: Path, mesh: Mesh) -> None:
-    """Write a mesh with its normals, uv and attributes: as float32 where that holds all numbers, else float64."""
+    """Write a mesh with its normals, uv and attributes: as float32 if that holds all numbers exactly, else float64."""
     columns = [(("x", "y", "z"), mesh.vertices), (("nx", "ny", "nz"), mesh.normals), (("u", "v"), mesh.uv)]
     columns = [(names, array) for names, array in columns if array is not None]
     columns += [(_channels(name[7:]), a) for name, a in mesh.attributes.items() if name.startswith("vertex_")]
@@ -35,6 +35,6 @@ def write(path: Path, mesh: Mesh) -> None:
 
 
 def _channels(name: str) -> tuple[str, ...]:
-    """Properties from which an attribute has its name: r, g, b are "color", and N_x, N_y, N_z are "N"."""
+    """Return the properties that store an attribute: r, g, b for "color", and N_x, N_y, N_z for "N"."""
     stem, ends = (name.removesuffix("color"), "rgb") if name.endswith("color") else (f"{name}_", "xyz")
     return tuple(stem + end for end in ends)

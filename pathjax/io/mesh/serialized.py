@@ -1,7 +1,7 @@
-"""Mitsuba's `serialized` meshes: several in a file, each a compressed stream, and their places in a table at its end.
+"""Mitsuba's `serialized` meshes: several compressed streams in a file, with their offsets in a table at its end.
 
-The format (Mitsuba's documentation of the plugin): every mesh begins with an identifier and a version, 3 or 4, then
-comes a zlib stream of flags, a name (version 4), counts, positions, normals, uv, colours and triangles.
+The format (Mitsuba's documentation of the plugin): every mesh begins with an identifier and a version, 3 or 4, followed
+by a zlib stream of flags, a name (version 4), counts, positions, normals, uv, colours and triangles.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from pathjax.errors import InputError
 from pathjax.io.mesh.raw import Raw
 
 _IDENTIFIER = 0x041C
-_NORMALS, _UV, _COLORS, _DOUBLE = 0x0001, 0x0002, 0x0008, 0x2000  # Mitsuba heeds no other flags
+_NORMALS, _UV, _COLORS, _DOUBLE = 0x0001, 0x0002, 0x0008, 0x2000  # Mitsuba ignores other flags
 _LONGEST_NAME = 1 << 12
-# Packed bytes that are unpacked at a time, and the most that come of them at once.
+# Compressed bytes per step, and the most decompressed bytes per step.
 _BLOCK, _LARGEST_PIECE = 1 << 16, 1 << 24
 
 
 def read(path: Path, part: int = 0) -> Raw:
-    """Mesh number `part`, counting from 0. Colours are passed over, as in Mitsuba."""
+    """Read mesh number `part`, counting from 0. Colours are ignored, as in Mitsuba."""
     data = path.read_bytes()
     version = _version(path, data, 0)
     start = _start(path, data, version, part) if part else 0
@@ -45,7 +45,7 @@ def read(path: Path, part: int = 0) -> Raw:
 
 
 class _Stream:
-    """What a zlib stream holds, taken piece by piece: no more of it is unpacked than asked for."""
+    """A zlib stream that is decompressed on demand, piece by piece."""
 
     def __init__(self, path: Path, packed: memoryview):
         self.path, self.packed = path, packed
@@ -89,7 +89,7 @@ def _version(path: Path, data: bytes, start: int) -> int:
 
 
 def _start(path: Path, data: bytes, version: int, part: int) -> int:
-    """Byte at which a mesh begins, of the table at the end."""
+    """Return the byte at which a mesh begins, from the table at the end."""
     (count,) = struct.unpack("<I", data[-4:])
     place = np.dtype("<u8" if version == 4 else "<u4")
     if count == 0 or 4 + count * place.itemsize > len(data):

@@ -1,7 +1,7 @@
-"""STL: binary and text, flat triangles. The normals that it stores are not read; the order of vertices decides.
+"""STL: binary and text, flat triangles. Stored normals are not read; the order of vertices gives the orientation.
 
-Files are binary whose length fits the number of triangles at byte 80, whatever the first words: headers that begin
-with "solid" are common, and of a text these bytes would make a file of gigabytes.
+A file that is long enough for the number of triangles at byte 80 is binary, even if it begins with "solid", as many
+binary headers do: in a text file these bytes give a number that would need gigabytes.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def read(path: Path) -> Raw:
 
 
 def _text_corners(path: Path, text: bytes) -> np.ndarray:
-    """(F, 3, 3); the names that follow `solid` and `endsolid` may be anything."""
+    """Return (F, 3, 3) corners; the names after `solid` and `endsolid` may be anything."""
     words = re.sub(rb"(?mi)^[ \t]*(end[ \t]*)?solid\b.*$", b"", text).split()
     if len(words) % len(FACET):
         raise InputError(f"{path}: cannot be read as STL: facets have three vertices each, and {len(FACET)} words")
@@ -56,6 +56,6 @@ def _text_corners(path: Path, text: bytes) -> np.ndarray:
 
 
 def _separate(corners: np.ndarray, notes: tuple[str, ...] = ()) -> Raw:
-    """Triangles that share no vertices."""
+    """Return triangles that share no vertices."""
     vertices = corners.reshape(-1, 3).astype(np.float64)
     return Raw(vertices, np.arange(len(vertices)), notes=notes)
