@@ -1,1 +1,1 @@
-"""Mitsuba's scene files."""
+"""Read and write Mitsuba's scene files and dictionaries."""

@@ -1,6 +1,6 @@
-"""Scenes as Python dictionaries, in Mitsuba's form, to the elements that a scene file is made of.
+"""Convert scenes that are Python dictionaries, in Mitsuba's form, to the elements of a scene file.
 
-So each kind, bound and message is the same for both. The place of an element is the keys that lead to it.
+So kinds, bounds and messages are the same for both. The place of an element is the keys that lead to it.
 """
 
 from __future__ import annotations
@@ -33,23 +33,23 @@ def read(scene: Mapping, name: str = "scene") -> Document:
     """Convert a scene.
 
     Args:
-        name: of the scene, where the keys begin that are places.
+        name: name of the scene, with which all places begin.
     Raises:
-        InputError: a value of a type that no scene holds, a dictionary within itself, an unknown type, an id given
-            twice; with the keys that lead there.
+        InputError: a value of an unsupported Python type, a dictionary inside itself, an unknown "type", or a duplicate
+            id; the message has the keys that lead there.
     """
     return _Reader(name).document(scene)
 
 
 def element(name: str, value: Mapping, parent: Element) -> Element:
-    """What a dictionary stands for as one more object of a document, placed where `parent` stands."""
+    """Convert a dictionary to another object of a document, whose place is that of `parent`."""
     made = _Reader(parent.place).object(name, value, parent.place, top=False)
     del made.attributes["name"]
     return made
 
 
 def rooms() -> dict[str, Mapping[str, object]]:
-    """The tables of all rooms by the tag of elements."""
+    """Return tag of an element -> kinds by name."""
     return {
         "integrator": integrators.KINDS,
         "sensor": sensors.KINDS,
@@ -67,7 +67,7 @@ def rooms() -> dict[str, Mapping[str, object]]:
 
 
 class _Reader:
-    """What all levels share: the dictionaries around the present one, and which keys lead to each object."""
+    """The state that all levels share: the dictionaries around the current one, and the objects by their keys."""
 
     def __init__(self, name: str):
         self.name = name
@@ -82,13 +82,13 @@ class _Reader:
             must = 'must be a dictionary with "type": "scene", which holds all others by name'
             raise InputError(f"{self.name}: {must}")
         root = Element("scene", {"version": VERSION}, self.name, 0, self.children(scene, self.name, top=True))
-        # Keys lead to objects, too: `shape.bsdf`.
+        # A <ref> may give keys instead of an id: `shape.bsdf`.
         for path in self.referred & self.paths.keys():
             self.paths[path].attributes.setdefault("id", path)
         return Document(root, self.paths | by_id(root), tuple(self.folders))
 
     def children(self, items: Mapping, place: str, top: bool = False) -> list[Element]:
-        """What a dictionary holds besides its type and its id."""
+        """Convert the values of a dictionary, except its type and id."""
         if len(self.around) >= MAX_DEPTH:
             raise InputError(f"{place}: dictionaries are nested more than {MAX_DEPTH} deep")
         self.around.append(items)
@@ -115,7 +115,7 @@ class _Reader:
             return self.object(key, value, place, top)
         if mesh_objects.is_mesh(value):
             return self.object(key, {"type": "mesh", "mesh": value}, place, top)
-        if np.shape(getattr(value, "matrix", ()))[:2] in _MATRICES:  # Dr.Jit's points have an attribute matrix as well
+        if np.shape(getattr(value, "matrix", ()))[:2] in _MATRICES:  # Dr.Jit's points have an attribute matrix too
             return _transform(key, value.matrix, place)
         if type(value).__name__.endswith("Color3f"):  # of Mitsuba
             return _element("rgb", key, place, _text(_array(value, place)))
@@ -128,7 +128,7 @@ class _Reader:
         return self.array(key, _array(value, place), place)
 
     def array(self, key: str, array: np.ndarray, place: str) -> Element:
-        """A number, a point, a matrix, or data."""
+        """Convert an array: a scalar, a point, a matrix, or data."""
         if not array.ndim:
             return _number(key, array.item(), place)
         if key.startswith("to_"):
@@ -137,13 +137,13 @@ class _Reader:
             return _element("point", key, place, _text(array))
         if array.ndim == 1:
             raise InputError(f"{place}: must be one number or three, has {len(array)}")
-        name = "data" if key in ("bitmap", "grid") else key  # the same, where Mitsuba takes one of its own objects
+        name = "data" if key in ("bitmap", "grid") else key  # Mitsuba's keys for its own Bitmap and VolumeGrid
         if key == "bitmap" and array.ndim == 3 and array.shape[2] == 4:
-            array = array[..., :3]  # Mitsuba leaves alpha out, too
+            array = array[..., :3]  # Mitsuba drops alpha too
         return Element("array", {"name": name}, place, 0, data=array)
 
     def object(self, key: str, value: Mapping, place: str, top: bool) -> Element:
-        """An object of the kind that `type` names. At the top its key is its id."""
+        """Convert an object of the kind that `type` names. At the top level its key is its id."""
         tag = self.tag(value["type"], place)
         attributes = {"type": value["type"]} | ({} if top else {"name": key})
         name = value.get("id", key if top else None)
@@ -153,13 +153,13 @@ class _Reader:
             value = self.mesh(value["mesh"], {key: each for key, each in value.items() if key != "mesh"}, place)
         element = Element(tag, attributes, place, 0)
         element.children = self.children(value, place)
-        if tag not in ("shape", "texture"):  # their arrays are what they consist of; elsewhere they are images
+        if tag not in ("shape", "texture"):  # there arrays are the object's own data; elsewhere they are images
             element.children = [_as_texture(child) for child in element.children]
         self.paths[place.removeprefix(f"{self.name}.")] = element
         return element
 
     def mesh(self, mesh: object, beside: dict, place: str) -> dict:
-        """The arrays of a mesh object, and what stands beside it, which takes the place of its own bsdf and emitter."""
+        """Return the arrays of a mesh object, its bsdf and emitter, and the values beside it, which override these."""
         kinds = [each.get("type") for each in beside.values() if isinstance(each, Mapping)]
         given = ["bsdf" if kind == "ref" else self.tag(kind, place) for kind in kinds if isinstance(kind, str)]
         arrays = mesh_objects.arrays_of(mesh, place, lambda numbers: _array(numbers, place))
@@ -176,14 +176,14 @@ class _Reader:
             raise InputError(f'{place}: no kind is named "{_string(kind, place)[:60]}"{nearest(kind, known)}')
         return found[0]
 
-    # ---- what Mitsuba writes as dictionaries, and is no object
+    # ---- dictionaries that are values, not objects
 
     def _rgb(self, key: str, value: Mapping, place: str) -> Element:
         given = _only(value, ("value",), place)
         return _element("rgb", key, place, _text(_array(given["value"], place).reshape(-1)))
 
     def _spectrum(self, key: str, value: Mapping, place: str) -> Element:
-        """A spectrum of one number, of pairs of wavelength and number, or of a file."""
+        """Convert a spectrum: a number, pairs of wavelength and number, or a file."""
         if "filename" in value:
             filename = _only(value, ("filename",), place)["filename"]
             return Element("spectrum", {"name": key, "filename": _string(filename, place)}, place, 0)
@@ -200,7 +200,7 @@ class _Reader:
         return Element("ref", {"name": key, "id": name}, place, 0)
 
     def _resources(self, key: str, value: Mapping, place: str) -> None:
-        """A folder in which files are searched."""
+        """Add a folder in which files are searched."""
         name, element = _only(value, ("path",), place)["path"], Element("path", {"name": key}, place, 0)
         self.folders.append(find_file(_string(name, place), self.folders, element, folder=True))
 
@@ -212,12 +212,12 @@ def _string(value: object, place: str) -> str:
 
 
 def _shown(value: object) -> str:
-    """In one line of a message."""
+    """Return a short repr on one line, for a message."""
     return " ".join(repr(value).split())[:60]
 
 
 def _only(value: Mapping, keys: tuple[str, ...], place: str) -> Mapping:
-    """The dictionary, which has these keys besides its type and no others."""
+    """Return the dictionary after checking that it has exactly these keys besides its type."""
     for key in keys:
         if key not in value:
             raise InputError(f'{place}: {{"type": "{value["type"]}", ...}} lacks "{key}"')
@@ -238,7 +238,7 @@ def _number(key: str, value: object, place: str) -> Element:
 
 
 def _text(array: np.ndarray) -> str:
-    """The numbers such that they are read as they are."""
+    """Format numbers such that they are parsed back exactly."""
     return ", ".join(repr(float(x)) for x in array.ravel())
 
 
@@ -246,7 +246,7 @@ def _transform(key: str, matrix: object, place: str) -> Element:
     matrix = _array(matrix, place)
     if matrix.shape not in _MATRICES:
         raise InputError(f"{place}: a transform is a pj.Transform or a (4, 4) matrix, has the shape {matrix.shape}")
-    if key == "to_uv" and matrix.shape == (3, 3):  # of (u, v, 1), as Mitsuba's `ScalarTransform3f` has it
+    if key == "to_uv" and matrix.shape == (3, 3):  # acts on (u, v, 1), as Mitsuba's `ScalarTransform3f`
         of_plane, matrix = matrix, np.eye(4)
         matrix[np.ix_([0, 1, 3], [0, 1, 3])] = of_plane
     step = Element("matrix", {"value": _text(matrix)}, place, 0)
@@ -254,7 +254,7 @@ def _transform(key: str, matrix: object, place: str) -> Element:
 
 
 def _array(value: object, place: str) -> np.ndarray:
-    """Numbers of a list, or of an array of NumPy, JAX or Dr.Jit."""
+    """Convert a list, or an array of NumPy, JAX or Dr.Jit, to a NumPy array of numbers."""
     if is_traced(value):
         raise InputError(f"{place}: is traced; load the scene with numbers, and set parameters by pj.with_parameters")
     try:
@@ -269,14 +269,14 @@ def _array(value: object, place: str) -> np.ndarray:
             raise InputError(f"{place}: a {kind} cannot be read back; give the dictionary that it is made of")
         kinds = "a number, a string, a list of numbers, an array, a transform or a dictionary"
         raise InputError(f"{place}: a value of type {type(value).__name__} has no place in a scene; use {kinds}")
-    # Dr.Jit has one more axis, for the lanes that it computes at once.
+    # Dr.Jit's arrays have an extra last axis, for lanes.
     if not isinstance(value, list | tuple | np.ndarray) and array.shape[-1:] == (1,):
         array = array[..., 0]
     return array
 
 
 def _as_texture(child: Element) -> Element:
-    """The element, or in the place of an array the bitmap that holds it; `data` is what an object consists of."""
+    """Return the element, or a bitmap in place of an array, except for `data`, which is the object's own."""
     if child.tag != "array" or child.attributes["name"] == "data":
         return child
     data = Element("array", {"name": "data"}, child.file, 0, data=child.data)

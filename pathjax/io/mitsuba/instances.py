@@ -1,4 +1,4 @@
-"""Instances: shapes of a group that stand in several places, each a copy with a row of its own in the tables."""
+"""Instances: shapes of a group in several places. Each instance copies them, to separate rows of the tables."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from pathjax.description.fields import Fields
 from pathjax.kinds import Unused
 from pathjax.shapes import Shape
 
-# Above, the tables of a scene would not fit into the memory of usual machines, or its numbers into 32 bits.
+# More would not fit into the memory of usual machines, or indices not into 32 bits.
 MOST_TRIANGLES = 1 << 28
 MOST_SHAPES = 1 << 20  # inside one element
-# Vertices, normals, uv, and what searches keep of a triangle.
+# Per triangle: vertices, normals, uv, and its share of the hierarchy.
 BYTES = 200
 
 
 class ShapeGroup:
-    """What its instances show. It is not seen itself."""
+    """The shapes that its instances copy; the group itself is not in the scene."""
 
     unused: ClassVar[Mapping[str, Unused]] = Shape.unused | {
         "to_world": Unused("transform", "its shapes and its instances are placed each by their own")
@@ -29,7 +29,7 @@ class ShapeGroup:
 
     @classmethod
     def read(cls, loader, fields: Fields) -> list[d.Shape]:
-        """Its shapes, in its own space."""
+        """Read its shapes, in the space of the group."""
         made = []
         for element in fields.objects("shape", limit=MOST_SHAPES):
             if element.attributes.get("type") in ("shapegroup", "instance"):
@@ -44,7 +44,7 @@ class ShapeGroup:
 
 
 class Merge:
-    """Shapes that Mitsuba searches as one, where they have the same bsdf; the image is the same."""
+    """Shapes that Mitsuba merges into one if they have the same bsdf, which does not change the image."""
 
     unused = Shape.unused
 
@@ -74,5 +74,5 @@ def _placed(fields: Fields, shape: d.Shape, to_world: np.ndarray, name: str) -> 
     return replace(shape, name=f"{name}.{shape.name}", geometry=placed)
 
 
-# By the name that scene files give them.
+# Kinds by their names in scene files.
 KINDS = {"shapegroup": ShapeGroup, "instance": Instance, "merge": Merge}

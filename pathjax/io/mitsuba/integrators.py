@@ -1,6 +1,6 @@
-"""Integrators of scene files: what renders here is a path tracer, with the limits that one of them sets.
+"""Integrators of scene files: all of them select a path tracer, whose limits they set.
 
-A kind says with `read` what `Description.integrator` an element stands for.
+The `read` of a kind converts an element to the `Description.integrator`.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ class Path:
 
     @staticmethod
     def zero(loader, fields: Fields) -> int:
-        """The depth that a `max_depth` of 0 stands for."""
+        """Return the depth that a `max_depth` of 0 means."""
         loader.note(fields.where("max_depth"), "renders black, as in Mitsuba; -1 means no limit, 1 emission alone")
         return 0
 
 
 class VolPath(Path):
-    """Participating media too. Straight through a surface is no bounce."""
+    """Path tracer with participating media. Straight passes through a surface do not count as bounces."""
 
     @classmethod
     def read(cls, loader, fields):
@@ -50,7 +50,7 @@ class VolPathMIS(VolPath):
 
 
 class PRB(Path):
-    """Mitsuba's differentiable path tracer; its default is another depth."""
+    """Mitsuba's differentiable path tracer, with another default depth."""
 
     default_depth = 6
     same = "path, which is used"
@@ -67,12 +67,12 @@ class PRB(Path):
 
 
 class PRBBasic(PRB):
-    """The same without light samples."""
+    """Mitsuba's `prb` without light samples."""
 
     same = "path, which is used, and which finds lights of no size, too"
 
 
-# How derivatives of edges of shadows and shapes are sampled.
+# Parameters for the sampling of boundary derivatives, at the edges of shadows and shapes.
 _PROJECTIVE = (
     dict.fromkeys(("sppc", "sppp", "sppi", "guiding_rounds"), Unused("integer"))
     | {"guiding": Unused("string", choices=("none", "grid", "octree")), "guiding_proj": Unused("boolean")}
@@ -81,19 +81,19 @@ _PROJECTIVE = (
 
 
 class PRBProjective(PRB):
-    """The same with derivatives of edges."""
+    """Mitsuba's `prb` with boundary derivatives."""
 
     unused = PRB.unused | _PROJECTIVE
 
 
 class PRBVolPath(PRB, VolPath):
-    """Mitsuba's differentiable tracer of paths through participating media."""
+    """Mitsuba's differentiable path tracer for participating media."""
 
     same = "volpath, which is used"
 
 
 class PTracer(Path):
-    """Mitsuba's tracer of paths from the lights, which come to the same image."""
+    """Mitsuba's tracer of paths from the lights: the same image, except for what mirrors and clear glass show."""
 
     @classmethod
     def read(cls, loader, fields):
@@ -114,7 +114,7 @@ class Direct:
 
 
 class DirectProjective(Direct):
-    """The same for derivatives, those of edges among them."""
+    """Mitsuba's `direct` for derivatives, with boundary derivatives."""
 
     unused = Path.unused | _PROJECTIVE | {"rr_depth": Unused("integer")}
 
@@ -126,7 +126,7 @@ class DirectProjective(Direct):
 
 
 class Wrapper:
-    """An integrator whose image is that of the one inside, with further channels beside it."""
+    """An integrator that adds channels to the image of the integrator inside."""
 
     unused = Path.unused | {"hide_emitters": Unused("boolean", "that of the integrator inside counts")}
     left_out: ClassVar[str]
@@ -141,7 +141,7 @@ class Wrapper:
 
     @classmethod
     def alone(cls, loader, fields: Fields) -> d.Integrator:
-        """What it stands for if it has nothing inside."""
+        """Return the integrator to use if there is none inside."""
         raise fields.element.error(f"{fields.element} needs an <integrator> inside")
 
 
@@ -163,7 +163,7 @@ class Stokes(Wrapper):
     left_out = "light has no polarisation here, so Stokes vectors are not written"
 
 
-# By the name that scene files give them.
+# Kinds by their names in scene files.
 KINDS = {
     "path": Path,
     "direct": Direct,

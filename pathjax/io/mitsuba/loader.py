@@ -1,7 +1,7 @@
-"""Mitsuba 3 scene files: what each element means.
+"""Build descriptions from the elements of Mitsuba 3 scene files.
 
-What a file asks for and pathjax does not model is an InputError that names file, line, element and what is supported.
-Defaults are Mitsuba's. Parameters are named after ids; an object without one is named after what it is nested in.
+A feature that pathjax does not model raises an InputError that names file, line, element and supported alternatives.
+Defaults are Mitsuba's. Parameters are named after ids; an object without an id is named after its parent.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ from pathjax.shapes import Mesh
 
 
 def load(path: str | Path, sensor: int | str = 0, /, **parameters: object) -> d.Description:
-    """Read a scene file and the meshes and images that it names; or glTF or a bare mesh, which get what they lack.
+    """Read a scene file and the meshes and images that it names; or glTF or a bare mesh, which `bare` completes.
 
     Args:
-        sensor: which of several to use: its number, or its id.
+        sensor: which of several sensors to use: its index, or its id.
         parameters: values for the file's `$name`s, in place of its `default`s.
     Raises:
-        InputError: a file cannot be read, or asks for what pathjax does not model.
+        InputError: a file cannot be read, or needs a feature that pathjax does not model.
     """
     if Path(path).suffix.lower() not in bare.SUFFIXES:
         return _Loader(read(path, parameters)).description(str(path), sensor)
@@ -49,29 +49,29 @@ def load(path: str | Path, sensor: int | str = 0, /, **parameters: object) -> d.
 
 
 def load_dict(scene: Mapping, sensor: int | str = 0) -> d.Description:
-    """`load` of a scene that a dictionary holds.
+    """Read a scene from a dictionary, and the files that it names.
 
     Raises:
-        InputError: what is wrong, with the keys that lead there.
+        InputError: the scene is invalid; the message has the keys that lead there.
     """
     return _Loader(dict_reader.read(scene)).description("scene", sensor)
 
 
 def read_again(document: Document, element: Element, name: str) -> Instance:
-    """What one element says by itself. name: by which its parameters are known.
+    """Read one element by itself. name: the prefix of its parameters' names.
 
     Raises:
-        InputError: what is wrong with it.
+        InputError: the element is invalid.
     """
     return _Loader(document).make(element, dict_reader.rooms()[element.tag], name)
 
 
 class _NotModelled(InputError):
-    """A kind of Mitsuba that pathjax has not."""
+    """A Mitsuba plugin that pathjax does not model."""
 
 
 class _Loader:
-    """What `objects` and the readers of kinds share: names given so far, objects made so far, notes."""
+    """The state that `objects` and the `read` of kinds share: names in use, objects built so far, notes."""
 
     def __init__(self, document: Document):
         self.document = document
@@ -82,11 +82,11 @@ class _Loader:
         self.named: set[tuple[str, str]] = set()  # types and names of bsdfs and textures
         self.making: set[Element] = set()
         self.made: dict[Element, object] = {}
-        self.of_numbers: dict[Instance, Instance] = {}  # textures, as they are where they stand for numbers
+        self.of_numbers: dict[Instance, Instance] = {}  # texture -> its form for scalar parameters
         self.copied = 0  # triangles of instances
-        self.placed: tuple[d.Shape, ...] = ()  # all of the scene, once they are known
-        self.on_shapes: dict[Element, Element] = {}  # a light by reference, and the shape that it shines from
-        # Sensors inside of shapes, and the element and the shape that each is on; None: nothing of that is left.
+        self.placed: tuple[d.Shape, ...] = ()  # all shapes of the scene, after they are read
+        self.on_shapes: dict[Element, Element] = {}  # light -> the shape that it shines from
+        # Sensor inside a shape -> the shape's element, and the shape; None: all its triangles are degenerate.
         self.on_surfaces: dict[Element, tuple[Element, d.Shape | None]] = {}
 
     def description(self, file: str, sensor: int | str = 0) -> d.Description:
@@ -120,7 +120,7 @@ class _Loader:
         )
         shapes = tuple(shape for element in scene["shape"] for shape in self.shapes(element))
         self.placed = shapes
-        # In Mitsuba, too, those that stand on shapes come last.
+        # As in Mitsuba, sensors on shapes come last.
         sensors = [*scene["sensor"], *self.on_surfaces] or [self.camera(shapes)]
         names = [element.id or str(number) for number, element in enumerate(sensors)]
         name = d.chosen(names, sensor, sensors[0].file)
@@ -158,11 +158,11 @@ class _Loader:
         )
 
     def measured(self, sensor: Element) -> d.Shape | None:
-        """The shape that a sensor stands on; None: it is on none."""
+        """Return the shape that a sensor is on; None: it is on none, or the shape has no area."""
         return self.on_surfaces.get(sensor, (None, None))[1]
 
     def surface(self, element: Element) -> d.Shape:
-        """The one shape that an element stands for, which need not be in the scene."""
+        """Return the shape of an element, which must be a single one, but need not be in the scene."""
         if element.attributes.get("type") in instances.KINDS:
             raise element.error(f"{element} is not one shape")
         if element not in self.made:
@@ -172,12 +172,12 @@ class _Loader:
         return self.made[element]
 
     def inner_sensor(self, element: Element) -> Sensor:
-        """A sensor that is part of another, whose film and sampler it shares."""
+        """Read a sensor that is part of another one, whose film and sampler it shares."""
         kinds = {key: kind for key, kind in sensors.KINDS.items() if kind.inner}
         return self.make(element, kinds, read=objects.inner_sensor)
 
     def camera(self, shapes: tuple[d.Shape, ...]) -> Element:
-        """A sensor that frames the shapes, for a scene without one; it becomes part of the document."""
+        """Add a sensor that frames the shapes to the document of a scene without a sensor."""
         root = self.document.root
         what = bare.framing([shape.geometry for shape in shapes], root.file) if shapes else {"type": "perspective"}
         element = dict_reader.element("sensor", what, root)
@@ -187,13 +187,13 @@ class _Loader:
         return element
 
     def around(self, element: Element) -> tuple[np.ndarray, float]:
-        """Center and radius of the sphere around the box of all shapes, which an element needs."""
+        """Return center and radius of the sphere around the bounding box of all shapes. element: for messages."""
         if not self.placed:
             return np.zeros(3), 0.0
         return bare.around([shape.geometry for shape in self.placed], element.place)
 
     def view(self, element: Element, seen: Element) -> d.View | InputError:
-        """What a sensor sees. One that is not used may be of a kind that is not supported, and gets one note alone."""
+        """Read a sensor. If another one, `seen`, is used, errors are returned and notes replaced by a single one."""
         if element is seen:
             return self.make(element, sensors.KINDS, read=objects.sensor)
         notes = list(self.notes)
@@ -213,7 +213,7 @@ class _Loader:
         lights: tuple[Instance, ...],
         medium: Instance | None,
     ) -> None:
-        """Tell whether media are rendered; elements: the integrator, if there is one."""
+        """Check that the integrator suits the media, with notes or an error; elements: the integrator, if present."""
         root = elements[0] if elements else self.document.root
         present = medium is not None or any(shape.interior or shape.exterior for shape in shapes)
         media = self.integrator.media
@@ -230,14 +230,14 @@ class _Loader:
                 self.notes.append(f"{light.name} is infinitely far: {never}; put the medium inside a <shape>")
 
     def note(self, element: Element, text: str) -> None:
-        """What `info` should tell of an element."""
+        """Add a note about an element, for `info`."""
         self.notes.append(f"{element.place}: {element} {text}")
 
     def make(self, element: Element, kinds: Mapping[str, type], *context: object, read: Callable | None = None):
-        """What the kind of the element's type reads; the file may hold nothing else but what has no effect.
+        """Build an object by the `read` of its kind. Contents that are neither read nor in its `unused` are refused.
 
         Args:
-            read: loader, fields, context -> what is made, in place of the kind's own.
+            read: function (loader, fields, *context) to use in place of the kind's own.
         """
         fields = Fields(self.document, element)
         if fields.type not in kinds:
@@ -258,9 +258,9 @@ class _Loader:
         return made
 
     def shared(self, element: Element, name: str) -> Instance:
-        """A bsdf, texture, medium or phase function; the same object each time, also by reference.
+        """Return a bsdf, texture, medium or phase function; each element is read once, also if it is referenced often.
 
-        name: for one without an id, with a number if it is that of another one of its type, as in masks inside masks.
+        name: used without an id; a number is appended if another object of that type has it, as in masks inside masks.
         """
         if element not in self.made:
             kinds = dict_reader.rooms()[element.tag]
@@ -274,7 +274,7 @@ class _Loader:
     bsdf = shared
 
     def emitter(self, element: Element, name: str, inside: bool = False) -> Instance:
-        """The light of an element that stands inside a shape, or outside of shapes."""
+        """Read a light that stands inside a shape, or outside of shapes."""
         kind = emitters.KINDS.get(element.attributes.get("type", ""))
         if kind is not None and inside and not kind.on_surfaces:
             raise element.error(f"{element} shines from no surface; it stands directly in <scene>")
@@ -282,7 +282,7 @@ class _Loader:
         return self.make(element, kinds, name, read=objects.emitter)
 
     def shapes(self, element: Element) -> list[d.Shape]:
-        """What an element of a scene or a group stands for: nothing, one, or those that an instance shows."""
+        """Read the shapes of an element of a scene or a group: none, one, or those of an instance or a <merge>."""
         kinds = SHAPES | instances.KINDS
         match kinds.get(element.attributes.get("type", "")):
             case instances.ShapeGroup:
@@ -296,24 +296,24 @@ class _Loader:
         return [] if made is None else [made]
 
     def group(self, element: Element) -> list[d.Shape]:
-        """The shapes of a group, read once."""
+        """Return the shapes of a group, which is read once."""
         if element not in self.made:
             self.make(element, instances.KINDS)
         return self.made[element]
 
     def copy(self, element: Element, triangles: int) -> None:
-        """Count what instances copy."""
+        """Count triangles that instances copy, and refuse too many."""
         self.copied += triangles
         if self.copied > instances.MOST_TRIANGLES:
             size = self.copied * instances.BYTES / 1e9
             raise element.error(f"{element} makes the copies of instances {self.copied} triangles, about {size:.0f} GB")
 
     def unnamed(self, element: Element) -> str:
-        """Name of an emitter outside of shapes that has no id."""
+        """Return a name for an emitter outside of shapes without an id."""
         return self.unique(emitters.usual_name(element.attributes.get("type", "")))
 
     def texture(self, fields: Fields, parameter: str, owner: str, of_number: bool = False) -> Instance | None:
-        """The texture that sets a parameter; None where it is something else. `owner` names one without an id."""
+        """Return the texture that sets a parameter, or None. `owner` names one without an id."""
         element = fields.texture(parameter)
         if element is None:
             return None
@@ -321,34 +321,34 @@ class _Loader:
         return textures.of_number(made, self.of_numbers) if of_number else made
 
     def volume(self, fields: Fields, parameter: str, default: float) -> GridVolume:
-        """The volume that sets a parameter, of whatever values; a colour as one that is the same everywhere."""
+        """Return the volume that sets a parameter, without bounds on its values; a colour gives a constant volume."""
         element = fields.texture(parameter, "volume")
         if element is None:
             return boxed(fields.color(parameter, np.full(3, default)), np.eye(4))
         return self.make(element, media.VOLUMES | {"constvolume": BoxedVolume}, np.inf)
 
     def find(self, fields: Fields, parameter: str) -> Path:
-        """The file that a parameter names."""
+        """Return the path of the file that a parameter names."""
         return self.document.find(fields.string(parameter), fields.where(parameter))
 
     def read_mesh(self, *how: object, **choices: object) -> Mesh:
-        """The mesh of `io.mesh.load`, whose notes are kept."""
+        """Return the mesh of `io.mesh.load`, and keep the notes."""
         made, notes = mesh.load(*how, **choices)
         self.notes += notes
         return made
 
     def mesh_of_arrays(self, fields: Fields, **arrays: object) -> Mesh:
-        """The mesh of `io.mesh.of_arrays`, whose notes are kept."""
+        """Return the mesh of `io.mesh.of_arrays`, and keep the notes."""
         made, notes = mesh.of_arrays(fields.element.place, **arrays)
         self.notes += notes
         return made
 
     def numbered(self, name: str) -> str:
-        """`name0`, `name1`, ...; the next that is free."""
+        """Reserve the next free name of `name0`, `name1`, ..."""
         return self.unique(next(each for k in self.counts[name] if (each := f"{name}{k}") not in self.names))
 
     def unique(self, name: str) -> str:
-        """`name` if it is free, else with a number."""
+        """Reserve `name` if it is free, else `name` with a number."""
         if name in self.names:
             return self.numbered(name)
         self.names.add(name)
@@ -356,12 +356,12 @@ class _Loader:
 
 
 def _kind_of_light(element: Element) -> type[emitters.Emitter]:
-    """The class of an emitter's type; that of any, where the type is unknown, which `emitter` refuses."""
+    """Return the class of an emitter's type; the base class if the type is unknown, which `emitter` refuses."""
     return emitters.KINDS.get(element.attributes.get("type", ""), emitters.Emitter)
 
 
 class _Settings:
-    """What stands directly in <scene>: how Mitsuba searches for hits."""
+    """Parameters directly in <scene>: how Mitsuba searches for hits."""
 
     unused = (
         dict.fromkeys(("embree_use_robust_intersections", "allow_thread_reordering"), Unused("boolean"))
@@ -377,6 +377,6 @@ class _Settings:
         pass
 
 
-# What is of use by reference alone.
+# Objects that have an effect only if they are referenced.
 SHARED = ("bsdf", "texture", "medium", "phase", "film", "sampler", "rfilter")
 TOP_LEVEL = ("integrator", "sensor", "emitter", "shape", "volume", *SHARED)

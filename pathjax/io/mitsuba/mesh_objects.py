@@ -1,4 +1,4 @@
-"""Meshes that are Python objects, of trimesh or of Mitsuba, to the dictionaries that hold their arrays."""
+"""Convert mesh objects of trimesh or Mitsuba to dictionaries of arrays."""
 
 from __future__ import annotations
 
@@ -15,12 +15,13 @@ def is_mesh(value: object) -> bool:
 
 
 def arrays_of(mesh: object, place: str, array: Callable[[object], np.ndarray]) -> dict[str, object]:
-    """What a dictionary says of a mesh.
+    """Return the arrays of a mesh, as in a scene dictionary.
 
-    array: makes one of what the libraries hold.
-
+    Args:
+        place: the keys that lead to the mesh.
+        array: converts an array of a library to NumPy.
     Raises:
-        InputError: it is no mesh; place: the keys that lead to it.
+        InputError: it is not a mesh.
     """
     if not is_mesh(mesh):
         kind = type(mesh).__name__
@@ -29,10 +30,10 @@ def arrays_of(mesh: object, place: str, array: Callable[[object], np.ndarray]) -
 
 
 def looks_of(mesh: object, place: str, given: Collection[str]) -> dict[str, object]:
-    """The bsdf and the emitter of a mesh of Mitsuba, of which Mitsuba tells parameters alone, but for those given.
+    """Return the bsdf and emitter of a Mitsuba mesh, except for those in `given`. Mitsuba exposes only parameters.
 
     Raises:
-        InputError: it is of another kind than diffuse or area, or is textured.
+        InputError: one is not a diffuse bsdf or area emitter, or is textured; or the mesh has a medium.
     """
     if not _is_mitsubas(mesh):
         return {}
@@ -60,7 +61,7 @@ def _is_mitsubas(value: object) -> bool:
 
 
 def _of_trimesh(mesh) -> dict[str, object]:
-    """With its texture coordinates, whose v grows upwards, and colours of vertices."""
+    """Return its arrays, with texture coordinates, whose v points upwards in trimesh, and vertex colours."""
     arrays: dict[str, object] = {"vertices": np.asarray(mesh.vertices), "faces": np.asarray(mesh.faces)}
     visual = getattr(mesh, "visual", None)
     if getattr(visual, "kind", None) == "vertex":
@@ -71,7 +72,7 @@ def _of_trimesh(mesh) -> dict[str, object]:
 
 
 def _of_mitsuba(mesh, array) -> dict[str, object]:
-    """In world space, with normals, texture coordinates and colours."""
+    """Return its arrays, in world space, with normals, texture coordinates and colours."""
 
     def rows(buffer, width):
         return array(buffer).reshape(-1, width)

@@ -1,6 +1,6 @@
-"""Shapes, lights and sensors of scene files: what their elements hold besides the parameters of their kind.
+"""Read shapes, lights and sensors with the objects that their elements hold besides the parameters of their kind.
 
-`loader` is the one that reads the file; its `make` calls these in place of a kind's own `read`.
+`loader.make` calls these functions in place of a kind's own `read`.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from pathjax.textures import mesh_attribute
 
 
 def shape(loader, fields: Fields, name: str) -> d.Shape | None:
-    """None where nothing of a mesh is left, as all its triangles are degenerate: no ray meets it, nor does it emit."""
+    """Read a shape. None: all triangles of a mesh are degenerate, so that no ray hits it and it does not emit."""
     geometry = SHAPES[fields.type].read(loader, fields)
     flip_normals = fields.boolean("flip_normals", False) != geometry.mirrored
     emitter = None
@@ -50,13 +50,13 @@ def shape(loader, fields: Fields, name: str) -> d.Shape | None:
 
 
 def _side(loader, fields: Fields, name: str, side: str) -> Instance | None:
-    """The medium on one side of a shape."""
+    """Return the medium on one side of a shape; None: there is none."""
     element = fields.object("medium", side)
     return None if element is None else loader.shared(element, element.id or f"{name}_{side}")
 
 
 def _note_boundary(loader, shape: Element, geometry: object, bsdf: Instance) -> None:
-    """Tell what looks like an oversight where a medium begins."""
+    """Add notes on probable mistakes at the boundary of a medium."""
     if not geometry.closed:
         loader.note(shape, "bounds a medium and is open: paths that go around it stay in the medium that they were in")
     if not any(leaf.kind.passes or leaf.kind.sided for leaf in bsdf.kind.leaves(bsdf)):
@@ -70,7 +70,7 @@ def emitter(loader, fields: Fields, name: str) -> Instance:
 
 
 def _usual_bsdf(shape: Element, lit: bool) -> Element:
-    """What Mitsuba takes for the bsdf that a shape lacks: grey, or what reflects nothing where light comes from it."""
+    """Add the bsdf that Mitsuba gives a shape without one: diffuse, grey or, if the shape emits, black."""
     reflectance = Element("float", {"name": "reflectance", "value": "0" if lit else "0.5"}, shape.file, shape.line)
     shape.children.append(Element("bsdf", {"type": "diffuse"}, shape.file, shape.line, [reflectance]))
     return shape.children[-1]

@@ -1,8 +1,8 @@
-"""The names of Mitsuba's plugins, so that one which is not modelled is told from a misspelt one."""
+"""Names of Mitsuba's plugins, to distinguish plugins that are not modelled from misspelt names."""
 
 from __future__ import annotations
 
-# By the tag of elements.
+# Tag of an element -> names.
 PLUGINS = {
     tag: frozenset(names.split())
     for tag, names in {
@@ -26,7 +26,7 @@ PLUGINS = {
 }
 
 _MEASURED = "files of measured reflectance are not read"
-# Why some of these are not modelled; the others may come.
+# Why some of these are not modelled; others are reported as not supported yet.
 REASONS = {
     "measured_polarized": _MEASURED,
     "specfilm": "images are linear RGB",

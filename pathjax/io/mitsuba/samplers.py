@@ -1,4 +1,4 @@
-"""Samplers of scene files, of which pathjax keeps the number of samples: it draws them from its own sequence."""
+"""Samplers of scene files. pathjax uses only their sample count, and draws samples from its own sequence."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Orthogonal(Stratified):
     unused = Stratified.unused | {"strength": Unused("integer")}
 
 
-# By the name that scene files give them.
+# Kinds by their names in scene files.
 KINDS = {
     "independent": Sampler,
     "stratified": Stratified,

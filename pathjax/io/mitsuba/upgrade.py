@@ -1,4 +1,4 @@
-"""Scene files of Mitsuba 0.6 and older, brought to the format of Mitsuba 3 by Mitsuba's own rules."""
+"""Upgrade scene files of Mitsuba 0.6 and older to the format of Mitsuba 3, by Mitsuba's own rules."""
 
 from __future__ import annotations
 
@@ -6,20 +6,20 @@ import re
 
 from pathjax.description.elements import Element
 
-# Where a small letter meets capitals: `intIOR`, `toWorld`.
+# Capitals after a lower-case letter: `intIOR`, `toWorld`.
 _CAPITALS = re.compile(r"(?<=[a-z])[A-Z]+")
 _UV = {"uoffset": ("translate", "x"), "voffset": ("translate", "y"), "uscale": ("scale", "x"), "vscale": ("scale", "y")}
 
 
 def upgrade(element: Element) -> None:
-    """Rename what stands inside an element: `maxDepth` to `max_depth`, `uscale` and its kin to `to_uv`, ..."""
+    """Rename the children of an element: `maxDepth` to `max_depth`, `uscale` and the like to `to_uv`, ..."""
     uv = [child for child in element.children if child.tag == "float" and child.attributes.get("name") in _UV]
     if uv:
         element.children = [child for child in element.children if child not in uv] + [_to_uv(uv)]
     for child in element.children:
         if child.tag == "lookAt":
             child.tag = "lookat"
-        # A <default> keeps its name, by which `$name` asks for it.
+        # A <default> keeps its name, to which `$name` refers.
         if "name" in child.attributes and child.tag != "default":
             name = _CAPITALS.sub(lambda match: f"_{match[0].lower()}", child.attributes["name"])
             is_diffuse = element.tag == "bsdf" and element.attributes.get("type") == "diffuse"
@@ -28,7 +28,7 @@ def upgrade(element: Element) -> None:
 
 
 def _to_uv(given: list[Element]) -> Element:
-    """The <transform> that shifts and then scales, as Mitsuba's does."""
+    """Return the <transform> that shifts and then scales, as in Mitsuba."""
     first = given[0]
     steps = {tag: Element(tag, {}, first.file, first.line) for tag in ("translate", "scale")}
     for each in given:

@@ -1,7 +1,7 @@
-"""From a loaded scene to a scene file of Mitsuba, which gives the same scene again.
+"""Write a loaded scene as a Mitsuba scene file that loads as the same scene.
 
-The file is what was read, written anew: the same elements, of whatever kind, with includes and `$name`s expanded, files
-named from the new place, and other values for parameters that have changed since. Arrays become files beside it.
+It has the elements that were read, of whatever kind, with includes and `$name`s expanded, file names relative to the
+new folder, and the current values of parameters that have changed. Arrays become files beside it.
 """
 
 from __future__ import annotations
@@ -32,15 +32,15 @@ from pathjax.system.files import check_writable, write_text
 
 
 def save(description: d.Description, values: Mapping[str, np.ndarray], path: Path) -> list[Path]:
-    """Write the scene file, and before it what it names.
+    """Write the scene file, after the new files that it names.
 
     Args:
-        values: of all parameters, by name.
+        values: values of all parameters, by name.
     Returns:
-        all files that were written, the scene file last.
+        All files that were written, the scene file last.
     Raises:
-        InputError: a file cannot be written, or would overwrite one that the scene was read from; or no scene file can
-            say what has changed.
+        InputError: a file cannot be written, or would overwrite one that the scene was read from; or a change cannot be
+            expressed in a scene file.
     """
     if path.suffix.lower() != ".xml":
         raise InputError(f"{path}: scenes are written as .xml")
@@ -58,20 +58,20 @@ class _Writer:
     def __init__(self, description: d.Description, values: Mapping[str, np.ndarray], path: Path, sources: set):
         self.document, self.made, self.values = description.document, description.made, values
         self.path, self.sources, self.seen = path, sources, description.views[description.seen]
-        self.files: dict[Path, Callable[[], None]] = {}  # and what writes each
+        self.files: dict[Path, Callable[[], None]] = {}  # file -> function that writes it
         self.images = _changed_images(description.made.values(), values)
         self.stored = _changed_arrays(description.made.values(), values)
 
     def text(self, element: Element, depth: int = 0) -> str:
-        """The element and what it holds as lines of XML."""
+        """Return the element and its children as lines of XML."""
         if element.tag == "shape" and self.made.get(element) is None and _has_arrays(element):
-            return ""  # a mesh of which no triangle is left
+            return ""  # a mesh of degenerate triangles only
         element = self.changed(element)
         attributes = self.attributes(element)
         if element.tag == "ref" and (target := self.document.ids.get(element.id)) is not None:
-            attributes["id"] = target.id  # which may have been given another one by <alias>
+            attributes["id"] = target.id  # the ref may use an <alias>
         if element.tag == "scene":
-            attributes["version"] = dict_reader.VERSION  # what older files say was brought up to date
+            attributes["version"] = dict_reader.VERSION  # elements of older files were upgraded
         start = f"{'    ' * depth}<{element.tag}" + "".join(f" {key}={quoteattr(x)}" for key, x in attributes.items())
         if not element.children:
             return f"{start}/>\n"
@@ -95,13 +95,13 @@ class _Writer:
         there = Path(os.path.realpath(self.path)).parent
         try:
             return Path(os.path.relpath(os.path.realpath(found), there)).as_posix()
-        except ValueError:  # on another drive of Windows
+        except ValueError:  # on another Windows drive
             return str(found.absolute())
 
     # ---- parameters
 
     def changed(self, element: Element) -> Element:
-        """The element with what has changed, and with files in the place of arrays."""
+        """Return the element with changed values, and with files in place of arrays."""
         made = self.made.get(element)
         geometry = getattr(made, "geometry", None)
         if geometry is not None and geometry.triangles:
@@ -123,14 +123,14 @@ class _Writer:
         return element
 
     def carried(self, shape: d.Shape) -> Mapping[str, np.ndarray]:
-        """The attributes of a mesh; where none has changed, the very ones that were read."""
+        """Return the attributes of a mesh; the same object that was read if none has changed."""
         read = shape.geometry.attributes
         new = {name: self.values.get(f"{shape.name}.{name}", values) for name, values in read.items()}
         changed = any(not np.array_equal(values, read[name].astype(values.dtype)) for name, values in new.items())
         return new if changed else read
 
     def different(self, made: Instance) -> list[str]:
-        """Parameters whose values are not those that were read."""
+        """Return the parameters whose values differ from those that were read."""
         found = []
         for key in made.values:
             value = self.values.get(f"{made.name}.{key}")
@@ -140,9 +140,9 @@ class _Writer:
         return found
 
     def with_values(self, element: Element, made: Instance, values: Mapping[str, np.ndarray]) -> Element:
-        """The element with these values of its parameters, read back and compared.
+        """Return the element with these values of its parameters, checked by reading it back.
 
-        Where the file sets them by other names, as a metal's by that of its material, it states all parameters instead.
+        If that fails, as the file sets them by other names, such as a metal's material, it sets all parameters instead.
         """
         constant = {key: x for key, x in made.values.items() if not isinstance(x, Instance | Stored)}
         listed = {key: x for key, x in constant.items() if f"{made.name}.{key}" in self.values}
@@ -159,7 +159,7 @@ class _Writer:
         raise element.error(f"{element}: no scene file can say {names} = {list(map(str, values.values()))}")
 
     def reads(self, element: Element, made: Instance, values: Mapping[str, object]) -> bool:
-        """Whether a loader takes the element for an object with these values."""
+        """Return whether reading the element gives an object with these values."""
         document = Document(self.document.root, self.document.ids, self.document.folders)
         try:
             again = read_again(document, element, made.name)
@@ -175,7 +175,7 @@ class _Writer:
     # ---- files
 
     def image(self, child: Element, parent: Element, name: str) -> Element:
-        """The element, or in the place of an array the <string> that names the file to which it goes."""
+        """Return the element, or, in place of an array, the <string> with the name of the file for it."""
         if child.tag != "array":
             return child
         if child.attributes["name"] != "data":
@@ -196,26 +196,26 @@ class _Writer:
         return Element("string", {"name": "filename", "value": file.name}, child.file, child.line)
 
     def with_image(self, element: Element, name: str, texels: np.ndarray) -> Element:
-        """The bitmap with other texels, in a file of its own."""
+        """Return the bitmap with other texels, in a new file."""
         file = self.file(name, ".exr")
         self.files[file] = lambda: _write_linear(file, texels)
         return self.with_file(element, file)
 
     def with_array(self, element: Element, stored: Stored, name: str, values: np.ndarray) -> Element:
-        """The volume with other values, in a file of its own."""
+        """Return the volume with other values, in a new file."""
         file = self.file(name, ".vol")
         self.files[file] = lambda: stored.write(file, values)
         return self.with_file(element, file)
 
     @staticmethod
     def with_file(element: Element, file: Path) -> Element:
-        """The element with a file in the place of its own or of its array."""
+        """Return the element with this file in place of its previous one or of its array."""
         children = [x for x in element.children if x.attributes.get("name") not in ("filename", "data")]
         children.append(Element("string", {"name": "filename", "value": file.name}, element.file, element.line))
         return Element(element.tag, element.attributes, element.file, element.line, children)
 
     def mesh(self, element: Element, shape: d.Shape) -> Element:
-        """The element of a PLY file that holds a mesh, in world space, which Mitsuba could not read as it was given."""
+        """Return the element of a new PLY file, in world space, for a mesh that changed or that Mitsuba cannot read."""
         file, geometry = self.file(shape.name, ".ply"), shape.geometry
         self.files[file] = lambda: ply_writer.write(file, geometry)
         gone = ("filename", "to_world", "face_normals", "flip_tex_coords")
@@ -226,7 +226,7 @@ class _Writer:
         return Element("shape", element.attributes | {"type": "ply"}, element.file, element.line, children)
 
     def file(self, name: str, suffix: str) -> Path:
-        """A new name beside the scene file."""
+        """Return an unused path beside the scene file."""
         stem = "_".join([self.path.stem, re.sub(r"[^\w-]", "_", name)])
         for number in itertools.count(1):
             made = self.path.with_name(f"{stem}{f'_{number}' if number > 1 else ''}{suffix}")
@@ -236,15 +236,15 @@ class _Writer:
 
 
 def _changed_images(made: Iterable[object], values: Mapping[str, np.ndarray]) -> dict[Instance, tuple[str, np.ndarray]]:
-    """The images that are parameters and have changed: instance -> the parameter's name, and its texels."""
+    """Return the images that are parameters and have changed: instance -> name of the parameter, and its texels."""
     owners = [owner for owner in made if isinstance(owner, Instance)]
     images = [(x, f"{owner.name}.{key}") for owner in owners for key, x in owner.values.items()]
-    images += [(owner, f"{owner.name}.radiance") for owner in owners]  # of environment maps
+    images += [(owner, f"{owner.name}.radiance") for owner in owners]  # environment maps
     found = {}
     for image, name in images:
         if isinstance(image, Instance) and "texels" in image.values and name in values:
             value, read = values[name], image.values["texels"].astype(values[name].dtype)
-            if value.ndim == 2:  # of numbers
+            if value.ndim == 2:  # of a scalar parameter
                 value, read = np.stack([value] * 3, -1), np.stack([luminance(read)] * 3, -1)
             if not np.array_equal(np.broadcast_to(read, value.shape), value):
                 found[image] = name, value
@@ -254,7 +254,7 @@ def _changed_images(made: Iterable[object], values: Mapping[str, np.ndarray]) ->
 def _changed_arrays(
     made: Iterable[object], values: Mapping[str, np.ndarray]
 ) -> dict[Stored, tuple[str, np.ndarray]]:
-    """The same of volumes, of media and of textures."""
+    """Return the volumes, of media and of textures, that are parameters and have changed, as `_changed_images` does."""
     owners = [owner for owner in made if isinstance(owner, Instance)]
     volumes = [(x, f"{owner.name}.{key}") for owner in owners for key, x in owner.values.items()]
     volumes += [(v, name) for x, name in volumes if isinstance(x, Instance) for v in x.values.values()]
@@ -278,10 +278,10 @@ def _is_object(child: Element) -> bool:
 
 
 def _value(key: str, value: object, element: Element) -> Element:
-    """The element that sets a parameter to exactly this value."""
+    """Return the element that sets a parameter to exactly this value."""
     value = np.asarray(value)
     if value.shape == (3,) and value.min() == value.max() > 1:
-        value = value[0]  # Mitsuba takes an <rgb> above 1 for light alone, and a number for any
+        value = value[0]  # Mitsuba accepts an <rgb> above 1 only for light, but any <float>
     tag = {(): "float", (3,): "rgb"}.get(value.shape)
     if tag is None:
         raise element.error(f'{element}: "{key}" has the shape {value.shape}, which no scene file can say')

@@ -1,6 +1,6 @@
-"""Scene XML to a tree of elements that know their line: includes, `default`, `$name`, ids and aliases are settled here.
+"""Parse scene XML to a tree of elements with line numbers; resolve includes, `default`, `$name`, ids and aliases.
 
-What the elements mean is the business of `loader.py` and of each kind.
+`loader.py` and the kinds interpret the elements.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from pathjax.errors import InputError
 from pathjax.io.mitsuba.plugins import PLUGINS
 from pathjax.io.mitsuba.upgrade import upgrade
 
-# Far above any real scene (meshes live in files of their own), and low enough that a hostile file fails at once.
+# Far above any real scene (meshes are in separate files), and low enough that a hostile file fails at once.
 MAX_BYTES = 64 << 20
 MAX_DEPTH = 32
 MAX_ELEMENTS = 1_000_000
@@ -28,12 +28,12 @@ MAX_VALUE = 10_000
 REFERENCE = re.compile(r"\$(\w+)")
 _DECLARATION = re.compile(rb"\s*(<\?xml\b[^>]*\?>)")
 _AMPERSAND = re.compile(rb"&(?!#?\w{1,8};)")
-# With what it declares between brackets; what stands in quotes may hold any of these characters.
+# With its declarations in brackets; quoted strings may contain any of these characters.
 _DOCTYPE = re.compile(rb"""<!DOCTYPE(?:[^]["'>]|"[^"]*"|'[^']*'|\[(?:[^]"']|"[^"]*"|'[^']*')*\])*>""")
 
 
 def read(path: str | Path, parameters: Mapping[str, object]) -> Document:
-    """Read a scene file and what it includes.
+    """Read a scene file and the files that it includes.
 
     Args:
         parameters: values that override the file's `default`s; each must be used by the file.
@@ -55,7 +55,7 @@ def read(path: str | Path, parameters: Mapping[str, object]) -> Document:
 
 
 def by_id(root: Element) -> dict[str, Element]:
-    """The elements that have an id; one that is given twice is an InputError."""
+    """Return the elements that have an id, by id. A duplicate id is an InputError."""
     ids: dict[str, Element] = {}
     for element in _walk(root):
         if element.tag != "ref" and element.id:
@@ -66,7 +66,7 @@ def by_id(root: Element) -> dict[str, Element]:
 
 
 class _Reader:
-    """What includes share: the values of `$name`, the folders to search, and how much has been read."""
+    """The state that includes share: the values of `$name`, the folders to search, and how much has been read."""
 
     def __init__(self, path: Path, parameters: dict[str, str]):
         self.given = parameters
@@ -92,7 +92,7 @@ class _Reader:
         return root
 
     def _settle(self, parent: Element, chain: tuple[Path, ...]) -> None:
-        """Take out of an element what is for reading alone, and put in what it includes, in the order of the file."""
+        """Substitute `$name`s, apply and remove directives, and insert included elements, in the order of the file."""
         children: list[Element] = []
         for element in parent.children:
             self._substitute(element)
@@ -115,7 +115,7 @@ class _Reader:
         parent.children = children
 
     def _include(self, element: Element, parent: Element, chain: tuple[Path, ...]) -> list[Element]:
-        """The objects of another file; in a scene its settings, too."""
+        """Return the objects of another file; directly in <scene>, all its elements."""
         _check(element, required=("filename",), optional=("name",))
         path = find_file(element.attributes["filename"], [*self.folders, chain[-1].parent], element)
         self.found[element] = path
@@ -196,15 +196,15 @@ def _parse(path: Path, shown: str, notes: list[str]) -> Element:
         raise
     except expat.ExpatError as error:
         raise InputError(f"{shown}:{error.lineno}: not well-formed XML: {expat.errors.messages[error.code]}") from None
-    except (ValueError, LookupError) as error:  # an encoding that Python does not know
+    except (ValueError, LookupError) as error:  # an encoding unknown to Python
         raise InputError(f"{shown}:1: cannot be decoded: {error}") from None
     return roots[0]
 
 
 def _well_formed(data: bytes) -> bytes:
-    """What is XML to the letter, where Mitsuba's parser is lenient: with `--` and any bytes in comments, white space
-    before the declaration, and & for itself. It skips a document type, too, so that no entities are known. Lines stay
-    where they are. What is UTF-16 is left alone.
+    """Turn text that Mitsuba's lenient parser accepts into strict XML: it allows `--` and any bytes in comments, white
+    space before the declaration, and a bare &. A document type is removed, so that there are no entities; Mitsuba skips
+    it too. Line numbers stay the same. UTF-16 is returned unchanged.
     """
     if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return data
