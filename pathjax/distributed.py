@@ -1,9 +1,9 @@
-"""Several processes, on one machine or on many, that share their work by JAX's distributed runtime.
+"""Several processes, on one machine or on many, that share work through JAX's distributed runtime.
 
-All of them run the same program and do the same, but for what is written, which is the first one's. The items of a
-kernel are dealt to the devices of all (`compile.mapping`); `render_until` deals out whole calls of kernels, so that no
-device waits for another (`dealt`). Whatever decides how work goes on (time, signals, the noise so far) is agreed upon,
-so that they never part.
+All run the same program and do the same, except that only the first one writes and prints. The items of a kernel are
+distributed over the devices of all processes (`compile.mapping`); `render_until` distributes whole calls of kernels, so
+that no device waits for another (`dealt`). Processes agree on everything that decides how work continues (time,
+signals, noise so far), so that they never diverge.
 """
 
 from __future__ import annotations
@@ -34,18 +34,18 @@ from pathjax.system.output import say
 from pathjax.system.watch import BEAT, PATIENCE, Relay, Watch
 
 T = TypeVar("T")
-# Seconds for which processes wait for each other at first, as of a large job some begin minutes after others; and then,
-# by JAX's own watch, which is the slower one.
+# Seconds that processes wait for each other at the start, as in large jobs some start minutes after others; and seconds
+# of silence after which JAX's own watch, which is slower than `Watch`, gives a process up.
 MEETING, SILENCE = 300, 60
-# Calls of each device between two exchanges: all wait for the slowest, so the fewer exchanges the better; but signals
-# are heard then.
+# Calls per device between two exchanges. All processes wait for the slowest at an exchange, so few are better; but only
+# then do they notice signals.
 _CALLS = 2
-# Bytes that are sent at once, by each process, of what one has read.
+# Bytes per exchange when a process sends what it has read from a file.
 _PART = 1 << 22
-# Words of what the transport raises when it has lost a process.
+# Words in the transport's errors after the loss of a process.
 TRANSPORT = re.compile("gloo|nccl|peer|connection|socket|heartbeat|coordination|deadline", re.IGNORECASE)
 
-_threads: list[Watch | Relay] = []  # while there are several processes
+_threads: list[Watch | Relay] = []  # of this process, if there are several
 
 
 class ProcessLost(RuntimeError):
@@ -53,15 +53,16 @@ class ProcessLost(RuntimeError):
 
 
 def start(coordinator: str | None = None, processes: int | None = None, process: int | None = None) -> None:
-    """Join the other processes; before JAX's first array. Each process of the cluster calls it.
+    """Join the other processes. Each process of the cluster calls this before it creates its first JAX array.
 
     Args:
-        coordinator: HOST:PORT at which the first process is found, the same for all; None, like what follows, where
-            JAX finds the cluster by itself (SLURM, Open MPI, Kubernetes).
-        processes: how many there are; process: which of them this is, from 0.
+        coordinator: HOST:PORT of the first process, the same for all; None, as the other arguments, if JAX detects the
+            cluster (SLURM, Open MPI, Kubernetes).
+        processes: number of processes.
+        process: index of this process, from 0.
     Raises:
-        InputError: the others were not found, two have one number, their code or numbers of devices differ, or JAX's
-            backend has started already.
+        InputError: the others were not found, two have the same index, their code or device counts differ, or JAX's
+            backend has already started.
     """
     facts = {"code of pathjax": _package(), "version of JAX": jax.__version__}
     try:
@@ -105,15 +106,15 @@ def count() -> int:
 
 
 def index() -> int:
-    """Return the number of this process; 0 is the one that writes and prints."""
+    """Return the index of this process; process 0 writes and prints."""
     return jax.process_index() if jax.distributed.is_initialized() else 0
 
 
 def exchanged(tree: T) -> list[T]:
-    """What each process gives, by process; arrays of the same shapes.
+    """Return the pytrees that all processes pass, by process; their arrays must have the same shapes.
 
     Raises:
-        ProcessLost: one has ended.
+        ProcessLost: a process has ended.
     """
     with losses():
         found = jax.tree.map(np.array, gathered(tree))
@@ -121,15 +122,15 @@ def exchanged(tree: T) -> list[T]:
 
 
 def of_first(tree: T) -> T:
-    """What the first process gives."""
+    """Return the pytree that the first process passes."""
     return exchanged(tree)[0] if count() > 1 else tree
 
 
 def of_file(path: str | os.PathLike, read: Callable[[], T]) -> T:
-    """What `read` gives of a file; a process that has no such file gets what the first one has read.
+    """Return `read()`; a process that lacks the file `path` gets the result of the first process.
 
     Raises:
-        InputError: of `read`.
+        InputError: raised by `read`.
     """
     lacking = not Path(path).exists()
     if not highest(lacking):
@@ -142,10 +143,10 @@ def of_file(path: str | os.PathLike, read: Callable[[], T]) -> T:
 
 
 def same(digests: Mapping[str, str]) -> None:
-    """Compare what processes have: names, and digests of 16 letters.
+    """Check that digests, of 16 letters, are the same in all processes; names are for messages.
 
     Raises:
-        InputError: they differ.
+        InputError: a digest differs.
     """
     if count() > 1:
         own = np.stack([np.frombuffer(digest.encode(), np.uint8) for digest in digests.values()])
@@ -156,14 +157,14 @@ def same(digests: Mapping[str, str]) -> None:
 
 
 def ended(reason: str = "") -> None:
-    """Tell the others, if there are any, that this process ends: as it should, or why not."""
+    """Tell the other processes, if any, that this process ends: regularly, or for a reason."""
     for thread in _threads:
         if isinstance(thread, Watch):
             thread.end(reason and f"process {index()} has ended: {reason}")
 
 
 def _leave() -> None:
-    """End as it should."""
+    """End regularly."""
     ended()
     jax.distributed.shutdown()  # waits for the others
     for thread in _threads:
@@ -171,13 +172,13 @@ def _leave() -> None:
 
 
 def _end(reason: str) -> None:
-    time.sleep(2 * BEAT)  # what differs between processes each of them finds out by itself, and says it better
+    time.sleep(2 * BEAT)  # if processes differ, this one finds that too, and its own message is better
     say(f"process {index()} ends, as {reason}")
     leave(1, at_once=True)
 
 
 def _end_at_once_after_errors() -> None:
-    """Let an error that ends this process end it: else Python waits for the others, which wait for this one."""
+    """End this process at once after an uncaught error; else Python waits for the others, which wait for this one."""
     tell = sys.excepthook
 
     def end(kind, error, trace) -> None:
@@ -191,12 +192,12 @@ def _end_at_once_after_errors() -> None:
 
 
 def _wait_for_watch() -> None:
-    """Wait while it finds out which process is lost, and ends this one."""
+    """Wait for `Watch` to detect which process is lost, and to end this one."""
     time.sleep(BEAT * (PATIENCE + 2))
 
 
 def _package() -> str:
-    """Digest of the code of pathjax, which may be of one version and yet not the same."""
+    """Return a digest of pathjax's code, which may differ within one version."""
     files = sorted(Path(__file__).parent.rglob("*.py"))
     content = b"".join(file.read_bytes().replace(b"\r\n", b"\n") for file in files)
     return hashlib.sha256(content).hexdigest()[:16]
@@ -204,14 +205,14 @@ def _package() -> str:
 
 @contextmanager
 def losses() -> Iterator[None]:
-    """A context in which errors of JAX are told apart from those of a process that has ended.
+    """Context that replaces errors of JAX's transport, which are due to an ended process, by `ProcessLost`.
 
     Raises:
-        ProcessLost: for what JAX raises within it, if there are several processes and one has ended.
+        ProcessLost: JAX raised such an error within the context, and there are several processes.
     """
     try:
         yield
-    except (ValueError, RuntimeError) as error:  # of either type the transport has it
+    except (ValueError, RuntimeError) as error:  # the transport raises both types
         if count() == 1 or isinstance(error, InputError | ProcessLost) or not TRANSPORT.search(str(error)):
             raise
         _wait_for_watch()
@@ -221,7 +222,7 @@ def losses() -> Iterator[None]:
 
 @contextmanager
 def interruptible(interrupts: Interrupts) -> Iterator[None]:
-    """`interrupts.raised` in one process. Several, which must not part, ask `heard` now and then."""
+    """Context like `interrupts.raised` for one process. Several must not diverge, so they call `heard` now and then."""
     if count() == 1:
         with interrupts.raised():
             yield
@@ -231,31 +232,31 @@ def interruptible(interrupts: Interrupts) -> Iterator[None]:
 
 
 def heard(interrupts: Interrupts) -> None:
-    """Find out whether a signal came to any process.
+    """Exchange whether any process has received a signal.
 
     Raises:
-        KeyboardInterrupt: one did.
+        KeyboardInterrupt: one has.
     """
     if highest(bool(interrupts.heard)):
         raise KeyboardInterrupt
 
 
 def highest(number: int) -> int:
-    """Return the highest of the numbers that the processes give."""
+    """Return the highest of the numbers that the processes pass."""
     return int(max(exchanged(np.int32(number)))) if count() > 1 else number
 
 
 def total(number: float) -> float:
-    """Sum of the numbers that processes give."""
+    """Return the sum of the numbers that the processes pass."""
     return float(sum(exchanged(np.float32(number)))) if count() > 1 else number
 
 
 def dealt(f: Callable[[T], np.ndarray], items: Iterable[T], stopped: Callable[[], object]) -> Iterator[tuple]:
-    """`concurrently`, of which each process does its share: pairs (item, f(item)) in order, the same in all.
+    """Yield pairs (item, f(item)) in order, the same in all processes; like `concurrently`, each computing its share.
 
     Args:
-        f: of an item, an array of one shape for all items.
-        stopped: once it is true in any process, the result is None, and no more is asked for.
+        f: function of an item; returns arrays of the same shape for all items.
+        stopped: once true in any process, results are None; with several processes the first such pair is the last.
     """
     if count() == 1:
         yield from concurrently(lambda item: None if stopped() else f(item), items)
@@ -265,7 +266,7 @@ def dealt(f: Callable[[T], np.ndarray], items: Iterable[T], stopped: Callable[[]
         if highest(bool(stopped())):
             yield batch[0], None
             return
-        # Who has nothing to do repeats what another one does, since all give arrays of one shape.
+        # A process without an item repeats the first one, as all must exchange arrays of the same shape.
         mine = batch[index() :: count()] or batch[:1]
         done = np.stack([result for _, result in concurrently(f, mine)])
         room = np.zeros((-(-len(batch) // count()), *done.shape[1:]), done.dtype)
@@ -277,7 +278,7 @@ def dealt(f: Callable[[T], np.ndarray], items: Iterable[T], stopped: Callable[[]
 
 @contextmanager
 def _without_stdout() -> Iterator[None]:
-    """Leave out what the transport prints on stdout, past Python's own, of the processes that it has found."""
+    """Suppress the transport's messages about connected processes, which it prints on stdout, bypassing Python."""
     sys.stdout.flush()
     kept, nowhere = os.dup(1), os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, 1)
