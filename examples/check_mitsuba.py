@@ -17,9 +17,9 @@ import numpy as np
 import pathjax as pj
 from pathjax.images import write_png
 
-# Of each case: integrator, and what theta is.
+# Integrator, and what theta is.
 CASES = [("prb", "albedo"), ("prb", "place"), ("prb_projective", "place")]
-FAULTS = 6  # standard errors that are drawn in full colour
+FAULTS = 6  # disagreement in standard errors at which the colours saturate
 
 
 def ball_on_a_floor(mi, integrator, res):
@@ -53,7 +53,7 @@ def ball_on_a_floor(mi, integrator, res):
 
 
 class Mitsuba:
-    """A renderer of one number, for `check_gradient`: the albedo of the ball, or how far it has moved to the right."""
+    """A renderer with one parameter, for `check_gradient`: the albedo of the ball, or its shift to the right."""
 
     def __init__(self, mi, integrator, what, res, spp):
         self.mi, self.what, self.spp = mi, what, spp
@@ -88,7 +88,7 @@ class Mitsuba:
 
 
 def colored(values, largest):
-    """(H, W) in red above 0, in blue below, white at 0."""
+    """Map (H, W) values to colours: red above 0, blue below, white at 0."""
     share = np.clip(values / largest, -1, 1)[..., None]
     red, blue = np.array([0.8, 0.05, 0.05]), np.array([0.05, 0.15, 0.8])
     return np.where(share > 0, 1 + share * (red - 1), 1 - share * (blue - 1))

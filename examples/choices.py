@@ -29,7 +29,7 @@ from pathjax.shapes.accel.build import RULES
 SCENES = Path(__file__).resolve().parents[1] / "scenes"
 BATCHES = 16  # independent images that make up a reference
 PATCHES = 400  # of the coarse solution
-REFERENCE_SEED = 1 << 20  # of the first; no timed render has it
+REFERENCE_SEED = 1 << 20  # of the first reference image; no timed render uses it
 LOOKS = [
     {"color": color, "marker": marker}
     for color, marker in zip(("black", "#d55e00", "#0072b2", "#009e73", "#cc79a7", "#e69f00"), "os^DvP", strict=True)
@@ -40,7 +40,7 @@ class Choice(NamedTuple):
     label: str
     scene: Scene
     how: dict = {}  # keywords of `render`
-    truth: int = 0  # the choice, by its place, whose converged image is the reference
+    truth: int = 0  # index of the choice whose converged image is the reference
 
 
 def load(name, res, **more):
@@ -112,7 +112,7 @@ QUESTIONS = {question.__name__: question for question in QUESTIONS}
 
 
 def measure(choices, spps, seeds, reference_spp):
-    """For each choice its rows, one for each spp, with its bias beside."""
+    """Return a list of rows for each choice, one row per spp, with the bias."""
     each = -(-reference_spp // BATCHES)
     references = {}
     for truth in sorted({choice.truth for choice in choices}):
@@ -138,7 +138,7 @@ def measure(choices, spps, seeds, reference_spp):
 
 
 def table(choices, rows):
-    """As Markdown; efficiency 1 / (relMSE x s), and the bias as a relMSE that more samples would not remove."""
+    """Return a Markdown table; efficiency is 1 / (relMSE x s), bias a relMSE that more samples would not remove."""
     lines = ["| | spp | s | relMSE | efficiency | of the first | bias, relMSE |", "|---|---|---|---|---|---|---|"]
     for choice, of_choice in zip(choices, rows, strict=True):
         for row, first in zip(of_choice, rows[0], strict=True):

@@ -27,7 +27,7 @@ def main():
 
     scene = pj.load_scene(Path(__file__).parents[1] / "scenes" / "cornell_box.xml", res=options.res)
     truth = pj.parameters(scene)
-    # Another seed than the fit's own draws; a photograph would do as well.
+    # With another seed than the fit uses; a photograph would do as well.
     target = np.asarray(pj.render(scene, options.target_spp, seed=1))
 
     start = {name: 0.4 for name in NAMES}

@@ -21,10 +21,10 @@ from pathjax.shapes.accel.build import RULES
 
 SCENES = Path(__file__).resolve().parents[1] / "scenes"
 GAMMA = 2.2
-ZOOM, SMOOTH = 2, 2  # of the panels; and how much larger lines are drawn, so that they come out smooth
+ZOOM, SMOOTH = 2, 2  # scale of the panels; and of the canvas for lines, which antialiases them
 COLORS = "#ffffff", "#ff5a4d", "#ffc400", "#39d353", "#2fb8ff", "#c77dff"  # of the levels, the root's first
-# The mesh stands on a floor, its bounds scaled to a sphere of radius 1. Flat: smooth normals of coarse meshes turn away
-# from the camera at their outlines, which are then black.
+# The mesh stands on a floor, with its bounds scaled to a sphere of radius 1. It is flat-shaded, as smooth normals of
+# coarse meshes turn away from the camera at silhouettes, which are then black.
 SCENE = """<scene version="3.0.0">
   <integrator type="path"><integer name="max_depth" value="8"/></integrator>
   <sensor type="thinlens"><float name="fov" value="30"/>
@@ -47,7 +47,7 @@ SCENE = """<scene version="3.0.0">
 
 
 def describe(file, output, res):
-    """The scene file of a mesh file, written beside the output, and its parameters."""
+    """Write a scene file for a mesh file beside the output, and return its path and parameters."""
     kind = file.suffix.lower().lstrip(".")
     vertices = mesh.load(file, kind, np.eye(4))[0].vertices
     low, high = vertices.min(0), vertices.max(0)
@@ -59,7 +59,7 @@ def describe(file, output, res):
 
 
 def camera_rays(scene, res):
-    """One through the middle of every pixel and a random point of the lens: origins (N, 3), directions (N, 3)."""
+    """Return origins and directions (N, 3) of rays through every pixel's center and a random point on the lens."""
     middles = (np.stack(np.meshgrid(range(res), range(res)), -1).reshape(-1, 2) + 0.5) / res
     lens = np.random.default_rng(0).random((len(middles), 2))
     rays = jax.vmap(scene.camera.sample_ray)(np.float32(middles), np.float32(lens))
@@ -67,7 +67,7 @@ def camera_rays(scene, res):
 
 
 def figures_of(scene, rule, rays):
-    """A line of the table."""
+    """Return a line of the table."""
     tree = scene.about.trees["triangle"]  # triangles are the last of the tables
     found = walk(tree, scene.geometry.tables[-1].vertices, *rays)
     counts = (np.mean(count) for count in (found.nodes, found.boxes, found.leaves, found.triangles))
@@ -76,7 +76,7 @@ def figures_of(scene, rule, rays):
 
 
 def boxes_by_level(tree):
-    """[(n, 2, 3)] lo and hi of the boxes of each level: the root's own, then the children of each level of nodes."""
+    """Return [(n, 2, 3)] lo and hi of the boxes of each level: the root's, then the children of each level of nodes."""
     inside = [np.stack([np.nanmin(tree.bounds[:1, 0], -1), np.nanmax(tree.bounds[:1, 1], -1)], 1)]
     nodes = np.zeros(1, int)
     while len(nodes):
@@ -88,7 +88,7 @@ def boxes_by_level(tree):
 
 
 def draw_boxes(picture, camera, levels, first=0):
-    """Their edges over a picture; levels: boxes of the levels first, first + 1, ..., coloured by them."""
+    """Draw the edges of boxes over a picture. levels: boxes of levels first, first + 1, ..., which set the colours."""
     large = picture.resize((picture.width * SMOOTH, picture.height * SMOOTH), Image.Resampling.BICUBIC)
     draw = ImageDraw.Draw(large)
     corners = np.indices((2, 2, 2)).reshape(3, 8)
@@ -105,7 +105,7 @@ def draw_boxes(picture, camera, levels, first=0):
 
 
 def encode(image):
-    """Linear RGB to a picture, enlarged."""
+    """Convert linear RGB to an enlarged PIL image."""
     values = np.clip(np.asarray(image), 0, 1) ** (1 / GAMMA)
     picture = Image.fromarray(np.rint(values * 255).astype(np.uint8))
     return picture.resize((picture.width * ZOOM, picture.height * ZOOM), Image.Resampling.BICUBIC)

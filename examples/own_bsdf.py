@@ -20,7 +20,7 @@ from pathjax.kinds import Color, Number
 
 @bsdfs.register("oren_nayar")
 class OrenNayar(bsdfs.BSDF):
-    """Rough clay (Oren and Nayar 1994), in Fujii's form, which loses less light."""
+    """Rough clay: the model of Oren and Nayar (1994) in Fujii's form, which loses less energy."""
 
     reflectance = Color(0.5)
     sigma = Number(0.5, bounds=(0, 1))

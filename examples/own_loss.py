@@ -35,9 +35,9 @@ def main():
         return pj.with_parameters(scene, dict(zip(NAMES, albedos, strict=True)))
 
     def loss(x, _):
-        # One seed throughout: the loss is a smooth function of x.
+        # The same seed for all x makes the loss a smooth function of x.
         image = pj.render(decorated(x), options.spp, seed=7)
-        # The lamp itself is far too bright to count.
+        # Clip, as the visible lamp would dominate the means.
         image = jnp.minimum(image, 1)
         left, right = image[:, : options.res // 2], image[:, options.res // 2 :]
         color = jnp.sum((image.mean((0, 1)) - MEAN_COLOR) ** 2)

@@ -18,7 +18,7 @@ from pathjax import scene, transport
 from pathjax.images import picture, write_png
 from pathjax.shapes import Cube
 
-BLOCKS = 32  # across the image: means over blocks hide the pixels' noise and the patches' edges
+BLOCKS = 32  # across the image; means over blocks hide pixel noise and patch edges
 
 
 def empty_box(res):
@@ -53,7 +53,7 @@ def main():
         op = transport.operator(box, count)
         solution = op.solve()
         seconds = time.perf_counter() - start
-        # The camera's rays are those of the renders: what the film's sampling errs by cancels.
+        # With the camera rays of the renders, so that the error of pixel sampling cancels.
         light = op.radiosity(solution.L)
         images.append(np.mean([transport.image(box, light, options.spp, seed) for seed in (1, 2)], 0))
         error = np.sqrt(np.mean((block_means(images[-1]) - reference) ** 2)) / scale

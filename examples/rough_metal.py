@@ -36,7 +36,7 @@ SCENE = """<scene version="3.0.0">
 
 
 def sky(windows):
-    """(16, 32, 3) radiances: a grey room, and windows of several colours, or none."""
+    """Return (16, 32, 3) radiances: a grey room, with windows of several colours or without."""
     image = np.full((16, 32, 3), 0.4)
     for top, left, color in [(3, 2, (4, 5, 6)), (4, 10, (6, 5, 4)), (3, 20, (5, 5, 5)), (9, 27, (2, 4, 2))] * windows:
         image[top : top + 4, left : left + 3] = color

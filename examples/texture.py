@@ -21,7 +21,7 @@ NAME = "carpet.reflectance"
 
 
 def pattern(size: int) -> np.ndarray:
-    """(size, size, 3) smooth colours, with a disk and a square in them."""
+    """Return a (size, size, 3) texture of smooth colours with a disk and a square."""
     noise = np.random.default_rng(0).normal(size=(size, size, 3))
     smooth = ndimage.gaussian_filter(noise, (size / 12, size / 12, 0), mode="wrap")
     texels = 0.45 + 0.12 * smooth / smooth.std()
@@ -32,7 +32,7 @@ def pattern(size: int) -> np.ndarray:
 
 
 def room(size: int, res: int) -> pj.Scene:
-    """A carpet, a box on it and a wall behind, under a lamp."""
+    """Build a scene of a carpet, a box on it and a wall behind, under a lamp."""
     wall = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.6, 0.6, 0.6]}}
     flat, turn = Transform(), Transform().rotate([1, 0, 0], -90)
     texels = {"type": "bitmap", "data": pattern(size), "raw": True, "wrap_mode": "clamp"}

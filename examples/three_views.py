@@ -22,7 +22,7 @@ START = {"glass.int_ior": 1.2, "pattern.color0": 0.5, "pattern.color1": 0.5}
 
 
 def correlation_picture(fit, width, cell=34):
-    """Squares for the correlations, labelled."""
+    """Draw the correlation matrix as labelled squares."""
     n = len(fit.components)
     picture = Image.new("RGB", (width, cell * n + 2 * cell), "white")
     draw = ImageDraw.Draw(picture)
