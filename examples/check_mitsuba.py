@@ -1,12 +1,12 @@
-"""Check another renderer's derivatives: Mitsuba's, of which one is right and one is wrong.
+"""Check the derivatives of another renderer: one of Mitsuba's that is right, and one that is wrong.
 
     python examples/check_mitsuba.py
 
-In an albedo, `prb` differentiates right. In the place of the ball it does not: it moves the shading, and not the
-outline of the ball and of its shadow, as its documentation says; `prb_projective` adds these. `check_gradient` is told
-nothing of that, and finds it by images alone. Writes check_mitsuba.png: of each case the claimed derivative,
-differences of images, and by how many standard errors they disagree (red: too large, blue: too small). Needs Mitsuba:
-pip install 'pathjax[bench]'.
+With respect to an albedo, Mitsuba's `prb` is right. With respect to the position of the ball it is not: it moves the
+shading, but not the outlines of the ball and of its shadow, as its documentation says; `prb_projective` adds these.
+`check_gradient` knows nothing of this and detects it from images alone. Writes check_mitsuba.png: for each case the
+claimed derivative, the differences of images, and their disagreement in standard errors (red: too large, blue: too
+small). Needs Mitsuba: pip install 'pathjax[bench]'.
 """
 
 import argparse

@@ -1,11 +1,11 @@
-"""Choices of the classic path tracers, compared: error against time, a table and a plot for each question.
+"""Compare the choices of the classic path tracer: error against time, with a table and a plot for each question.
 
     python examples/choices.py [QUESTION...]
 
-Which strategy, roulette from which depth, what does Schlick's approximation cost, does splitting at glass pay, which
-random numbers, which split rule of the hierarchy, which filter, does a coarse solution help? Choices are rendered with
-the same seeds, in turns; relMSE is measured against a converged reference. Writes choices.png. A further choice is one
-line here: its label, its scene, and what `pathjax.render` is to do otherwise.
+Which strategy? Roulette from which depth? What does Schlick's approximation cost? Does splitting at glass pay? Which
+random numbers? Which split rule of the hierarchy? Which filter? Does a coarse solution help? Choices are rendered in
+turns with the same seeds; relMSE is measured against a converged reference. Writes choices.png. A further choice is one
+line here: its label, its scene, and its arguments of `pathjax.render`.
 """
 
 import argparse

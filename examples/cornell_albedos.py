@@ -2,7 +2,7 @@
 
     python examples/cornell_albedos.py
 
-Writes cornell_albedos.png: target, fit, and what is left between them in standard deviations.
+Writes cornell_albedos.png: target, fit, and residual in standard deviations.
 """
 
 import argparse

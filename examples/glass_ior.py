@@ -1,9 +1,9 @@
-"""Recover the index of refraction of a glass ball before stripes, from a start in the wrong valley.
+"""Recover the index of refraction of a glass ball in front of stripes, from a start in the wrong valley.
 
     python examples/glass_ior.py
 
-From 1.2 a local method ends where the stripes happen to line up again; `fit` scans the range first, and says so where
-the scan is left out. Writes glass_ior.png: above the fit with the scan, below the one without.
+From 1.2, a local method ends where the stripes happen to line up again. `fit` scans the range first; without the scan,
+it reports that it has not converged. Writes glass_ior.png: the fit with the scan above, the one without below.
 """
 
 import argparse

@@ -1,10 +1,10 @@
-"""What an image does not determine: the brightness of a lamp and the albedos that it lights, with direct light alone.
+"""Find what an image does not determine: the brightness of a lamp and the albedos that it lights directly.
 
     python examples/identifiability.py
 
-With one bounce, an image holds only the product of the two, as long as the lamp itself is not seen; `fit` names the
-direction along which it looks the same, and gives infinite errors instead of false confidence. With more bounces the
-albedos show in how the light goes on, and the same fit succeeds. Writes identifiability.png: both fits.
+With one bounce, an image determines only the product of the two, as long as the lamp itself is not visible. `fit` names
+the direction along which the image does not change, and gives infinite errors instead of false confidence. With more
+bounces, indirect light reveals the albedos, and the same fit succeeds. Writes identifiability.png: both fits.
 """
 
 import argparse

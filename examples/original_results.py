@@ -1,10 +1,10 @@
-"""The two results of the work that pathjax continues, at its size, with its tent filter, thin lens and gamma.
+"""Reproduce the two results of the work that pathjax continues, with their size, tent filter, thin lens and gamma.
 
     python examples/original_results.py [--mesh car.obj]
 
-A Cornell box whose walls are triangles, and a mesh whose bounding volume hierarchy is drawn over it, level by level.
-Prints what the hierarchy costs by each of the three split rules: the mean over the camera's rays of the nodes that they
-open, of the boxes and of the triangles that they test. Writes original_results.png.
+The results are a Cornell box whose walls are triangles, and a mesh over which its bounding volume hierarchy is drawn,
+level by level. Prints the cost of the hierarchy under each of the three split rules: the mean numbers of nodes, boxes
+and triangles that a camera ray tests. Writes original_results.png.
 """
 
 import argparse

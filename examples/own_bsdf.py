@@ -1,4 +1,4 @@
-"""A bsdf of one's own: registered, checked, used in a scene, and its roughness recovered from an image."""
+"""Register a bsdf of your own, check it, use it in a scene, and recover its roughness from an image."""
 
 from __future__ import annotations
 

@@ -1,9 +1,9 @@
-"""A loss of one's own around `render`, minimised by optimistix.BFGS: make the walls of the Cornell box match a mood.
+"""Minimise a loss of your own around `render` with optimistix.BFGS: give the Cornell box a mood by its walls.
 
     python examples/own_loss.py
 
-The image should have a given mean colour, and its left and right halves should be equally bright; what the albedos are
-for that is found by gradients through the renderer. Writes own_loss.png: before and after.
+The image should have a given mean colour, and its left and right halves should be equally bright. Gradients through the
+renderer find the albedos that achieve this. Writes own_loss.png: before and after.
 """
 
 import argparse

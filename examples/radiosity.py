@@ -1,9 +1,9 @@
-"""The Cornell box without its boxes by linear algebra: (I - T)^-1 Le on patches, beside path tracing.
+"""Render the Cornell box without its boxes by linear algebra, (I - T)^-1 Le on patches, and by path tracing.
 
     python examples/radiosity.py
 
 Prints how the error falls as the patches get smaller, and how GMRES and the Neumann series converge. Writes
-radiosity.png: three meshes, the path tracer, and what is left between it and the finest mesh (red: too bright).
+radiosity.png: three meshes, the path tracer, and its difference from the finest mesh (red: too bright).
 """
 
 import argparse

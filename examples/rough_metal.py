@@ -1,11 +1,11 @@
-"""How rough a metal is, and its colour, from one photograph of a ball under a sky with windows.
+"""Recover the roughness and the colour of a metal from one photograph of a ball under a sky with windows.
 
     python examples/rough_metal.py
 
-Roughness blurs what the ball mirrors, and the colour scales it: the windows tell the two apart, and from each of four
-starts `fit` finds both. Under a sky that is the same everywhere there is nothing to blur. A rougher ball is a little
-darker then, and so is one of a darker colour: of a polished ball the fit says that the image does not determine what is
-which. Writes rough_metal.png: target, fit and residual of both.
+Roughness blurs the reflections, and colour scales them. The windows distinguish the two, and `fit` finds both from each
+of four starts. Under a uniform sky there is nothing to blur: a rougher ball is only a little darker, and so is one of a
+darker colour. For a polished ball under such a sky, the fit reports that the image does not determine which of the two
+it is. Writes rough_metal.png: target, fit and residual of both.
 """
 
 import argparse

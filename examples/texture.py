@@ -3,7 +3,7 @@
     python examples/texture.py
 
 Writes texture.png: the true texels, the fitted ones, and their standard errors, white at 0.1. Texels that no pixel
-sees, as behind the box, are red.
+sees, such as those behind the box, are red.
 """
 
 import argparse

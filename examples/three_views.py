@@ -1,9 +1,9 @@
-"""Recover the IOR of a glass ball and the two colours behind it, together, from three views.
+"""Recover the IOR of a glass ball and the two colours behind it together, from three views.
 
     python examples/three_views.py
 
-Views are scenes that share parameters by name. Writes three_views.png: target, fit and residual of each view, and below
-the correlations of the recovered numbers (red +1, white 0, blue -1).
+Views are scenes that share parameters by name. Writes three_views.png: target, fit and residual of each view and, below
+them, the correlations of the recovered numbers (red +1, white 0, blue -1).
 """
 
 import argparse
