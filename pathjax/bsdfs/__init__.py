@@ -174,12 +174,12 @@ def build(
 
 def occurs(materials: Materials, capability: str) -> bool:
     """Return whether some kind present has a capability: "smooth", "delta", ... of `BSDF`, or "moves_paths"."""
-    return any(_is(table, capability) for table in (*materials.tables, *materials.wrappers))
+    return any(_capable(table, capability) for table in (*materials.tables, *materials.wrappers))
 
 
 def has(materials: Materials, kind: Index, capability: str) -> Bool[Array, ""]:
     """Return whether a kind has a capability, as in `occurs`; False where there is no bsdf."""
-    flags = [_is(table, capability) for table in materials.tables]
+    flags = [_capable(table, capability) for table in materials.tables]
     if not any(flags):
         return jnp.bool_(False)
     if all(flags):
@@ -187,7 +187,7 @@ def has(materials: Materials, kind: Index, capability: str) -> Bool[Array, ""]:
     return at(jnp.array(flags), jnp.maximum(kind, 0)) & (kind >= 0)
 
 
-def _is(table: Table, capability: str) -> bool:
+def _capable(table: Table, capability: str) -> bool:
     if capability == "moves_paths":
         return any(declared.moves_paths for declared in table.kind.declared.values())
     return table.kind.capable(table, capability)

@@ -20,7 +20,15 @@ from pathjax.compile.cache import compiled, keep_kernels
 from pathjax.compile.jax_compat import is_symbolic_zero, is_traced, register_dataclass
 from pathjax.compile.lanes.interpreter import SELECTED_ROWS
 from pathjax.compile.linear import linear
-from pathjax.compile.mapping import MANY_ITEMS, cuts, native_fold, native_map, native_rows, split_map, sum_of_parts
+from pathjax.compile.mapping import (
+    MANY_ITEMS,
+    native_fold,
+    native_map,
+    native_rows,
+    parts_per_item,
+    split_map,
+    sum_of_parts,
+)
 from pathjax.compile.primitives import (
     Search,
     basis,
@@ -31,7 +39,7 @@ from pathjax.compile.primitives import (
     together,
     unset,
 )
-from pathjax.compile.promotion import usual_promotion
+from pathjax.compile.promotion import standard_promotion
 from pathjax.compile.replicas import on_all_devices
 from pathjax.compile.rows import Rows
 from pathjax.compile.threads import calls_at_once, concurrently, devices_of_a_call
@@ -47,7 +55,6 @@ __all__ = [
     "compiled",
     "compute_once",
     "concurrently",
-    "cuts",
     "devices_of_a_call",
     "interleaved",
     "is_symbolic_zero",
@@ -60,14 +67,15 @@ __all__ = [
     "native_rows",
     "on_all_devices",
     "one_by_one",
+    "parts_per_item",
     "persistent_loop",
     "register_dataclass",
     "setup",
     "split_map",
+    "standard_promotion",
     "sum_of_parts",
     "together",
     "unset",
-    "usual_promotion",
 ]
 
 setup()

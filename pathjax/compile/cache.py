@@ -71,11 +71,11 @@ def keep_kernels() -> None:
 def _keep_programs(folder: Path) -> None:
     global _programs
     if _programs is None:
-        jax.monitoring.register_event_listener(_hear_hit)
+        jax.monitoring.register_event_listener(_note_hit)
     _programs = folder
 
 
-def _hear_hit(event: str, **_: str | int) -> None:
+def _note_hit(event: str, **_: str | int) -> None:
     if "cache_hits" in event:
         _hits.append(event)
 
@@ -155,7 +155,7 @@ def _key(function, arguments, static) -> str:
     chosen = sorted((name, str(value)) for name, value in jax.config.values.items())
     chosen += sorted((name, x) for name, x in os.environ.items() if name.startswith(("XLA_", "JAX_", "PATHJAX_")))
     versions = platform.python_version(), jax.__version__, jaxlib.__version__
-    known = function.__module__, function.__qualname__, _told(static), _told_tree(tree), given
+    known = function.__module__, function.__qualname__, _canonical(static), _canonical_tree(tree), given
     code = hashlib.sha256(repr((known, chosen, versions, _sources())).encode())
     return code.hexdigest()[:32]
 
@@ -167,13 +167,13 @@ def _sources() -> list[tuple]:
     return [(str(file), file.stat().st_mtime_ns, file.stat().st_size) for file in files]
 
 
-def _told_tree(tree) -> object:
+def _canonical_tree(tree) -> object:
     """Return a pytree's structure as values whose `repr` is the same in each process."""
     data = tree.node_data()
-    return "*" if data is None else (_told(data), [_told_tree(child) for child in tree.children()])
+    return "*" if data is None else (_canonical(data), [_canonical_tree(child) for child in tree.children()])
 
 
-def _told(x: object) -> object:
+def _canonical(x: object) -> object:
     if x is None or isinstance(x, bool | int | float | str):
         return repr(x)
     if isinstance(x, type):
@@ -181,11 +181,11 @@ def _told(x: object) -> object:
             raise _Unknown
         return f"{x.__module__}.{x.__qualname__}"
     if isinstance(x, tuple | list):
-        return [_told(type(x)), *map(_told, x)]
+        return [_canonical(type(x)), *map(_canonical, x)]
     if isinstance(x, dict):
-        return [_told(list(pair)) for pair in x.items()]
+        return [_canonical(list(pair)) for pair in x.items()]
     if is_dataclass(x):
-        return [_told(type(x)), *(_told(getattr(x, f.name)) for f in fields(x))]
+        return [_canonical(type(x)), *(_canonical(getattr(x, f.name)) for f in fields(x))]
     raise _Unknown
 
 

@@ -17,7 +17,7 @@ from jax.custom_batching import custom_vmap
 from jax.sharding import Mesh, PartitionSpec
 
 from pathjax.compile.lanes import lanes
-from pathjax.compile.promotion import usual_promotion
+from pathjax.compile.promotion import standard_promotion
 from pathjax.compile.rows import Rows
 from pathjax.compile.vectorised import most_lanes, vectorised, vectorised_sum
 from pathjax.compile.xla import native
@@ -34,7 +34,7 @@ ITEMS_OF_A_PART, MOST_PARTS, MOST_BYTES = 8192, 16, 1 << 26
 _ITEMS_OF_A_LANE, _MOST_CUTS = 4, 16
 
 
-@usual_promotion
+@standard_promotion
 def native_map(f: Callable, xs, *shared, form: str | None = None, devices: int | None = None):
     """Return `f(x, *shared)` for every x of `xs`, computed on all devices.
 
@@ -57,7 +57,7 @@ def native_map(f: Callable, xs, *shared, form: str | None = None, devices: int |
         return _map(f, xs, shared, form, devices)
 
     @run.def_vmap
-    @usual_promotion
+    @standard_promotion
     def run_batch(size, batched, xs, *shared):
         xs_batched, *shared_batched = batched
 
@@ -81,7 +81,7 @@ def native_map(f: Callable, xs, *shared, form: str | None = None, devices: int |
     return run(xs, *shared)
 
 
-@usual_promotion
+@standard_promotion
 def native_fold(
     f: Callable, xs, *shared, start: Callable, finish: Callable, form: str | None = None, devices: int | None = None
 ):
@@ -116,7 +116,7 @@ def native_fold(
     return _by_parts(part, xs, shared, devices, max(1, MOST_BYTES // _bytes(lambda: zeros)), zeros)
 
 
-@usual_promotion
+@standard_promotion
 def native_rows(
     f: Callable, xs, *shared, start: Callable, finish: Callable, form: str | None = None, devices: int | None = None
 ):
@@ -159,7 +159,7 @@ def native_rows(
         return ys, Rows((rows,), (count, *rows.shape[3:]))
 
     @run.def_vmap
-    @usual_promotion
+    @standard_promotion
     def _(size, batched, *args):
         def one(b):
             def pick(leaf, is_batched):
@@ -267,7 +267,7 @@ def _by_parts(part: Callable, xs, shared, devices: int | None, most: int = MOST_
     return jax.tree.map(lambda zero, x: x.reshape(-1)[: zero.size].reshape(zero.shape), total, sums)
 
 
-def cuts(count: int, form: str | None = None) -> int:
+def parts_per_item(count: int, form: str | None = None) -> int:
     """Return the number of parts to cut each of `count` items into: a lane of an accelerator needs several items."""
     return 1 if _form(form) != "vmap" else min(-(-_ITEMS_OF_A_LANE * most_lanes() // max(count, 1)), _MOST_CUTS)
 

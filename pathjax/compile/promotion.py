@@ -12,15 +12,15 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 
-def usual_promotion(f: Callable[P, R]) -> Callable[P, R]:
+def standard_promotion(f: Callable[P, R]) -> Callable[P, R]:
     """Return f with JAX's default promotion inside: a stricter setting of the user's is meant for the user's code.
 
     For public functions, and for functions that JAX calls later, such as differentiation rules.
     """
 
     @wraps(f)
-    def usual(*args: P.args, **kwargs: P.kwargs) -> R:
+    def promoted(*args: P.args, **kwargs: P.kwargs) -> R:
         with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
             return f(*args, **kwargs)
 
-    return usual
+    return promoted

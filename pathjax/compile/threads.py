@@ -8,7 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import jax
 
-from pathjax.compile.promotion import usual_promotion
+from pathjax.compile.promotion import standard_promotion
 
 
 def calls_at_once() -> int:
@@ -32,7 +32,7 @@ def concurrently(f: Callable, items: Iterable) -> Iterator[tuple]:
     with ThreadPoolExecutor(workers) as pool:
         try:
             for item in items:
-                waiting.append((item, pool.submit(usual_promotion(f), item)))
+                waiting.append((item, pool.submit(standard_promotion(f), item)))
                 # Per thread, one that runs and one that is ready.
                 if len(waiting) > 2 * workers:
                     done, result = waiting.popleft()

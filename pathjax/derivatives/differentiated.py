@@ -92,12 +92,12 @@ def paths(scene: Scene) -> set[tuple]:
         tables.append(("emitters", i, "table"))
         covers += tables_of_textures(scene, ("emitters", i, "textures"))
 
-    def tells_entries(path):
-        return named.get(scene, path).kind.tells_entries()
+    def has_entries(path):
+        return named.get(scene, path).kind.has_entries()
 
-    found = {path for table in filter(tells_entries, covers) for path in _columns(scene, table)}
+    found = {path for table in filter(has_entries, covers) for path in _columns(scene, table)}
     for table in tables:
-        found |= {p for p in _columns(scene, table) if not declared(scene, p).shared or tells_entries(table)}
+        found |= {p for p in _columns(scene, table) if not declared(scene, p).shared or has_entries(table)}
     shapes = enumerate(scene.geometry.tables)
     found |= {path for path in GRIDS if scene.media is not None and named.get(scene, path[:-1]) is not None}
     return found | {("geometry", "tables", i, "attributes", name) for i, each in shapes for name in each.attributes}
@@ -270,7 +270,7 @@ def of_colors(scene: Scene, path: tuple) -> bool:
     return known.shared and known.colors
 
 
-def is_both(scene: Scene, parameter: Parameter) -> bool:
+def is_color_and_number(scene: Scene, parameter: Parameter) -> bool:
     """Return whether colours may be used as colours in one place and by their luminance in another."""
     if not parameter.is_color:
         return False

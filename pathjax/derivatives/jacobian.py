@@ -21,7 +21,7 @@ from jaxtyping import Array, Float, Int
 
 from pathjax import emitters
 from pathjax.bsdfs import dielectric
-from pathjax.compile import is_symbolic_zero, is_traced, native, on_all_devices, register_dataclass, usual_promotion
+from pathjax.compile import is_symbolic_zero, is_traced, native, on_all_devices, register_dataclass, standard_promotion
 from pathjax.core.types import Number
 from pathjax.derivatives import backward, differentiated, ior, ior_difference, ior_step, rules, tangents, totals
 from pathjax.derivatives.kept import kept as kept_of
@@ -32,7 +32,7 @@ from pathjax.integrators.options import Counts, Options
 from pathjax.integrators.reconstruction import map_pixels
 from pathjax.kinds.parameter import Parameter
 from pathjax.scene import parameters as named
-from pathjax.scene.alike import by_all
+from pathjax.scene.alike import agreed_by_all
 from pathjax.scene.scene import Scene
 from pathjax.sensors import film
 from pathjax.system import memory
@@ -85,8 +85,8 @@ class Wanted:
     glass: tuple[int, ...]  # table rows of the dielectrics that get a difference
 
 
-@by_all
-@usual_promotion
+@agreed_by_all
+@standard_promotion
 def jacobian(
     scene: Scene,
     names: Sequence[str],
@@ -145,7 +145,7 @@ def _as_images(of_pixels, shape):
     return jax.tree.map(lambda x: x.reshape(*shape, *x.shape[1:]), of_pixels)
 
 
-@usual_promotion
+@standard_promotion
 def pixel_jacobians(
     scene: Scene,
     wanted: dict[str, Parameter],
@@ -229,7 +229,7 @@ def has_rows(scene: Scene, parameters) -> bool:
     """Return whether `backward.rows` gives the derivatives in these parameters. They must move no path."""
     parameters = list(parameters)
     known = differentiated.paths(scene)
-    return all(each.path in known and not differentiated.is_both(scene, each) for each in parameters)
+    return all(each.path in known and not differentiated.is_color_and_number(scene, each) for each in parameters)
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0, 1, 2, 3))
@@ -246,7 +246,7 @@ def _swept(wanted, options, ring, how, scene, pixels, *numbers):
 
 
 @partial(_swept.defjvp, symbolic_zeros=True)
-@usual_promotion
+@standard_promotion
 def _swept_jvp(wanted, options, ring, how, primals, changes):
     """Second derivatives: a sweep has none of its own, so they are those of the same Jacobian made by tangents."""
     tangents.refuse_textures(wanted)

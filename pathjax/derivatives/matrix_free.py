@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from pathjax.compile import usual_promotion
+from pathjax.compile import standard_promotion
 from pathjax.derivatives import backward, differentiated, forward
 from pathjax.derivatives.kept import kept as kept_of
 from pathjax.derivatives.kept import of_entries, of_parameter
@@ -30,7 +30,7 @@ def is_swept(scene: Scene, parameter: Parameter) -> bool:
     return not parameter.moves_paths and parameter.path in differentiated.paths(scene)
 
 
-@usual_promotion
+@standard_promotion
 def push(
     scene: Scene, wanted: Mapping[str, Parameter], changes: Changes, pixels, first_sample, spp, seed, options, **how
 ) -> Float[Array, "N 3"]:
@@ -49,7 +49,7 @@ def push(
     return forward.push(scene, v, pixels, *numbers, kept=kept, options=options, **how)
 
 
-@usual_promotion
+@standard_promotion
 def pull(
     scene: Scene,
     wanted: Mapping[str, Parameter],

@@ -19,7 +19,7 @@ from typing import Protocol, runtime_checkable
 import jax
 import jax.numpy as jnp
 
-from pathjax.compile import is_symbolic_zero, linear, usual_promotion
+from pathjax.compile import is_symbolic_zero, linear, standard_promotion
 from pathjax.errors import InputError
 from pathjax.kinds.parameter import Parameter
 from pathjax.scene import parameters as named
@@ -70,7 +70,7 @@ def _estimate(static, scene, varied, *work):
 
 
 @partial(_estimate.defjvp, symbolic_zeros=True)
-@usual_promotion
+@standard_promotion
 def _estimate_jvp(static, primals, tangents):
     estimator, parameters = static
     scene, varied, *work = primals

@@ -211,7 +211,7 @@ def chosen_by_place(emitters: tuple[Lights, ...]) -> bool:
     return any(lights.places is not None for lights in emitters)
 
 
-def usual_name(kind: str) -> str:
+def default_name(kind: str) -> str:
     """Return the name of a light outside of shapes that has no id. kind: its name in scene files."""
     return "background" if issubclass(KINDS.get(kind, Emitter), Background) else kind
 

@@ -39,7 +39,7 @@ class Emitter(Kind):
     single: ClassVar[bool] = False  # a scene may have only one of the kind
 
     @classmethod
-    def tells_entries(cls) -> bool:
+    def has_entries(cls) -> bool:
         """Return whether `entries` lists what it looks up in `Shared` arrays."""
         return False
 
@@ -92,7 +92,7 @@ class Background(Emitter):
         return []
 
     @classmethod
-    def tells_entries(cls):
+    def has_entries(cls):
         return cls.entries is not Background.entries
 
     @staticmethod

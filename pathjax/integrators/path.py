@@ -233,7 +233,7 @@ def scatter(
         path = path._replace(L=_with_light(path.L, direct._replace(light=_carried(path) * direct.light)))
     drawn, d = compute_once(sample(scene, here, u.bsdf))
     if path.pending is not None:
-        splits = splitting.takes_place(scene, here, path)
+        splits = splitting.splits_here(scene, here, path)
         drawn = drawn._replace(weight=jnp.where(splits, drawn.pdf, 1) * drawn.weight)
     behind = _scaled(path, lambda carried: carried * drawn.weight)
     passive = None if path.passive is None else lax.stop_gradient(path.passive * drawn.passive)

@@ -26,7 +26,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int, UInt
 
-from pathjax.compile import cuts, native_map, split_map
+from pathjax.compile import native_map, parts_per_item, split_map
 from pathjax.core import sampler
 from pathjax.core.math import safe_divide
 from pathjax.integrators.options import Options
@@ -119,7 +119,7 @@ def _whole(work: Works, scene: Scene) -> Run:
 def _own_samples(of_pixel: Callable, work: Works, scene: Scene, *shared, means: bool, **how) -> object:
     """Do `map_pixels` where no sample is shared. Accelerators take parts of a pixel's samples in parallel."""
     pixels, first_sample, spp, seed = work
-    parts = cuts(len(pixels), how.get("form"))
+    parts = parts_per_item(len(pixels), how.get("form"))
     if parts == 1:
         return native_map(of_pixel, work, scene, *shared, **how)
     k, each, more = jnp.arange(parts, dtype=spp.dtype)[:, None], spp // parts, spp % parts

@@ -142,10 +142,10 @@ def _flown(scene, way: _Way, distance, along) -> _Way:
     share = way.share * media.transmittance(scene.media, way.medium, way.ray, distance)
     if way.dimmed is None:
         return way._replace(share=share)
-    return way._replace(share=share, dimmed=_looked_at(scene, way.dimmed, way.medium, way.ray, distance, along[2]))
+    return way._replace(share=share, dimmed=_with_segment(scene, way.dimmed, way.medium, way.ray, distance, along[2]))
 
 
-def _looked_at(scene, seen, medium, ray, distance, u):
+def _with_segment(scene, seen, medium, ray, distance, u):
     """Update the drawn point with one more segment (reservoir sampling, reusing one random number)."""
     p, length = media.on_the_way(scene.media, medium, ray, distance, u)
     total = seen.length + length

@@ -25,7 +25,7 @@ def start(path, depth: int):
     return path._replace(pending=nothing)
 
 
-def takes_place(scene: Scene, here: Vertex, path) -> Bool[Array, ""]:
+def splits_here(scene: Scene, here: Vertex, path) -> Bool[Array, ""]:
     """Return whether both branches are followed at a vertex."""
     return bsdfs.has(scene.materials, here.kind, "branches") & (path.splits > 0)
 

@@ -221,7 +221,7 @@ class Dense(Search):
     def determined(self) -> np.ndarray:
         return np.einsum("sqr,srq->qs", self.inverse, self.equations.matrix).ravel()
 
-    def told_waves(self) -> dict[str, np.ndarray]:
+    def determined_waves(self) -> dict[str, np.ndarray]:
         places, found = self.vector.unpack(np.arange(len(self.values))), {}
         known, systems = self.inverse @ self.equations.matrix, self.vector.systems
         for name in self.prior.waves:

@@ -25,7 +25,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Real
 
 from pathjax import distributed
-from pathjax.compile import usual_promotion
+from pathjax.compile import standard_promotion
 from pathjax.errors import InputError
 from pathjax.integrators.options import check_counts
 from pathjax.inverse import problem, uncertainty, weights
@@ -38,7 +38,7 @@ from pathjax.inverse.refine import refine
 from pathjax.inverse.scan import scan as scanned
 from pathjax.inverse.state import State
 from pathjax.inverse.target import Target
-from pathjax.scene.alike import by_all
+from pathjax.scene.alike import agreed_by_all
 from pathjax.scene.scene import Scene
 from pathjax.system.interrupts import Interrupts
 
@@ -94,8 +94,8 @@ class Fit:
             return self.covariance / np.outer(sigma, sigma)
 
 
-@by_all
-@usual_promotion
+@agreed_by_all
+@standard_promotion
 def fit(
     scene: Scene | Sequence[Scene],
     target: Seen | Sequence[Seen],
@@ -153,7 +153,7 @@ def fit(
     if distributed.index():
         tell = None
     views = problem.build(scene, target, names, start or {})
-    if problem.is_many(views.vector):
+    if problem.is_large(views.vector):
         if chosen is not None:
             raise InputError("solver is of fits of few numbers; textures have one of their own, so leave it out")
         return _fit_many(views, spp, seed, Prior(views.vector, views.start, smoothness, prior), tell)

@@ -106,7 +106,7 @@ class Search:
             self.record(samples)
             self.deviation = self.draw()
             self.told = self.determined()
-            self.prior.estimate(self.values, self.deviation, self.told, self.told_waves())
+            self.prior.estimate(self.values, self.deviation, self.told, self.determined_waves())
             if excess < SETTLED and (not last or self.renders > 1):
                 break
 
@@ -215,7 +215,7 @@ class Search:
         self.sharp = int(np.ceil(spp * pretended / max(PRETENDED * told.sum(), 1)))
         return told
 
-    def told_waves(self) -> dict[str, np.ndarray]:
+    def determined_waves(self) -> dict[str, np.ndarray]:
         """Return per texture (h, w) how much of each cosine wave the pixels determine, channels summed; noisy."""
         one, other = self.prior.waves_of(self.deviation), self.prior.waves_of(self.response)
         return {name: (amplitudes * other[name]).sum(-1) for name, amplitudes in one.items()}

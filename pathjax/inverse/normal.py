@@ -23,7 +23,7 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
-from pathjax.compile import register_dataclass, sum_of_parts, usual_promotion
+from pathjax.compile import register_dataclass, standard_promotion, sum_of_parts
 from pathjax.compile.mapping import ITEMS_OF_A_PART, MOST_BYTES
 from pathjax.derivatives.jacobian import pixel_jacobians
 from pathjax.errors import InputError
@@ -33,7 +33,7 @@ from pathjax.inverse.parameter_vector import ParameterVector
 from pathjax.inverse.problem import Views
 from pathjax.inverse.target import Target
 from pathjax.scene import parameters as named
-from pathjax.scene.alike import by_all
+from pathjax.scene.alike import agreed_by_all
 from pathjax.scene.scene import Scene
 from pathjax.system import memory
 
@@ -73,8 +73,8 @@ class NormalEquations:
     components: tuple[str, ...] = field(metadata={"static": True})
 
 
-@by_all
-@usual_promotion
+@agreed_by_all
+@standard_promotion
 def normal_equations(
     scene: Scene | Sequence[Scene],
     names: Sequence[str],

@@ -156,7 +156,7 @@ class Prior:
         return _joined(total)
 
     def estimate(
-        self, values: np.ndarray, deviation: np.ndarray, told: np.ndarray, told_waves: Mapping[str, np.ndarray]
+        self, values: np.ndarray, deviation: np.ndarray, told: np.ndarray, determined_waves: Mapping[str, np.ndarray]
     ) -> None:
         """Update the most likely differences, given the mean of the posterior and a deviation drawn from it.
 
@@ -168,11 +168,11 @@ class Prior:
             values: (n,) mean of the posterior.
             deviation: (n,) drawn from it.
             told: (n,) how much of each parameter the images determine.
-            told_waves: (h, w) the same for the waves of each texture in `waves`, summed over channels.
+            determined_waves: (h, w) the same for the waves of each texture in `waves`, summed over channels.
         """
         if self.estimated:
             for name in self.waves:
-                self._estimate_waves(name, self._by_name(values)[name], told_waves[name])
+                self._estimate_waves(name, self._by_name(values)[name], determined_waves[name])
         deviations, tolds = self._by_name(deviation), self._by_name(told)
         for name, value in self._by_name(values).items():
             if name not in self.links:

@@ -170,7 +170,7 @@ def build(scene, target, names, start) -> Problem:
     pixels = sum(int(t.usable.any(-1).sum()) for t in targets)
     if not pixels:
         raise InputError("every pixel of the target is clipped or left out; give one that is exposed for the scene")
-    if pixels < vector.count and not is_many(vector):
+    if pixels < vector.count and not is_large(vector):
         raise InputError(f"{pixels} pixels cannot determine {vector.count} numbers; give larger targets or more views")
     level = np.concatenate([target.image[target.usable] for target in targets]).mean()
     exposure = float(np.exp2(-np.floor(np.log2(level)))) if level > 0 else 1.0
@@ -184,7 +184,7 @@ def build(scene, target, names, start) -> Problem:
     return Problem(scenes, targets, exposure, rounding, groups, vector, vector.pack(values))
 
 
-def is_many(vector: ParameterVector) -> bool:
+def is_large(vector: ParameterVector) -> bool:
     """Return whether there is a texture, or more scalars than a Jacobian should have columns."""
     return vector.count > MOST_COLUMNS or any(p.is_texture for _, p in vector.parameters)
 

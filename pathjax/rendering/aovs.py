@@ -8,13 +8,13 @@ from functools import partial
 import jax
 import numpy as np
 
-from pathjax.compile import on_all_devices, usual_promotion
+from pathjax.compile import on_all_devices, standard_promotion
 from pathjax.errors import InputError
 from pathjax.integrators import aov, pixel
 from pathjax.integrators.options import DEFAULTS, Options, check_counts
 from pathjax.integrators.reconstruction import map_pixels
 from pathjax.rendering.progressive import replicates
-from pathjax.scene.alike import by_all
+from pathjax.scene.alike import agreed_by_all
 from pathjax.scene.parameters import nameless
 from pathjax.scene.scene import Scene
 from pathjax.sensors import film
@@ -25,8 +25,8 @@ MAX_SPP = 16
 CHUNK_PIXELS = 1 << 14
 
 
-@by_all
-@usual_promotion
+@agreed_by_all
+@standard_promotion
 def render_aovs(scene: Scene, names: Sequence[str], spp: int = MAX_SPP, seed: int = 0) -> dict[str, np.ndarray]:
     """Return images of the camera's first hit, as Mitsuba's `aov` integrator does.
 

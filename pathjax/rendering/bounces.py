@@ -12,7 +12,7 @@ from jax import lax
 from jaxtyping import Array, Integer
 
 from pathjax import emitters
-from pathjax.compile import is_traced, on_all_devices, register_dataclass, usual_promotion
+from pathjax.compile import is_traced, on_all_devices, register_dataclass, standard_promotion
 from pathjax.core.types import Number
 from pathjax.derivatives import rules, tangents
 from pathjax.errors import InputError
@@ -21,7 +21,7 @@ from pathjax.integrators.options import DEFAULTS, Options
 from pathjax.integrators.reconstruction import map_pixels
 from pathjax.rendering import tail
 from pathjax.rendering.progressive import error_estimate, replicates
-from pathjax.scene.alike import by_all
+from pathjax.scene.alike import agreed_by_all
 from pathjax.scene.scene import Scene
 from pathjax.sensors import film
 
@@ -69,8 +69,8 @@ class Bounces:
         return tail.fit(means[:, known].mean(1), error)
 
 
-@by_all
-@usual_promotion
+@agreed_by_all
+@standard_promotion
 def render_bounces(
     scene: Scene,
     depth: int,

@@ -12,7 +12,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from scipy import stats
 
-from pathjax.compile import usual_promotion
+from pathjax.compile import standard_promotion
 from pathjax.derivatives import ior
 from pathjax.derivatives.jacobian import jacobian
 from pathjax.errors import InputError
@@ -83,7 +83,7 @@ def check_gradient(
 ) -> GradientCheck: ...
 
 
-@usual_promotion
+@standard_promotion
 def check_gradient(
     of: Scene | Render,
     at: str | ArrayLike,

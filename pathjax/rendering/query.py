@@ -10,19 +10,19 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Real
 
-from pathjax.compile import native_map, on_all_devices, usual_promotion
+from pathjax.compile import native_map, on_all_devices, standard_promotion
 from pathjax.core.math import normalize, rescale
 from pathjax.core.types import Hit, Ray
 from pathjax.errors import InputError
-from pathjax.scene.alike import by_all
+from pathjax.scene.alike import agreed_by_all
 from pathjax.scene.scene import Scene
 from pathjax.shapes import geometry
 
 Vectors = Real[Array | np.ndarray, "N 3"]
 
 
-@by_all
-@usual_promotion
+@agreed_by_all
+@standard_promotion
 def closest_hit(scene: Scene, origins: Vectors, directions: Vectors) -> Hit:
     """Return the first primitive that each ray meets; directions may have any positive length.
 
@@ -36,8 +36,8 @@ def closest_hit(scene: Scene, origins: Vectors, directions: Vectors) -> Hit:
     return _closest_hit(on_all_devices(scene.geometry), *_rays(scene, origins, directions))
 
 
-@by_all
-@usual_promotion
+@agreed_by_all
+@standard_promotion
 def any_hit(
     scene: Scene, origins: Vectors, directions: Vectors, distances: Real[ArrayLike, "..."] = jnp.inf
 ) -> Bool[Array, " N"]:

@@ -9,7 +9,7 @@ import jax
 from jaxtyping import Array, Float
 
 from pathjax import emitters
-from pathjax.compile import on_all_devices, usual_promotion
+from pathjax.compile import on_all_devices, standard_promotion
 from pathjax.core.types import Number
 from pathjax.derivatives import matrix_free
 from pathjax.derivatives.backward import longest_ring
@@ -19,7 +19,7 @@ from pathjax.errors import InputError
 from pathjax.integrators import pixel
 from pathjax.integrators.options import DEFAULTS, Options
 from pathjax.integrators.reconstruction import map_pixels
-from pathjax.scene.alike import by_all
+from pathjax.scene.alike import agreed_by_all
 from pathjax.scene.scene import Scene
 from pathjax.sensors import film
 
@@ -27,8 +27,8 @@ from pathjax.sensors import film
 MOST_TWICE = 8
 
 
-@by_all
-@usual_promotion
+@agreed_by_all
+@standard_promotion
 def render(
     scene: Scene,
     spp: Number = 64,
@@ -90,7 +90,7 @@ def _check_control(control, scene: Scene) -> None:
     control.check(scene)
 
 
-@usual_promotion
+@standard_promotion
 def render_pixels(
     scene: Scene, pixels, first_sample, spp, seed, options: Options = DEFAULTS, control=None, shape=None, **how
 ):

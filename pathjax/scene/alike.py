@@ -46,7 +46,7 @@ def _plain(x: object) -> object:
     return vars(x) if is_dataclass(x) else x
 
 
-def by_all(f: Callable[P, R]) -> Callable[P, R]:
+def agreed_by_all(f: Callable[P, R]) -> Callable[P, R]:
     """Return f with a check that all processes, which share its kernels, call it with the same arguments.
 
     With several processes, it returns when the result is computed. Within `jax.jit` and other transformations, where

@@ -8,7 +8,7 @@ import numpy as np
 
 from pathjax import bsdfs, emitters, media, shapes
 from pathjax import description as desc
-from pathjax.compile import usual_promotion
+from pathjax.compile import standard_promotion
 from pathjax.errors import InputError
 from pathjax.kinds import Parameters
 from pathjax.scene.metadata import About
@@ -16,7 +16,7 @@ from pathjax.scene.scene import UNBOUNDED, Scene
 from pathjax.shapes.accel.build import RULES
 
 
-@usual_promotion
+@standard_promotion
 def build(description: desc.Description, dtype=jnp.float32, split_rule: str = "sah") -> Scene:
     """Compile a description into tables grouped by kind.
 

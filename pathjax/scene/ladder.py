@@ -89,11 +89,11 @@ def _emitters(emitters: tuple[Lights, ...], light: Int[np.ndarray, " N"]) -> tup
         lit[(light >= first) & (light < first + lights.count)] += moved
         first += lights.count
     if any(lights.places is not None for lights in emitters):
-        _plant(emitters, made, extra)
+        _pad_light_tree(emitters, made, extra)
     return lit, tuple(made)
 
 
-def _plant(emitters: tuple[Lights, ...], made: list[Lights], extra: list[int]) -> None:
+def _pad_light_tree(emitters: tuple[Lights, ...], made: list[Lights], extra: list[int]) -> None:
     """Put added lights into empty leaves, with the bounds of an empty leaf, so that no node of the tree changes."""
     placed = [place for place, lights in enumerate(emitters) if lights.places is not None]
     places = np.concatenate([emitters[place].places for place in placed])

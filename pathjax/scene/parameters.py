@@ -13,20 +13,20 @@ import numpy as np
 from jax import lax
 from jax.typing import ArrayLike
 
-from pathjax.compile import is_traced, usual_promotion
+from pathjax.compile import is_traced, standard_promotion
 from pathjax.errors import InputError
 from pathjax.kinds.parameter import Parameter, with_textures
 from pathjax.scene.scene import Scene
 
 
-@usual_promotion
+@standard_promotion
 def parameters(scene: Scene) -> dict[str, jax.Array]:
     """Return all parameters of the scene by name, `ID.field`."""
     scene = attached(scene)
     return {name: p.get(get(scene, p.path)) for name, p in scene.described.parameters.items()}
 
 
-@usual_promotion
+@standard_promotion
 def with_parameters(scene: Scene, values: Mapping[str, ArrayLike | Sequence[float]]) -> Scene:
     """Return the scene with other values for some of its parameters; nothing is compiled again.
 
@@ -99,10 +99,10 @@ def find(scene: Scene, name: str) -> Parameter:
     if name in known.refused:
         raise InputError(known.refused[name])
     near = difflib.get_close_matches(str(name), known.parameters, n=3, cutoff=0.3)
-    raise InputError(f"no parameter is named {name!r}; " + _offer(near, known.parameters))
+    raise InputError(f"no parameter is named {name!r}; " + _suggestion(near, known.parameters))
 
 
-def _offer(near, parameters):
+def _suggestion(near, parameters):
     if not parameters:
         return "this scene has none"
     return "did you mean " + " or ".join(near) + "?" if near else "the scene has " + ", ".join(parameters)

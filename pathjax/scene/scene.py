@@ -9,7 +9,7 @@ from jaxtyping import Array, Int
 
 from pathjax import bsdfs
 from pathjax.bsdfs import Materials
-from pathjax.compile import register_dataclass, usual_promotion
+from pathjax.compile import register_dataclass, standard_promotion
 from pathjax.emitters import Lights
 from pathjax.errors import InputError
 from pathjax.media import Media
@@ -47,7 +47,7 @@ class Scene:
         """Names of the sensors in the order of the scene's file: ids, or indices from 0 for sensors without an id."""
         return tuple(self.described.description.views)
 
-    @usual_promotion
+    @standard_promotion
     def with_sensor(self, which: int | str) -> Scene:
         """Return the scene seen by another sensor of its file, with its film; all else, also parameters, is shared.
 

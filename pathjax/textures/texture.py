@@ -44,7 +44,7 @@ class Texture(Kind):
         return cls.look_up(p, uv, surface), cls.entries(p, uv, surface)
 
     @classmethod
-    def tells_entries(cls) -> bool:
+    def has_entries(cls) -> bool:
         return cls.entries is not Texture.entries
 
     @classmethod

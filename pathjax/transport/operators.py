@@ -24,7 +24,7 @@ import numpy as np
 from jax import lax
 
 from pathjax import bsdfs, emitters
-from pathjax.compile import is_traced, register_dataclass, usual_promotion
+from pathjax.compile import is_traced, register_dataclass, standard_promotion
 from pathjax.core.math import safe_divide
 from pathjax.errors import InputError
 from pathjax.integrators.options import check_counts
@@ -129,7 +129,7 @@ class Operator:
     def _function(self, f):
         return lx.FunctionLinearOperator(f, jax.ShapeDtypeStruct(self.Le.shape, self.Le.dtype))
 
-    @usual_promotion
+    @standard_promotion
     def with_scene(self, scene: Scene) -> Operator:
         """Return the operator with the reflectances and radiances, perhaps traced, of a scene of the same shapes."""
         return replace(self, **dict(zip(("albedo", "Le"), _albedos_and_lights(scene, self.patches), strict=True)))
@@ -138,7 +138,7 @@ class Operator:
         """Return light L (U, 3) on the patches for `transport.image` and `transport.radiance`."""
         return radiosity(self.patches, L)
 
-    @usual_promotion
+    @standard_promotion
     def control(self, L, effort: float = 2.0) -> Control:
         """Return light L (U, 3), ideally the solution, as a control variate for `pathjax.render`; see `control`.
 
@@ -146,23 +146,23 @@ class Operator:
         """
         return Control(self.radiosity(self.T.mv(L)), jnp.asarray(effort, self.Le.dtype))
 
-    @usual_promotion
+    @standard_promotion
     def error(self, L) -> jax.Array:
         """Return the standard error (U, 3) of T L due to the errors of the form factors, for light L (U, 3)."""
         return self.albedo * jnp.sqrt(self.factors.squared_errors_mv(L**2))
 
-    @usual_promotion
+    @standard_promotion
     def terms(self, depth: int) -> jax.Array:
         """Return Le, T Le, T^2 Le, ... as (depth, U, 3): light reflected 0, 1, ... times. depth: at least 1."""
         _check_depth(depth)
         return lax.scan(lambda term, _: (self.T.mv(term), term), self.Le, length=depth)[1]
 
-    @usual_promotion
+    @standard_promotion
     def spectral_radius(self) -> jax.Array:
         """Return the largest eigenvalue of T per channel (3,), by the power method; below 1 if the light dies out."""
         return _spectral_radius(self)
 
-    @usual_promotion
+    @standard_promotion
     def solve(self, method: str = "gmres", depth: int | None = None, tolerance: float | None = None) -> Solution:
         """Solve for L = (I - T)^-1 Le.
 
@@ -211,7 +211,7 @@ class Operator:
             )
         return radius
 
-    @usual_promotion
+    @standard_promotion
     def residual_history(self, steps: int, method: str = "gmres") -> np.ndarray:
         """Return |Le + T L - L| / |Le| for L composed of Le, T Le, ..., T^(k-1) Le, k = 0, ..., steps: (steps + 1,).
 
@@ -226,7 +226,7 @@ class Operator:
         return _krylov_residuals(self, steps)
 
 
-@usual_promotion
+@standard_promotion
 def operator(
     scene: Scene,
     patches: int = 1000,

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from pathjax.compile import native_map, register_dataclass, usual_promotion
+from pathjax.compile import native_map, register_dataclass, standard_promotion
 from pathjax.core import sampler
 from pathjax.core.math import at, dot
 from pathjax.errors import InputError
@@ -33,7 +33,7 @@ class Radiosity:
     L: jax.Array  # (U + 1, 3) radiance that leaves each patch; the last row, black, is for points of no patch
 
 
-@usual_promotion
+@standard_promotion
 def radiosity(patches: Patches, L) -> Radiosity:
     """Return light L (U, 3) on the patches as a Radiosity, for look-ups."""
     return Radiosity(patches, jnp.concatenate([L, jnp.zeros_like(L[:1])]))
@@ -51,7 +51,7 @@ def radiance(light: Radiosity, shapes: Geometry, primitive, p, back):
     return at(light.L, patch_at(light.patches, shapes, primitive, p, back))
 
 
-@usual_promotion
+@standard_promotion
 def image(scene: Scene, light: Radiosity, spp: int = 16, seed: int = 0) -> jax.Array:
     """Render the light on patches through the camera: (H, W, 3).
 

@@ -163,7 +163,7 @@ class _Reader:
         kinds = [each.get("type") for each in beside.values() if isinstance(each, Mapping)]
         given = ["bsdf" if kind == "ref" else self.tag(kind, place) for kind in kinds if isinstance(kind, str)]
         arrays = mesh_objects.arrays_of(mesh, place, lambda numbers: _array(numbers, place))
-        return mesh_objects.looks_of(mesh, place, given) | arrays | beside
+        return mesh_objects.appearance_of(mesh, place, given) | arrays | beside
 
     def tag(self, kind: str, place: str) -> str:
         found = [tag for tag, kinds in self.kinds.items() if kind in kinds]

@@ -310,7 +310,7 @@ class _Loader:
 
     def unnamed(self, element: Element) -> str:
         """Return a name for an emitter outside of shapes without an id."""
-        return self.unique(emitters.usual_name(element.attributes.get("type", "")))
+        return self.unique(emitters.default_name(element.attributes.get("type", "")))
 
     def texture(self, fields: Fields, parameter: str, owner: str, of_number: bool = False) -> Instance | None:
         """Return the texture that sets a parameter, or None. `owner` names one without an id."""

@@ -29,7 +29,7 @@ def arrays_of(mesh: object, place: str, array: Callable[[object], np.ndarray]) -
     return _of_mitsuba(mesh, array) if _is_mitsubas(mesh) else _of_trimesh(mesh)
 
 
-def looks_of(mesh: object, place: str, given: Collection[str]) -> dict[str, object]:
+def appearance_of(mesh: object, place: str, given: Collection[str]) -> dict[str, object]:
     """Return the bsdf and emitter of a Mitsuba mesh, except for those in `given`. Mitsuba exposes only parameters.
 
     Raises:

@@ -85,13 +85,13 @@ class _Writer:
     def attributes(self, element: Element) -> dict[str, str]:
         attributes = dict(element.attributes)
         if found := self.document.found.get(element):
-            attributes["filename" if "filename" in attributes else "value"] = self.seen_from_there(found)
+            attributes["filename" if "filename" in attributes else "value"] = self.relative_path(found)
         for value in attributes.values():
             if "$" in value or not value.replace("\n", " ").replace("\t", " ").isprintable():
                 raise element.error(f"{element}: {value[:60]!r} cannot be written, as XML has no word for it here")
         return attributes
 
-    def seen_from_there(self, found: Path) -> str:
+    def relative_path(self, found: Path) -> str:
         there = Path(os.path.realpath(self.path)).parent
         try:
             return Path(os.path.relpath(os.path.realpath(found), there)).as_posix()

@@ -88,10 +88,10 @@ class _Reader:
             raise root.error(f'scene version "{version}" is not of the form "3.0.0"; use that, Mitsuba 3\'s')
         if int(version.partition(".")[0]) < 2:
             upgrade(root)
-        self._settle(root, chain)
+        self._expand(root, chain)
         return root
 
-    def _settle(self, parent: Element, chain: tuple[Path, ...]) -> None:
+    def _expand(self, parent: Element, chain: tuple[Path, ...]) -> None:
         """Substitute `$name`s, apply and remove directives, and insert included elements, in the order of the file."""
         children: list[Element] = []
         for element in parent.children:
@@ -110,7 +110,7 @@ class _Reader:
                 case "include":
                     children += self._include(element, parent, chain)
                 case _:
-                    self._settle(element, chain)
+                    self._expand(element, chain)
                     children.append(element)
         parent.children = children
 

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from pathjax import distributed
-from pathjax.compile import usual_promotion
+from pathjax.compile import standard_promotion
 from pathjax.errors import InputError
 from pathjax.integrators.options import Options, check_counts
 from pathjax.rendering.progressive import error_estimate, passes, replicates
@@ -51,7 +51,7 @@ class RenderResult:
     reason: str  # why it ended: "target error", "time limit", "spp", "interrupted", "no estimate"
 
 
-@usual_promotion
+@standard_promotion
 def render_until(
     scene: Scene,
     target_error: float | None = None,
