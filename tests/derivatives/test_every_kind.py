@@ -1,6 +1,6 @@
-"""Every parameter of every kind, a scene a kind: derivatives of images, by `check_gradient`, and images of Mitsuba.
+"""Every parameter of every kind, in one scene or more per kind: derivatives by `check_gradient`, images by Mitsuba.
 
-A right derivative fails with the chance 1e-3 each; seeds are fixed.
+A correct derivative fails with probability 1e-3 each; seeds are fixed.
 """
 
 import math
@@ -17,13 +17,13 @@ from pathjax.bsdfs.ior import LEAST_IOR
 from pathjax.sensors.film import image_shape
 
 SEEDS = 16
-# Samples per pixel to begin with, and at most; as many are taken as find an error of this size half of the time.
+# Samples per pixel of the first check, and at most: enough to detect a relative error of RESOLUTION half of the time.
 SPP, MOST_SPP = 64, 2048
 RESOLUTION = 0.15
-# Its square is no float32.
+# Its square overflows float32.
 LARGE_IOR = 1e30
 
-# What stands around: its parameters are checked with the kinds that they are of.
+# The surroundings. Their parameters, named "around-...", are checked in the cases of their own kinds.
 FLOOR = """<shape type="rectangle"><transform name="to_world"><scale value="3"/><rotate x="1" angle="-90"/>
   <translate y="-1"/></transform><bsdf type="diffuse" id="around-floor"><texture type="checkerboard" name="reflectance">
   <rgb name="color0" value="0.7, 0.6, 0.5"/><rgb name="color1" value="0.2, 0.3, 0.4"/>
@@ -33,7 +33,7 @@ AROUND = """<shape type="rectangle"><transform name="to_world"><rotate x="1" ang
   <emitter type="area" id="around-light">
   <rgb name="radiance" value="{}"/></emitter></shape>
   <emitter type="constant" id="around-sky"><rgb name="radiance" value="{}"/></emitter>"""
-# How rough something is shows best under a lamp alone, in whose light what is smooth is noisy.
+# Roughness shows best under LAMP, which is little but its lamp; smooth surfaces are noisy in that light.
 LIGHT, LAMP = AROUND.format("4, 3, 2", "0.4, 0.5, 0.6"), AROUND.format("20, 16, 12", "0.1, 0.15, 0.2")
 BALL = '<shape type="sphere"><float name="radius" value="0.9"/>{}</shape>'
 PANE = '<shape type="rectangle"><transform name="to_world"><rotate y="1" angle="25"/></transform>{}</shape>'
@@ -88,7 +88,7 @@ def on_pane(*of_bsdf):
 
 
 AIMED = '<transform name="to_world"><lookat origin="1, 2, 3" target="0, 0, 0" up="0, 1, 0"/></transform>'
-# Mitsuba takes no colours above 1 here.
+# Mitsuba accepts no colours above 1 here.
 SIGMA = rgb("sigma_t", "0.125, 0.5, 1") + numbers(scale=4)
 SHEEN = numbers(sheen=0.5, sheen_tint=0.4)
 CASES = {
@@ -187,7 +187,7 @@ CASES = {
         rgb("albedo"),
         numbers(scale=1.5),
     ).replace('"homogeneous"', '"heterogeneous"'),
-    # Of one channel and of three, which shadow rays pass one after the other.
+    # Grids of one channel and of three, which shadow rays cross one after the other.
     "heterogeneous, of grids": filled(grid("sigma_t", "cloud"), grid("albedo", "tints"), numbers(scale=1.5)).replace(
         '"homogeneous"', '"heterogeneous"'
     )
@@ -272,7 +272,7 @@ def test_every_parameter_that_a_kind_declares_is_checked(scene_of):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("case", [case for case in CASES if case != "null"])  # which has no parameters
+@pytest.mark.parametrize("case", [case for case in CASES if case != "null"])  # it has no parameters
 def test_derivatives_are_those_of_differences(scene_of, case):
     scene = scene_of(case)
     names, values = checked(scene), pj.parameters(scene)
@@ -312,11 +312,11 @@ def test_derivatives_are_those_of_differences(scene_of, case):
 @pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
 def test_no_derivative_is_nan(scene_of, case):
-    """Of a million paths with the values of the scene, of fewer with each number at its bounds, and all at theirs."""
+    """For a million paths at the scene's values, and fewer with each scalar, or all parameters, at their bounds."""
     scene = scene_of(case)
     known, values = scene.about.parameters, pj.parameters(scene)
     names = [name for name in values if not known[name].moves_paths]
-    # What is below the least value that counts has no derivative.
+    # Values below `least` are treated as `least`, so they have no derivative.
     least = {name: max(known[name].bounds[0], np.nextafter(np.float32(known[name].least), np.inf)) for name in names}
     ends = {name: [least[name], known[name].bounds[1]] for name in names}
     ends |= {name: [least[name], LARGE_IOR] for name in names if known[name].bounds == (LEAST_IOR, np.inf)}
@@ -335,16 +335,16 @@ def test_no_derivative_is_nan(scene_of, case):
     assert not {str(each): found for each in (lowest, highest, *single) if (found := wrong(each, 64, 1))}
 
 
-# Mitsuba covers spots by no colour, and its blends of mirrors lose light, where the sum of two images does not.
+# Mitsuba's spot takes no colour as its texture, and its blend of a mirror loses light, unlike the sum of two images.
 ALIKE = [case for case in CASES if case not in ("spot, covered", "bitmap, in a weight")]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("case", ALIKE)
 def test_images_are_those_of_mitsuba(file_of, scene_of, mitsuba, estimate, agree, case):
-    """Where both are right all cases pass, but for once in 1000 runs.
+    """If both are right, all cases pass, except in one of 1000 runs.
 
-    Two programs tilt edges and contacts by the rounding that tests of whole images allow.
+    Rounding shifts edges and contacts between the two programs, which the tolerance allows for.
     """
     theirs = mitsuba(file_of(case), SPP, SEEDS)
     agree(estimate(scene_of(case), SPP, SEEDS), theirs, rounding=1e-3, false_alarm=1e-3 / len(ALIKE))

@@ -1,4 +1,4 @@
-"""What people fit is a parameter, wherever it stands, and J^T v knows it: against tangents and against closed forms."""
+"""Fields of bsdfs, lights, textures and meshes are parameters in J^T v: against tangents and against closed forms."""
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +12,7 @@ from pathjax.scene import parameters as named
 from pathjax.sensors.film import pixel_count
 
 SPP, SEED = 4, 3
-# Of pictures that shine on little of what is seen.
+# Samples per pixel, many since textured lights reach little of what is seen.
 MANY = 64
 
 
@@ -33,7 +33,7 @@ def picture(*shape, seed=0, high=0.9):
 
 
 def scene(dtype=jnp.float32, res=6, depth=4, **things):
-    """Of a camera and these things."""
+    """Return a scene of a camera and these objects."""
     view = {
         "type": "perspective",
         "fov": 50,
@@ -132,10 +132,10 @@ def colored():
 @pytest.mark.parametrize("strategy", ["mis", "light"])
 @pytest.mark.parametrize("things", [lit_by_pictures, mixed, masked, colored], ids=lambda each: each.__name__)
 def test_a_sweep_is_the_transpose_of_tangents(x64, things, strategy):
-    """Of every parameter in random directions, to the rounding of float64."""
+    """For every parameter, along random directions, to the rounding of float64."""
     with x64():
         made = scene(jnp.float64, **things())
-        # At the bounds of shares, too.
+        # Also with opacities and weights at their bounds.
         ends = {
             name: x for name, x in (("leaf.opacity", [[0, 1], [1, 0.5]]), ("thick.opacity", 1), ("inner.weight", 0))
         }
@@ -152,18 +152,18 @@ def test_a_sweep_is_the_transpose_of_tangents(x64, things, strategy):
                 terms = np.asarray(matrix_free.push(bare, {name: parameter}, {name: u}, *work)) * v
                 assert abs((pulled[name] * u).sum() - terms.sum()) <= 1e-12 * np.abs(terms).sum(), name
                 seen += bool(terms.any())
-            # Of weight 0, and on the lamp's back, nothing is seen.
+            # Nothing is seen of bsdfs of weight 0, nor on the lamp's back.
             assert seen > len(wanted) / 2
 
 
 def gradient(made, values):
-    """Of the image's sum."""
+    """Return the gradient of the image's sum."""
     return jax.grad(lambda values: pj.render(pj.with_parameters(made, values), SPP, SEED).sum())(values)
 
 
 @pytest.mark.slow
 def test_panes_dim_what_is_behind_them():
-    """Light of the sun passes two panes on its way to the floor, which the eye sees directly: I ~ (1 - a)(1 - b)."""
+    """Sunlight passes two panes on its way to the floor, which the camera sees directly: I ~ (1 - a)(1 - b)."""
     panes = [
         floor(
             seen_from_both_sides({"type": "mask", "id": f"pane{k}", "opacity": a, "inside": matte(f"in{k}", 0, 0, 0)}),
@@ -204,7 +204,7 @@ def test_what_stands_in_textures_and_meshes_is_listed_set_and_bounded():
     changed = pj.with_parameters(made, new)
     for name, value in new.items():
         np.testing.assert_allclose(pj.parameters(changed)[name], value, rtol=1e-6)
-    # Lights are chosen by the mean.
+    # The mean radiance, by which lights are chosen.
     (area,) = (lights for lights in changed.emitters if lights.lamps is not None)
     np.testing.assert_allclose(area.table.column("radiance").values, [[7, 7, 7]], rtol=1e-6)
     with pytest.raises(pj.InputError, match=r"metal.alpha .* outside its bounds \[0, 1\]"):

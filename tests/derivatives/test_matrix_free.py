@@ -22,7 +22,7 @@ from pathjax.sensors.film import pixel_count
 
 NO_LIMIT = 1 << 30
 RES, SPP = 8, 4
-# Of float32 sums of some thousand numbers, over the sum of their sizes.
+# Rounding error of float32 sums of some thousand scalars, relative to the sum of their magnitudes.
 ROUNDING = 3e-6
 
 
@@ -56,7 +56,7 @@ def picture(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def room(make_scene, picture):
-    """All that a path may meet: bitmaps of both filters, squares, a constant, metal, glass, a lamp and the sky."""
+    """Everything that a path may meet: bitmaps of both filters, squares, a constant, metal, glass, a lamp, the sky."""
 
     def make(**how):
         squares = (
@@ -94,7 +94,7 @@ def room(make_scene, picture):
 
 
 def parts(scene, spp=SPP, seed=3, strategy="mis", **how):
-    """Parameters that the sweep finds, and functions for J v and J^T v of them."""
+    """Return the parameters that the sweep handles, and functions that return J v and J^T v for them."""
     pixels = jnp.arange(pixel_count(scene.film), dtype=jnp.int32)
     wanted = {n: p for n, p in scene.about.parameters.items() if matrix_free.is_swept(scene, p)}
     work = pixels, 0, spp, seed, Options(strategy)
@@ -107,7 +107,7 @@ def parts(scene, spp=SPP, seed=3, strategy="mis", **how):
 
 
 def assert_transposed(scene, **how):
-    """Every entry of J^T v, from tangents that move one entry of a parameter in all channels at a time."""
+    """Assert that J^T v agrees with tangents, each of which moves one entry of a parameter in all channels."""
     wanted, push, pull = parts(scene, **how)
     v = np.random.default_rng(0).normal(size=(pixel_count(scene.film), 3)).astype(scene.camera.origin.dtype)
     pulled = pull(jnp.asarray(v))
@@ -143,7 +143,7 @@ def test_strategies_hidden_lights_and_float64(room, x64, how):
 
 @pytest.mark.slow
 def test_changes_of_texels_alone_are_those_beside_other_changes(room, monkeypatch):
-    """Alone and far they stand in the rows of the texels; among others in the list of all."""
+    """Alone and in far memory they lie in the rows of the texels; among others, in the list of all changes."""
     monkeypatch.setattr(forward, "NEAR", 0)
     scene = limited(room(), 4, 2)
     wanted, _, _ = parts(scene)
@@ -159,7 +159,7 @@ def test_changes_of_texels_alone_are_those_beside_other_changes(room, monkeypatc
 
 @pytest.mark.slow
 def test_the_jacobian_is_the_same(room):
-    """Through the public ways in: one number of each pixel's derivative, by the mean over pixels."""
+    """The public `jacobian`, contracted with v over the pixels, is J^T v of the sweep."""
     scene, names = limited(room(), 4, 2), ["ball.reflectance", "metal.k", "lamp.radiance"]
     wanted, push, pull = parts(scene)
     v = jnp.asarray(np.random.default_rng(1).normal(size=(RES * RES, 3)), jnp.float32)
@@ -173,7 +173,7 @@ def test_the_jacobian_is_the_same(room):
 
 @pytest.fixture(scope="module")
 def numbers(make_scene, tmp_path_factory):
-    """A scene of what is rough, mixed and cut out, a grey texture in the place of a colour, and a point light."""
+    """A scene of rough, blended and masked bsdfs, a grey texture in place of a colour, and a point light."""
     file = tmp_path_factory.mktemp("numbers") / "grey.png"
     Image.fromarray(np.random.default_rng(0).integers(60, 200, (2, 3), np.uint8)).save(file)
     grey = f'<string name="filename" value="{file}"/><boolean name="raw" value="true"/>'
@@ -199,7 +199,7 @@ def numbers(make_scene, tmp_path_factory):
 
 @pytest.mark.slow
 def test_a_jacobian_in_many_numbers_is_that_by_tangents(numbers, monkeypatch):
-    """And J^T v is that of a sweep of all entries in one list."""
+    """It also contracts to J^T v, which a sweep sums up in one list of all entries."""
     known = numbers.about.parameters
     names = [name for name in known if not known[name].moves_paths]
     constants, texels = ([name for name in names if known[name].is_texture == t] for t in (False, True))
@@ -220,7 +220,7 @@ def test_a_jacobian_in_many_numbers_is_that_by_tangents(numbers, monkeypatch):
 
 
 def test_the_program_of_a_jacobian_has_a_part_for_each_number_of_a_kind(numbers):
-    """Not of each bsdf: what it costs to compile does not grow with the number of bsdfs."""
+    """It has no part per bsdf, so the cost of compiling does not grow with the number of bsdfs."""
     fields = "base_color", "roughness", "metallic", "sheen"
 
     def equations(*bsdfs):
@@ -233,7 +233,7 @@ def test_the_program_of_a_jacobian_has_a_part_for_each_number_of_a_kind(numbers)
 
 
 def patches(count, res):
-    """A wall of squares, each of a material of its own, and a lamp before it."""
+    """Return a wall of squares, each with its own material, and a lamp in front of it; and the resolution."""
     wall = "".join(
         f'<shape type="rectangle"><transform name="to_world"><scale value="0.1"/>'
         f'<translate x="{0.2 * (i % 3) - 0.2}" y="{0.2 * (i // 3) - 0.3}"/></transform>'
@@ -247,8 +247,8 @@ def patches(count, res):
 
 @pytest.mark.slow
 def test_a_jacobian_in_many_colours_is_that_by_tangents(make_scene, monkeypatch):
-    """A recorded sweep gives it; so on every number of devices, and under vmap one call after another."""
-    inside, res = patches(jacobian.MOST_TANGENTS + 3, 23)  # more pixels than two groups of lanes
+    """A recorded sweep computes it, bit for bit alike on any number of devices and, call by call, under vmap."""
+    inside, res = patches(jacobian.MOST_TANGENTS + 3, 23)  # more pixels than two groups of lanes hold
     scene = limited(make_scene(inside, res=res, origin="0, 0, 2", fov=30), 6, 2)
     names = list(pj.parameters(scene))
     swept = pj.jacobian(scene, names, SPP, 3)
@@ -273,12 +273,12 @@ def test_a_jacobian_in_many_colours_is_that_by_tangents(make_scene, monkeypatch)
     assert set(swept[1]) == set(by_tangents[1])
     images = [(swept[0], by_tangents[0]), *((swept[1][name], by_tangents[1][name]) for name in names)]
     for one, other in images:
-        # Of float32 sums of some tens of numbers of one sign.
+        # Rounding of float32 sums of some tens of scalars of one sign.
         np.testing.assert_allclose(one, other, rtol=3e-6, atol=3e-6 * np.abs(other).max())
 
 
 def test_an_image_pulled_back_to_a_few_colours(make_scene):
-    """Too many for tangents, and few enough for a Jacobian, within a user's own jit."""
+    """There are too many for tangents, and so few that each lane sums by itself; within a user's own jit."""
     inside, res = patches(jacobian.MOST_TANGENTS, 8)
     scene = limited(make_scene(inside, res=res, origin="0, 0, 2", fov=30), 3, 2)
     values = {name: jnp.asarray(value) for name, value in pj.parameters(scene).items()}
@@ -297,7 +297,7 @@ def test_an_image_pulled_back_to_a_few_colours(make_scene):
 
 @pytest.mark.parametrize("near", [0, 1 << 30])
 def test_lanes_add_to_a_list_that_is_far_as_to_one_that_is_near(monkeypatch, near):
-    """Several lanes to the same places, some nothing; the list may hold what is not finite."""
+    """Several lanes add to the same places and some add nothing; the list may hold values that are not finite."""
     monkeypatch.setattr(totals, "NEAR", near)
     random = np.random.default_rng(4)
     places = random.integers(0, 50, (4, 64)).astype(np.int32)
@@ -318,7 +318,7 @@ def test_lanes_add_to_a_list_that_is_far_as_to_one_that_is_near(monkeypatch, nea
 def test_sums_are_bitwise_the_same_on_any_number_of_devices(room, monkeypatch):
     monkeypatch.setattr(mapping, "ITEMS_OF_A_PART", 16)  # four parts of an image
     scene, v = limited(room(), 6, 3), jnp.ones((RES * RES, 3))
-    backward.pullback.clear_cache()  # of other parts
+    backward.pullback.clear_cache()  # its kernels have parts of another size
     one, many = (parts(scene, devices=devices)[2](v) for devices in (1, None))
     for name in one:
         np.testing.assert_array_equal(one[name], many[name])
@@ -326,7 +326,7 @@ def test_sums_are_bitwise_the_same_on_any_number_of_devices(room, monkeypatch):
 
 @pytest.fixture(scope="module")
 def screen(make_scene, picture):
-    """A bitmap that fills the view, under radiance 1: a pixel is a share of its texels, sample by sample."""
+    """A bitmap that fills the view under radiance 1, so that each sample is a weighted mean of its texels."""
     inside = diffuse("screen", texture(picture(4, 4)))
     return make_scene(
         f'<shape type="rectangle">{inside}</shape><emitter type="constant"/>', res=RES, fov=28.0724869, depth=2
@@ -353,7 +353,7 @@ def test_a_bitmap_is_a_parameter(screen):
 
 
 def test_transformations_of_a_linear_image(screen):
-    """I = J texels, for J v, J^T v and all that JAX makes of them, within jit."""
+    """I = J texels holds for J v, J^T v and JAX's transformations of them, also within jit."""
     texels, image = pj.parameters(screen)[NAME], image_of(screen)
     v = jnp.asarray(np.random.default_rng(2).normal(size=(RES, RES, 3)), jnp.float32)
     value, linear = jax.linearize(image, texels)
@@ -367,7 +367,7 @@ def test_transformations_of_a_linear_image(screen):
 
 
 def test_jacobians_in_textures(make_scene, picture):
-    """The texels alone that are asked for are kept, beside a colour, of two textures that lie in one array."""
+    """Of two textures in one array, only the texels of the requested one are kept, beside a colour."""
     turned = '<scale value="{}"/><rotate y="1" angle="{}"/><translate x="{}" z="{}"/>'
     inside = "".join(
         f'<shape type="rectangle"><transform name="to_world">{turned.format(*place)}</transform>'
@@ -390,7 +390,7 @@ def test_jacobians_in_textures(make_scene, picture):
         sizes = np.abs(terms).sum((0, 1)) + np.finfo(np.float32).tiny
         assert (np.abs(np.tensordot(v, terms, 2) - found) <= ROUNDING * sizes).all(), name
         assert (np.abs(np.asarray(found)) > 0).any()
-    assert len(J.derivatives.rows.all()) == 5 * 4 + 1 + 1  # and one for what is not asked for
+    assert len(J.derivatives.rows.all()) == 5 * 4 + 1 + 1  # the last row collects all that is not requested
 
     normal = pj.normal_equations(scene, names, image, spp=SPP, seed=3)
     assert normal.matrix.shape == (63, 63) and normal.components[0] == "right.reflectance[0, 0].r"
@@ -405,9 +405,9 @@ def alpha(file):
 
 @pytest.mark.slow
 def test_textures_that_are_not_asked_for_take_no_part(make_scene, picture):
-    """Of a texture in the place of a reflectance, those that are roughnesses or colours of a board are not recorded.
+    """For a texture of reflectances, textures of roughnesses or of a checkerboard's colours are not recorded.
 
-    A Jacobian takes roughnesses as numbers, though they are the luminance of colours.
+    A Jacobian treats roughnesses as scalars, though they are the luminance of colours.
     """
     board = f'<texture type="checkerboard" name="reflectance">{rgb("color0", "0.2, 0.5, 0.7")}</texture>'
     bsdfs = diffuse("wall", texture(picture(2, 3))), diffuse("board", board), alpha(picture(3, 3))
@@ -427,7 +427,7 @@ def test_textures_that_are_not_asked_for_take_no_part(make_scene, picture):
     assert (slots("rough.alpha").of_bsdfs, slots("rough.alpha").colors) == (1, 0)
     assert slots("wall.reflectance", "rough.alpha").of_bsdfs == 2
     board = next(name for name in known if name.endswith("color0"))
-    assert slots(board).of_bsdfs == 2  # which may stand anywhere
+    assert slots(board).of_bsdfs == 2  # a checkerboard's colour may stand in any field
     everything = [name for name in known if matrix_free.is_swept(scene, known[name])]
     pulled = {}
     for names in (everything, *([name] for name in everything)):
@@ -437,7 +437,7 @@ def test_textures_that_are_not_asked_for_take_no_part(make_scene, picture):
         for name, x in found.items():
             first = pulled.setdefault(name, x)
             np.testing.assert_allclose(x, first, rtol=1e-5, atol=1e-6 * np.abs(first).max())
-    assert not jacobian.has_rows(scene, [known[board]])  # which may stand for a number
+    assert not jacobian.has_rows(scene, [known[board]])  # it may stand for a scalar
     image, J = pj.jacobian(scene, ["wall.reflectance", "rough.alpha"], SPP, 3)
     for name in J:
         terms = np.asarray(J[name], float)
@@ -474,9 +474,9 @@ def test_what_takes_a_derivative_of_each_number_refuses_textures_that_it_cannot_
 @pytest.mark.slow
 @pytest.mark.parametrize(("ring", "lost"), [(1, True), (2, False)])
 def test_a_path_longer_than_the_ring_is_told(screen, monkeypatch, ring, lost):
-    """Rather nan than a derivative that lacks something, where max_depth is known to the compiled kernel alone.
+    """Derivatives are NaN rather than incomplete, where max_depth is traced and so known only to the compiled kernel.
 
-    Paths have two vertices, and each trip is swept.
+    Paths have two vertices, and every trip is swept.
     """
     texels = pj.parameters(screen)[NAME]
     monkeypatch.setattr(backward, "RING", ring)
@@ -493,9 +493,9 @@ def test_a_path_longer_than_the_ring_is_told(screen, monkeypatch, ring, lost):
 @pytest.mark.slow
 @pytest.mark.parametrize("shape", [(2, 2, 3), (3,)])
 def test_paths_of_any_length_are_recorded_whole(make_scene, picture, shape):
-    """Within a closed sphere that shines, I = (1 - rho^d) / (1 - rho) of each sample.
+    """In a closed sphere that emits 1, every sample is I = (1 - rho^d) / (1 - rho).
 
-    Of a colour too, where there are more of them than get a tangent each.
+    Also for a colour, among more parameters than get a tangent each.
     """
     depth, rho = 3000, 0.999
     wall = diffuse("wall", texture(picture(2, 2)) if len(shape) == 3 else rgb("reflectance", "0.5"))
@@ -509,7 +509,7 @@ def test_paths_of_any_length_are_recorded_whole(make_scene, picture, shape):
     found = jax.grad(lambda x: pj.render(pj.with_parameters(scene, x), 1, 0, "bsdf").sum())(values)["wall.reflectance"]
     assert len(values) in (1, jacobian.MOST_TANGENTS + 1)
     expected = (1 - rho**depth - depth * rho ** (depth - 1) * (1 - rho)) / (1 - rho) ** 2
-    # Sums of thousands of float32 numbers of one sign.
+    # Sums of thousands of float32 scalars of one sign.
     np.testing.assert_allclose(found.reshape(-1, 3).sum(0), 4 * expected, rtol=1e-3)
 
 

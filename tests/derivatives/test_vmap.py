@@ -1,4 +1,4 @@
-"""The form for accelerators gives what lanes give, up to rounding: images, J in colours and in glass, J v and J^T v."""
+"""The form for accelerators agrees with lanes up to rounding: images, J, J v, J^T v, output variables, ray queries."""
 
 from functools import partial
 
@@ -89,7 +89,7 @@ def test_the_form_for_accelerators_gives_what_lanes_give(shipped, kernel, name, 
     )
     assert lanes and any(np.any(x) for x in lanes)
     for a, b in zip(lanes, vmap, strict=True):
-        # Rounding turns single paths another way: in a pixel or two.
+        # Rounding sends single paths another way, which changes a pixel or two.
         scale = np.abs(np.asarray(a, float)).max()
         differs = ~np.isclose(np.asarray(a, float), np.asarray(b, float), rtol=1e-3, atol=1e-4 * scale)
         assert differs.mean() < 0.02, (differs.mean(), scale)
