@@ -33,7 +33,7 @@ AROUND = """<shape type="rectangle"><transform name="to_world"><rotate x="1" ang
   <emitter type="area" id="around-light">
   <rgb name="radiance" value="{}"/></emitter></shape>
   <emitter type="constant" id="around-sky"><rgb name="radiance" value="{}"/></emitter>"""
-# Roughness shows best under LAMP, which is little but its lamp; smooth surfaces are noisy in that light.
+# Roughness shows best under LAMP, whose sky is dark; smooth surfaces are noisy in its light.
 LIGHT, LAMP = AROUND.format("4, 3, 2", "0.4, 0.5, 0.6"), AROUND.format("20, 16, 12", "0.1, 0.15, 0.2")
 BALL = '<shape type="sphere"><float name="radius" value="0.9"/>{}</shape>'
 PANE = '<shape type="rectangle"><transform name="to_world"><rotate y="1" angle="25"/></transform>{}</shape>'

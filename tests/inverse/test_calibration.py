@@ -1,4 +1,4 @@
-"""Errors that fits of many numbers state are as large as those that they make."""
+"""Standard errors that fits of many scalars state are as large as the errors that they make."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ from pathjax.inverse.dense import Dense, Equations, least_within
 
 
 def fitted(scene, name, start, spp, **how):
-    """The fit of a render of another seed, the truth, and errors over stated errors of what is seen."""
+    """Return the fit to a render of another seed, the truth, and error / standard error of the seen values."""
     truth = np.asarray(pj.parameters(scene)[name])
     target = np.asarray(pj.render(scene, 1024, seed=5))
     fit = pj.fit(scene, target, [name], start={name: np.full(truth.shape, start)}, spp=spp, **how)
@@ -19,7 +19,7 @@ def fitted(scene, name, start, spp, **how):
 
 
 def assert_calibrated(ratios, least, most):
-    """Of n independent ratios the root mean square is 1 +- 1/sqrt(2 n); neighbours are a third as many."""
+    """Assert the root mean square, 1 +- 1/sqrt(2 n) for n independent ratios; neighbours count as a third as many."""
     deviation = 1 / np.sqrt(2 * len(ratios) / 3)
     rms = np.sqrt(np.mean(ratios**2))
     assert least - 4 * deviation < rms < most + 4 * deviation, rms
@@ -48,7 +48,7 @@ def test_errors_of_an_environment_map_seen_in_two_balls_are_as_stated():
     # Noise of single pixels is known to 20 %.
     assert_calibrated(ratios, 0.8, 1.25)
     assert np.mean(np.abs(ratios) > 3) < 0.03
-    # Texels of which no pixel knows are named: those that the balls and the camera leave out.
+    # Texels that neither the balls nor the camera show are reported as unseen.
     assert not fit.seen["sky.radiance"].all()
 
 
@@ -86,9 +86,9 @@ def test_errors_of_the_colours_of_vertices_are_as_stated():
 @pytest.mark.slow
 @pytest.mark.parametrize("smoothness", [0.03, "auto"])
 def test_errors_of_texels_smaller_than_pixels_are_as_stated(smoothness):
-    """Six to a pixel, of a texture that is drawn from the prior. Noise of J knows them apart, which no pixel does."""
+    """Six texels per pixel, drawn from the prior. The noise of J tells them apart, though no pixel does."""
     side, random = 48, np.random.default_rng(7)
-    rate = 2 - 2 * np.cos(np.pi * np.arange(side) / side)  # squares of differences of the cosines that follow
+    rate = 2 - 2 * np.cos(np.pi * np.arange(side) / side)  # squared differences of neighbours in cosine waves
     links = 2 * side * (side - 1) / (side**2 - 1)
     rate = (rate[:, None] + rate) / (links * 0.03**2)
     waves = random.normal(size=(side, side, 3)) / np.sqrt(np.where(rate > 0, rate, np.inf))[..., None]
@@ -114,7 +114,7 @@ def test_errors_of_texels_smaller_than_pixels_are_as_stated(smoothness):
 
 
 def picture(kind, side=64):
-    """Texels (side, side, 3), that are no draw of the prior."""
+    """Return texels (side, side, 3) that are not drawn from the prior."""
     random = np.random.default_rng(1)
     y, x = (np.mgrid[:side, :side] + 0.5) / side
     smooth = ndimage.gaussian_filter(random.normal(size=(side, side, 3)), (side / 10, side / 10, 0), mode="wrap")
@@ -135,7 +135,7 @@ def picture(kind, side=64):
     "kind, least", [("noise", 0.7), ("edges", 0.7), ("spots", 0.7), ("smooth", 0.0), ("constant", 0.0)]
 )
 def test_errors_of_pictures_are_as_stated(kind, least):
-    """Seen at a slant, by conjugate gradients. What is smoother than edges may be better known than is stated."""
+    """Seen at a slant, fitted by conjugate gradients. Textures smoother than edges may be known better than stated."""
     texels = picture(kind)
     film = {"type": "hdrfilm", "width": 48, "height": 48, "rfilter": {"type": "box"}}
     camera = pj.Transform().look_at(origin=[0, 2, 3], target=[0, 0, 0], up=[0, 1, 0])
@@ -166,9 +166,9 @@ def test_errors_of_pictures_are_as_stated(kind, least):
 
 @pytest.mark.parametrize("spread", [1, 1e-4])
 def test_a_step_ends_where_the_quadratic_is_least_within_bounds(spread):
-    """Texels that are strongly correlated, of which many end at a bound: others make up for what it keeps one from.
+    """Texels are strongly correlated and many end at a bound, for which the others compensate.
 
-    spread: how well the last pixel knows them, over the first.
+    spread: sensitivity of the last pixel to the texels, relative to the first.
     """
     random, count = np.random.default_rng(4), 60
     J = (random.uniform(size=(80, count)) + 2) * np.geomspace(1, spread, 80)[:, None]
@@ -176,21 +176,21 @@ def test_a_step_ends_where_the_quadratic_is_least_within_bounds(spread):
     start = np.clip(wanted, 0, 1)
     found, free = least_within(matrix, matrix @ (start - wanted), start, np.zeros(count), np.ones(count))
     slope, rounding = matrix @ (found - wanted), 1e-9 * np.abs(matrix) @ np.abs(found - wanted)
-    # Nothing draws those that are free, and the others are drawn beyond their bounds.
+    # The slope vanishes for free values, and draws the others beyond their bounds.
     assert (free == ((found > 0) & (found < 1))).all() and free.mean() < 0.75
     assert (np.abs(slope[free]) < rounding[free]).all()
     assert (slope[found == 0] > 0).all() and (slope[found == 1] < 0).all()
 
 
 def test_errors_of_linear_equations_are_those_of_many_repetitions():
-    """Pixels of unequal noise, of which some weigh less than they should: the errors of what is done all the same."""
+    """Pixels have unequal noise and some weigh less than they should; stated errors are those of this weighting."""
     random = np.random.default_rng(3)
     J, deviation, trust = random.uniform(size=(40, 6)), random.uniform(0.5, 2, 40), random.uniform(0.1, 1, 40)
     weights, P = trust / deviation**2, 4 * np.eye(6)
     matrix, scatter = J.T @ (weights[:, None] * J), J.T @ ((trust * weights)[:, None] * J)
     search = object.__new__(Dense)
     of_channels = [np.stack([x] * 3) for x in (matrix, scatter)]
-    none = np.zeros((3, 6, 1))  # of noise of J
+    none = np.zeros((3, 6, 1))  # no noise of J
     found = Equations(of_channels[0], np.zeros((6, 3)), np.full((6, 3), np.inf), none, of_channels[1])
     search.sums, search.prior_matrix, search.samples, search.sharp = lambda variance: found, P, 8, 8
     search.prior, search.missing = type("Prior", (), {"scale": np.full(18, 10.0)}), deviation[:, None] ** 2
@@ -198,5 +198,5 @@ def test_errors_of_linear_equations_are_those_of_many_repetitions():
     truth = random.normal(size=(6, 20000)) / 2
     pixels = J @ truth + deviation[:, None] * random.normal(size=(40, 20000))
     errors = linalg.solve(matrix + P, J.T @ (weights[:, None] * pixels)) - truth
-    # 20000 repetitions tell a standard deviation to 0.5 %.
+    # 20000 repetitions determine a standard deviation to 0.5 %.
     np.testing.assert_allclose(search.standard_errors.reshape(6, 3)[:, 0], errors.std(1), rtol=0.025)

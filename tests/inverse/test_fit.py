@@ -1,4 +1,4 @@
-"""Parameters from images: recovery, bounds, what is not determined, views, solvers, interruptions, bad input."""
+"""Fits to images: recovery, bounds, undetermined parameters, views, solvers, interruptions, bad input."""
 
 import contextlib
 import functools
@@ -41,19 +41,19 @@ def target_image(room):
     return np.asarray(pj.render(room, 1024, seed=1))
 
 
-# Not of the module, so that tests of both kinds follow each other, and share what is compiled.
+# Not scoped to the module, so that tests of both kinds follow each other and share compiled programs.
 @pytest.fixture(params=["exr", "png"])
 def kind(request):
     return request.param
 
 
-# A target of each kind has a program of its own; what does not depend on it is quickly tested with one.
+# Each kind of target has its own program; tests that do not depend on the kind use only one in quick runs.
 EXR_FIRST = pytest.mark.parametrize("kind", ["exr", pytest.param("png", marks=pytest.mark.slow)], indirect=True)
 PNG_FIRST = pytest.mark.parametrize("kind", [pytest.param("exr", marks=pytest.mark.slow), "png"], indirect=True)
 
 
 def stored(image, path):
-    """The target that is read back from a file of the kind that its name says."""
+    """Write an image to a file of the kind that its suffix says; return the target read back."""
     image = np.asarray(image)
     if path.suffix == ".exr":
         write_exr(path, {name: image[..., i] for i, name in enumerate("RGB")}, {})
@@ -93,7 +93,7 @@ def test_radiances_are_recovered_in_any_unit(room, target_image, power):
     fit = pj.fit(scaled, target_image * np.float32(scale), ["sky.radiance"], spp=32)
     assert fit.converged, fit.message
     z = (fit.values["sky.radiance"] / scale - [1, 0.9, 0.8]) / (fit.standard_errors["sky.radiance"] / scale)
-    assert np.abs(z).max() < 4  # three numbers: a false alarm in 5000 runs
+    assert np.abs(z).max() < 4  # three values: a false alarm in 5000 runs
 
 
 @pytest.fixture(scope="module")
@@ -119,7 +119,7 @@ def z_scores(fit, truth):
 def test_albedos_are_recovered_within_their_errors(fitted, room):
     z = z_scores(fitted, pj.parameters(room))
     assert fitted.converged and not fitted.undetermined and not fitted.at_bound
-    # 6 numbers beyond 4.5 sigma by chance: 4e-5.
+    # One of 6 values lies beyond 4.5 sigma with a probability of 4e-5.
     assert np.abs(z).max() < 4.5
     errors = np.concatenate([fitted.standard_errors[n] for n in NAMES])
     assert (errors < 3e-3).all()
@@ -137,8 +137,8 @@ def test_the_fit_tells_its_history_and_its_scene(fitted, room):
 
 @pytest.mark.slow
 def test_stated_errors_match_the_errors_made(room, store):
-    """20 seeds and targets, 6 numbers: the mean square of z is known to 0.13 if all are independent, 0.3 if channels
-    are one."""
+    """20 seeds and targets, 6 scalars: the mean square of z is known to 0.13 if all are independent, to 0.3 if only the
+    seeds are."""
     z = []
     for seed in range(20):
         target = store(pj.render(room, 256, seed=100 + seed))
@@ -154,12 +154,12 @@ def test_values_at_their_bounds_are_reached_and_told(room, store):
     for name, value in truth.items():
         assert (np.abs(fit.values[name] - value) < 5 * fit.standard_errors[name] + 1e-4).all()
         assert (fit.values[name] >= 0).all() and (fit.values[name] <= 1).all()
-    # Half of those that lie at a bound are pushed beyond it by noise.
+    # Noise pushes half of the values at a bound beyond it.
     assert set(fit.at_bound) <= {f"{n}.{c}" for n in NAMES for c in "rgb"} - {"floor.reflectance.g"}
 
 
 def test_what_images_do_not_determine_is_named(make_scene):
-    """One bounce in the corner, under a sky out of view: only the product of its radiance and the albedo shows."""
+    """One bounce in the corner, with the sky out of view: only the product of its radiance and the albedo shows."""
     scene = make_scene(ROOM, res=16, depth=2, origin="0, 0.5, 0.5", target="0, -1, -1", fov=40)
     target = np.asarray(pj.render(scene, 256, seed=1))
     fit = pj.fit(scene, target, ["sky.radiance", *NAMES], start={"sky.radiance": 0.5, **START}, spp=32)
@@ -167,7 +167,7 @@ def test_what_images_do_not_determine_is_named(make_scene):
     assert len(fit.undetermined) == 3
     assert all(any(name.startswith("sky.radiance") for name in d) for d in fit.undetermined)
     assert all(np.isinf(e).all() for e in fit.standard_errors.values())
-    # The image is fitted all the same: what is left is noise.
+    # The image is fitted all the same: the residual is noise.
     assert fit.converged
     assert "not determined" in report.text(fit)
     json_text(report.facts(fit))
@@ -189,7 +189,7 @@ def test_views_share_parameters_and_know_more_together(write_scene, room, target
     both = pj.fit([room, other], [target, np.asarray(pj.render(other, 1024, seed=2))], NAMES, start=START, spp=32)
     assert both.converged and len(both.images) == len(both.scenes) == 2
     assert np.abs(z_scores(both, pj.parameters(room))).max() < 4.5
-    # In the mean, and well: one pixel at an edge may dominate a stated error, or the determinant of all.
+    # The mean, and clearly lower: one pixel at an edge may dominate a single stated error, or the determinant.
     ratios = np.log([both.standard_errors[n] / fitted.standard_errors[n] for n in NAMES])
     assert np.exp(ratios.mean()) < 0.95
 
@@ -214,7 +214,7 @@ def test_a_second_fit_of_the_problem_does_not_compile(make_scene, room, target_i
     before = compilations.count
     fits += [pj.fit(scene, target_image, NAMES, start=START, spp=32, seed=5) for scene in (room, other)]
     assert compilations.count == before
-    assert all(fit.compile_seconds < 0.1 * fit.run_seconds for fit in fits[1:])  # which reads what is kept
+    assert all(fit.compile_seconds < 0.1 * fit.run_seconds for fit in fits[1:])  # programs are reused
     first, second, same = (np.concatenate([fit.values[name] for name in NAMES]).tolist() for fit in fits)
     assert first != second == same
 
@@ -225,7 +225,7 @@ def test_programs_are_shared_by_solvers_that_are_the_same_and_by_no_others():
 
     assert identity(solver()) == identity(solver())
     assert hash(identity(solver())) == hash(identity(solver()))
-    arrays = [np.zeros(2000), np.r_[np.zeros(1000), 1, np.zeros(999)]]  # of which numpy abbreviates the middle
+    arrays = [np.zeros(2000), np.r_[np.zeros(1000), 1, np.zeros(999)]]  # numpy's repr omits the middle
     norms = [lambda x: optx.max_norm(x), lambda x: optx.max_norm(x)]
     others = [
         solver(2e-4),
@@ -247,7 +247,7 @@ def test_an_interrupted_fit_returns_what_it_has(room, target):
 
     fit = pj.fit(room, target, NAMES, start=START, spp=32, progress=stop)
     assert not fit.converged and fit.message == "interrupted"
-    # It was near already.
+    # It was already near the truth.
     assert all(np.abs(fit.values[n] - pj.parameters(room)[n]).max() < 0.05 for n in NAMES)
     report.text(fit), json_text(report.facts(fit))
 
@@ -273,14 +273,14 @@ def test_a_scene_without_noise_is_fitted_to_rounding(make_scene, start):
 
 
 def test_what_a_file_rounds_in_a_scene_without_noise_is_in_the_errors(make_scene, tmp_path):
-    """All pixels are rounded alike, by up to half a step; 48 values do not know more than 3."""
+    """All pixels are rounded alike, by up to half a step, so 48 values tell no more than 3 do."""
     lamp = '<emitter type="area" id="lamp"><rgb name="radiance" value="0.2, 0.5, 0.8"/></emitter>'
     scene = make_scene(f'<shape type="rectangle">{lamp}</shape>', res=4, depth=1, fov=20)
     write_png(tmp_path / "a.png", np.broadcast_to([0.2, 0.5, 0.8], (4, 4, 3)))
     fit = pj.fit(scene, pj.read_target(tmp_path / "a.png"), ["lamp.radiance"], start={"lamp.radiance": 1.0})
     assert fit.converged
     errors = fit.standard_errors["lamp.radiance"]
-    # Uniform over a step: never beyond sqrt(3) standard errors.
+    # The error is uniform over a step: never beyond sqrt(3) standard errors.
     assert (np.abs(fit.values["lamp.radiance"] - [0.2, 0.5, 0.8]) < 1.8 * errors).all()
     assert (errors < 4e-3).all()
 
@@ -307,7 +307,7 @@ def cornell_image(cornell):
 
 
 def test_a_clipped_sky_does_not_move_the_answer(room, tmp_path):
-    """Where it is told; of an array nothing is known: the sky seems to be 1, and no albedo makes it so."""
+    """A target from a file knows what is clipped; in an array the sky seems to be 1, and no albedo makes it so."""
     bright = pj.with_parameters(room, {"sky.radiance": 3 * pj.parameters(room)["sky.radiance"]})
     target = stored(pj.render(bright, 1024, seed=7), tmp_path / "a.png")
     fit = pj.fit(bright, target, NAMES, start=START, spp=32)
@@ -324,14 +324,14 @@ def test_a_lamp_that_is_clipped_does_not_move_the_answer(cornell, cornell_image,
     target = store(cornell_image)
     fit = pj.fit(cornell, target, list(WHITE), start=WHITE)
     assert fit.converged
-    # 3 numbers beyond 4.5 sigma by chance: 2e-5.
+    # One of 3 values lies beyond 4.5 sigma with a probability of 2e-5.
     assert np.abs(z_scores(fit, pj.parameters(cornell))).max() < 4.5
     assert (fit.standard_errors["white.reflectance"] < 2e-3).all()
 
 
 @pytest.mark.slow
 def test_a_clipped_image_of_which_nothing_is_known_is_told(cornell, cornell_image, tmp_path):
-    """The same image as an array: the lamp seems to be 1, and no white makes it so."""
+    """The same image as an array: the lamp seems to be 1, and no reflectance of white makes it so."""
     write_png(tmp_path / "a.png", cornell_image)
     fit = pj.fit(cornell, read_rgb(tmp_path / "a.png"), list(WHITE), start=WHITE)
     assert np.abs(fit.values["white.reflectance"] - pj.parameters(cornell)["white.reflectance"]).max() > 0.1
@@ -339,7 +339,7 @@ def test_a_clipped_image_of_which_nothing_is_known_is_told(cornell, cornell_imag
 
 
 def test_a_clipped_pixel_says_that_no_darker_image_fits(room, target_image):
-    """Only the floor is measured, and the rest is brighter than the scene can be."""
+    """Only the floor is below the clipping level, and the rest is brighter than the scene can be."""
     image = np.where(np.arange(16)[:, None, None] < 10, 2.0, target_image)
     fit = pj.fit(room, pj.Target(image, ceiling=1.5), NAMES, start=START, spp=32)
     assert not fit.converged and "structure" in fit.message
@@ -347,8 +347,8 @@ def test_a_clipped_pixel_says_that_no_darker_image_fits(room, target_image):
 
 @pytest.mark.parametrize("margin", [weights.CLIP_MARGIN, pytest.param(0, marks=pytest.mark.xfail(strict=True))])
 def test_noise_that_is_clipped_does_not_move_the_answer(room, monkeypatch, margin):
-    """Targets of 16 spp, the brightest 5 % clipped. Where pixels are left out for their own noise, the mean z of
-    12 fits is far off; else it is known to 0.3, and one of 6 lies beyond 1.3 with a chance of 4e-5."""
+    """Targets of 16 spp, the brightest 5 % clipped. If pixels are left out because of their own noise, the mean z of
+    12 fits is far off; otherwise it is known to 0.3, and one of 6 lies beyond 1.3 with a probability of 4e-5."""
     monkeypatch.setattr(weights, "CLIP_MARGIN", margin)
     truth, z = pj.parameters(room), []
     for seed in range(12):
@@ -376,7 +376,7 @@ def test_pixels_that_are_left_out_may_hold_anything(room, target_image):
 
 @pytest.fixture(scope="module")
 def ball(shipped):
-    return shipped("glass_ball", res=64)  # as in the README, whose programs these fits share
+    return shipped("glass_ball", res=64)  # as in the README, so that fits share its programs
 
 
 @pytest.fixture(scope="module")
@@ -419,7 +419,7 @@ METAL = ["metal.alpha", "metal.specular_reflectance"]
 
 @pytest.fixture(scope="module")
 def rough_ball(write_scene, tmp_path_factory):
-    """A file: a rough ball in a grey room with windows."""
+    """The file of a scene: a rough ball under an environment map of a grey room with windows."""
     sky = np.full((16, 32, 3), 0.4, np.float32)
     sky[3:7, 2:5], sky[4:8, 10:13], sky[9:13, 27:30] = (4, 5, 6), (6, 5, 4), (2, 4, 2)
     file = tmp_path_factory.mktemp("sky") / "sky.exr"
@@ -441,7 +441,7 @@ def test_roughness_and_colour_are_recovered_from_a_target_of_mitsuba(rough_ball)
         for color in (0.4, 0.95):
             fit = pj.fit(scene, target, METAL, start=dict(zip(METAL, (alpha, color), strict=True)), spp=64)
             assert fit.converged, fit.message
-            # 4 numbers, the same ones from all starts, beyond 3.5 sigma by chance: 2e-3.
+            # One of 4 values, the same from all starts, lies beyond 3.5 sigma with a probability of 2e-3.
             assert np.abs(z_scores(fit, truth)).max() < 3.5
             assert all((fit.standard_errors[name] < 0.02 * truth[name]).all() for name in METAL)
 

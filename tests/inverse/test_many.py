@@ -1,4 +1,4 @@
-"""Textures from images: recovery within stated errors, texels that no pixel sees, what is supposed, bad input."""
+"""Fits of textures: recovery within stated errors, texels that no pixel sees, the prior, bad input."""
 
 from functools import partial
 from types import SimpleNamespace
@@ -27,7 +27,7 @@ SIZE = 16
 
 @pytest.fixture(scope="module")
 def wall(make_scene, tmp_path_factory):
-    """A textured square before a lamp, whose left part is in view."""
+    """A textured square in front of a lamp; the left part of the square is in view."""
     file = tmp_path_factory.mktemp("pictures") / "wall.exr"
     numbers = np.random.default_rng(1).uniform(0.2, 0.8, (3, SIZE, SIZE)).astype(np.float32)
     write_exr(file, dict(zip("RGB", numbers, strict=True)), {})
@@ -70,7 +70,7 @@ def test_a_texture_is_recovered_within_its_errors(fit, truth):
     error, stated = fit.values[NAME] - truth, fit.standard_errors[NAME]
     known = stated < 0.1
     assert known.mean() > 0.3
-    # Stated errors are uncertain by 10 to 20 %, and hundreds of texels leave 3 %.
+    # Stated errors are uncertain by 10 to 20 %; chance adds 3 % for hundreds of texels.
     assert 0.7 < np.sqrt(np.mean((error / stated)[known] ** 2)) < 1.4
     assert np.sqrt(np.mean(error[stated < 0.02] ** 2)) < 0.025
 
@@ -79,8 +79,8 @@ def test_a_texture_is_recovered_within_its_errors(fit, truth):
 def test_texels_that_no_pixel_sees_are_named_and_keep_their_start(fit):
     seen = fit.seen[NAME]
     assert seen.shape == (SIZE, SIZE)
-    # The square reaches from -0.5 to 1.5, and the picture to tan(14 degrees) 4 = 1: to the twelfth texel, and at the
-    # other end, where the texture repeats, the last one.
+    # The square reaches from -0.5 to 1.5, and the view to tan(14 degrees) 4 = 1: to the twelfth texel and, at the other
+    # end, where the texture repeats, the last one.
     assert not seen[:, 13:15].any() and seen[:, :12].all()
     assert np.isinf(fit.standard_errors[NAME][:, 13:15]).all()
     assert np.abs(fit.values[NAME][:, 13:15] - 0.5).max() < 0.05
@@ -170,17 +170,17 @@ def test_the_precision_of_a_prior_is_that_of_its_gradient_diagonal_and_draws(kin
     prior = Prior(texture(3, 4), np.full(36, 0.5), 0.2, kind)
     prior.estimate(np.random.default_rng(4).uniform(size=36), np.zeros(36), np.ones(36), {})
     P = matrix(prior)
-    rounding = 1e-12 * np.diag(P).max()  # of sums of waves, where they cancel
+    rounding = 1e-12 * np.diag(P).max()  # where sums of waves cancel
     np.testing.assert_allclose(P, P.T, atol=rounding)
     np.testing.assert_allclose(np.diag(P), prior.diagonal())
     x = np.random.default_rng(0).normal(size=36)
     np.testing.assert_allclose(prior.gradient(x) - prior.gradient(0 * x), P @ x, atol=rounding)
-    # Between equal texels there is nothing, and the start is where the density is largest.
+    # Equal texels have no differences, and the density is largest at the start.
     np.testing.assert_allclose(prior.gradient(prior.mean), 0, atol=1e-12)
     random = np.random.default_rng(0)
     draws = np.stack([prior.draw(random) for _ in range(1000)])
     spread = np.sqrt((np.diag(P)[:, None] * np.diag(P) + P**2) / 1000)
-    assert np.abs((draws.T @ draws / 1000 - P) / spread).max() < 5  # 666 nearly normal numbers: a false alarm in 2000
+    assert np.abs((draws.T @ draws / 1000 - P) / spread).max() < 5  # 666 nearly normal values: a false alarm in 2000
 
 
 def test_differences_of_texels_are_as_large_as_was_supposed():
@@ -197,20 +197,20 @@ def test_the_size_of_differences_is_found_where_values_are_known():
     vector, random = texture(24, 24), np.random.default_rng(3)
     prior = Prior(vector, np.full(1728, 0.5), "auto")
     prior.estimate(0.5 + 0.03 * random.normal(size=1728), np.zeros(1728), np.ones(1728), {"a": np.full((24, 24), 3.0)})
-    # Of independent texels: the root mean square of differences.
+    # The root mean square difference of independent texels.
     assert abs(prior.difference["a"] / (0.03 * np.sqrt(2)) - 1) < 0.1
 
 
 @pytest.mark.parametrize("power, found", [(0.0, 0.0), (0.5, 0.5), (1.0, 1.0), (1.4, 1.4), (3.0, 1.5)])
 def test_the_power_of_smoothness_is_found_where_values_are_known(power, found):
-    """And the size of differences with it, of texels drawn with that power; the largest is that of edges."""
+    """The size of differences is found with it. Texels are drawn with `power`; at most the power of edges is found."""
     prior, random = Prior(texture(24, 24), np.full(1728, 0.5), "auto"), np.random.default_rng(8)
     rate = 2 - 2 * np.cos(np.pi * np.arange(24) / 24)
     rate = rate[:, None] + rate
     waves = random.normal(size=(24, 24, 3)) / np.where(rate > 0, rate, np.inf)[..., None] ** (power / 2)
     texels = 0.5 + 0.03 * fft.idctn(waves, axes=(0, 1), norm="ortho")
     prior.estimate(texels.ravel(), np.zeros(1728), np.ones(1728), {"a": np.full((24, 24), 3.0)})
-    # The logarithms of 1725 waves, which deviate by 0.7, leave 1 / (0.7 sqrt(1725 / 2)) = 0.05.
+    # Logarithms of the rates of 1725 waves deviate by 0.7, so the error is 1 / (0.7 sqrt(1725 / 2)) = 0.05.
     assert abs(prior.power["a"] - found) < 0.2
     differences = np.diff(texels, axis=0), np.diff(texels, axis=1)
     rms = np.sqrt(np.mean(np.concatenate([d.ravel() for d in differences]) ** 2))
@@ -218,7 +218,7 @@ def test_the_power_of_smoothness_is_found_where_values_are_known(power, found):
 
 
 def test_the_precision_of_total_variation_is_that_of_its_derivative():
-    """And its strength that of largest likelihood: T colours about their mean are as q^(3 T - 3) exp(-q sum |d|)."""
+    """Its strength maximises the likelihood q^(3 T - 3) exp(-q sum |d|) of T colours about their mean."""
     vector, x = texture(12, 12), np.random.default_rng(5).uniform(size=432)
     prior = Prior(vector, np.full(432, 0.5), "auto", "total variation")
     for _ in range(30):
@@ -227,7 +227,7 @@ def test_the_precision_of_total_variation_is_that_of_its_derivative():
     down, right = np.zeros((2, 12, 12, 3))
     down[:-1], right[:, :-1] = np.diff(image, axis=0), np.diff(image, axis=1)
     length = np.sqrt((down**2 + right**2).sum(-1))
-    # The last texel has no differences: where |d| = 0, precisions are finite.
+    # The last texel has no differences; where |d| = 0, precisions stay finite.
     q, (last, first) = 3 * 143 / length.sum(), (np.s_[:-1], np.s_[1:])
     slope = np.zeros((12, 12, 3))
     for d, of, to in ((down, last, first), (right, (np.s_[:], last), (np.s_[:], first))):
@@ -239,7 +239,7 @@ def test_the_precision_of_total_variation_is_that_of_its_derivative():
 
 
 def test_total_variation_keeps_an_edge_that_the_laplacian_blurs():
-    """Columns of a step, seen through noise as large as a tenth of it."""
+    """A step between columns, seen through noise of a tenth of its height."""
     vector, random = texture(12, 12), np.random.default_rng(6)
     step = (np.where(np.arange(12) < 6, 0.3, 0.7)[None, :, None] * np.ones((12, 12, 3))).ravel()
     seen, weight, errors = step + 0.04 * random.normal(size=432), 0.04**-2, {}
@@ -255,11 +255,11 @@ def test_total_variation_keeps_an_edge_that_the_laplacian_blurs():
     assert errors["total variation"] < 0.85 * errors["laplacian"], errors
 
 
-SIDE = 160  # of a picture that is not fitted
+SIDE = 160  # of a texture that is not fitted
 
 
 def made(program, rows):
-    """Names of what makes arrays of so many rows of 3 or more in a program, and in the programs that it calls."""
+    """Return the primitives in a program, and those it calls, that create arrays of at least `rows` rows of 3."""
     found = []
     for eqn in program.eqns:
         inner = jax.tree.leaves(list(eqn.params.values()), is_leaf=lambda x: hasattr(x, "eqns") or hasattr(x, "jaxpr"))
@@ -274,7 +274,7 @@ def made(program, rows):
 
 @pytest.fixture(scope="module")
 def pictures():
-    """A wall with a picture of 4 x 6 texels beside one of many, whose texels stand in one array."""
+    """A wall with a texture of 4 x 6 texels beside one with a large texture; all texels are in one array."""
     random, T = np.random.default_rng(3), pj.Transform
     camera = {"type": "perspective", "to_world": T().look_at(origin=[0, 0, 4], target=[0, 0, 0], up=[0, 1, 0])}
     scene = {
@@ -291,7 +291,7 @@ def pictures():
 
 
 def evaluated(scenes, name):
-    """The products of a fit of one texture, and the views with the start in them."""
+    """Return the products of a fit of one texture, and the views that hold its start."""
     given = problem.build(scenes, [np.ones((8, 8, 3))] * len(scenes), [name], {name: 0.5})
     found = products.Products(given, seed=0)
     (group,) = found._at(given.start)
@@ -300,11 +300,11 @@ def evaluated(scenes, name):
 
 
 def test_no_kernel_of_a_fit_copies_texels_that_are_not_fitted(pictures):
-    """Values are set once a step, and arrays are on all devices before: a kernel makes no array of all texels."""
+    """Values are set once per step and arrays replicated beforehand, so no kernel creates an array of all texels."""
     views, group = evaluated([pictures, pj.with_parameters(pictures, {"sky.radiance": 2.0})], "small.reflectance")
     large = [x for x in jax.tree.leaves(group.scene) if x.size >= 3 * SIDE**2]
     assert len(large) == 1 and len(large[0].devices()) == len(jax.devices())
-    (alone,) = views._at(views.problem.start, everywhere=False)  # for rows, which each device makes by itself
+    (alone,) = views._at(views.problem.start, everywhere=False)  # for rows, which each device computes by itself
     assert all(len(x.devices()) == 1 for x in jax.tree.leaves(alone.scene))
     _, pixels, _ = views.parts[0]
     values = jnp.asarray(views.problem.start, jnp.float32)
@@ -332,7 +332,7 @@ def test_values_of_a_texture_are_set_in_views_that_share_an_array_and_in_others(
 
 
 def test_fits_of_few_numbers_have_large_arrays_on_all_devices(pictures):
-    """What is on one of them is copied to the others at each call."""
+    """An array on one device would be copied to the others at each call."""
     given = problem.build(pictures, np.ones((8, 8, 3)), ["sky.radiance"], {})
     (group,) = State(given, 8, 0, None, None, None).groups
     large = [x for x in jax.tree.leaves(group.scene) if x.size >= 3 * SIDE**2]

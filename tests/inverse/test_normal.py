@@ -1,4 +1,4 @@
-"""Normal equations: against the Jacobians that they are made of, for views, weights, blocks, chunks and devices."""
+"""Normal equations against the Jacobians that they sum up, for views, weights, blocks, chunks and devices."""
 
 import jax
 import jax.numpy as jnp
@@ -20,10 +20,10 @@ BODY = """
 <shape type="sphere"><point name="center" x="0.9" y="0" z="0"/><ref id="glass"/></shape>
 <emitter type="constant" id="sky"><rgb name="radiance" value="1, 0.9, 0.8"/></emitter>
 """
-# A number that moves paths, a colour, a number, a colour.
+# A scalar that moves paths, a colour, a scalar, a colour.
 NAMES = ["glass.int_ior", "floor.reflectance", "metal.alpha", "sky.radiance"]
 RES, SPP, COUNT = 9, 4, 8
-# Of float32 sums of some hundred numbers, over the largest.
+# Rounding error of float32 sums of some hundred scalars, relative to the largest sum.
 ROUNDING = 3e-5
 WEIGHTS = np.random.default_rng(0).uniform(size=(RES, RES, 3))
 
@@ -39,7 +39,7 @@ def target():
 
 
 def made_up(scene, wanted, pixels, first, spp, seed, options, devices=None):
-    """Stands for `pixel_jacobians`, whose kernel takes long to compile: noise from -1 to 1, and no scene."""
+    """Return noise from -1 to 1 instead of calling `pixel_jacobians`, whose kernel takes long to compile."""
 
     def of_pixel(work):
         pixel, seed = work
@@ -53,7 +53,7 @@ def made_up(scene, wanted, pixels, first, spp, seed, options, devices=None):
 
 @pytest.fixture
 def no_kernel(monkeypatch):
-    """(what stands for `pixel_jacobians`)."""
+    """(function) -> None: replaces `pixel_jacobians` by it."""
 
     def put(instead):
         monkeypatch.setattr(normal, "pixel_jacobians", instead)
@@ -69,7 +69,7 @@ def without_kernel(no_kernel):
 
 
 def dense_of(views, target, image_and_jacobian):
-    """Residuals (2, H * W, 3) and Jacobians (2, H * W, 3, P) of the two renders of seed 3."""
+    """Return residuals (2, H * W, 3) and Jacobians (2, H * W, 3, P) of the two renders of seed 3."""
     residuals, jacobians = [], []
     for half in (0, 1):
         (seed,) = views.seeds(jnp.uint32(3), jnp.uint32(0), half)
@@ -92,7 +92,7 @@ def agree(found, wanted):
 
 
 def by_pixel(dense, weights):
-    """Scores (N, P) and matrices (N, P, P)."""
+    """Return each pixel's scores (N, P) and matrices (N, P, P)."""
     (ra, rb), (Ja, Jb) = dense
     scores = (np.einsum("pci,pc->pi", Ja, weights * rb) + np.einsum("pci,pc->pi", Jb, weights * ra)) / 2
     matrices = np.einsum("pci,pc,pcj->pij", Ja, weights, Jb)
@@ -135,7 +135,7 @@ EXTRA = np.random.default_rng(1).normal(size=(RES * RES, 3, 2))
 def test_blocks_and_chunks_are_summed_up_alike_on_any_number_of_devices(
     scene, target, dense, without_kernel, monkeypatch, least_parts
 ):
-    """Blocks of 2 x 2 pixels, some of them beyond the image, in two chunks; whether or not sums are dealt in parts."""
+    """Blocks of 2 x 2 pixels, some of them beyond the image, in two chunks; sums are split into parts or not."""
     views = problem.build(scene, target, NAMES, {})
     monkeypatch.setattr(normal, "CHUNK_BYTES", 2 * 4 * 3 * 4 * 50)
     monkeypatch.setattr(normal, "ITEMS_OF_A_PART", 20)
@@ -170,7 +170,7 @@ def test_every_pixel_is_in_one_block(height, width, side):
 
 @pytest.mark.slow
 def test_views_add_up(scene, target, write_scene, without_kernel):
-    """The first view twice, and another of another size."""
+    """The first view twice, and a view of another size."""
     other = pj.load_scene(write_scene(BODY, res=4, depth=3))
     names = NAMES[1:]
     seen = pj.normal_equations([scene, scene], names, [target] * 2, [WEIGHTS, 0 * WEIGHTS], SPP)
@@ -221,7 +221,7 @@ def test_what_no_image_changes_with_is_named(scene, target, no_kernel):
     fit = pj.fit(scene, target, NAMES[1:3], spp=4)
     assert [list(direction) for direction in fit.undetermined] == [[name] for name in fit.components]
     assert all(np.isinf(error).all() for error in fit.standard_errors.values())
-    np.testing.assert_allclose(fit.values[NAMES[1]], pj.parameters(scene)[NAMES[1]], rtol=1e-5)  # where it began
+    np.testing.assert_allclose(fit.values[NAMES[1]], pj.parameters(scene)[NAMES[1]], rtol=1e-5)  # its start
 
 
 def test_a_roughness_that_counts_as_a_larger_one_is_refused(scene, target):

@@ -66,7 +66,7 @@ def test_any_coordinates_give_values_within_the_bounds():
 
 
 def test_values_at_a_bound_can_be_left():
-    """The derivative there must not vanish, or a start at a bound would stay."""
+    """The derivative there must not vanish, or a start at a bound would stay there."""
     ends = ParameterVector((("paint.reflectance", COLOR),))
     x = jnp.asarray(ends.unbounded(np.array([0.0, 1.0, 0.5])), jnp.float32)
     slope = np.diag(jax.jacfwd(ends.bounded)(x))
@@ -84,7 +84,7 @@ def test_names_that_a_view_lacks_have_columns_of_zeros(missing):
 
 
 def test_columns_are_colours_by_channel_and_numbers():
-    """Between themselves and the components that they hold, and as a Jacobian of images."""
+    """They convert to and from the components that they hold, and are the columns of a Jacobian of images."""
     column, seen = BOTH.entries
     assert column.tolist() == [0, 0, 0, 1, 2, 2, 2]
     np.testing.assert_array_equal(seen.T, [*np.eye(3), np.ones(3), *np.eye(3)])
@@ -100,7 +100,7 @@ def test_columns_are_colours_by_channel_and_numbers():
 
 
 def test_what_counts_from_its_least_on_is_approached_by_its_logarithm():
-    """Halfway lies the geometric mean, and a value at its least has a derivative."""
+    """Halfway lies the geometric mean of the bounds, and the least value has a derivative."""
     alpha = ParameterVector((("metal.alpha", Parameter(("a",), (0,), (), (0, 1), least=1e-4)),))
     np.testing.assert_array_equal(alpha.bounds, [[1e-4, 1]])
     assert float(alpha.bounded(jnp.zeros(1))[0]) == pytest.approx(1e-2, rel=1e-5)

@@ -1,4 +1,4 @@
-"""What programs of fits are kept by: scenes share them where all that is compiled is the same."""
+"""Keys of the compiled programs of fits: scenes share programs if everything compiled into them is the same."""
 
 import jax
 import numpy as np
@@ -11,7 +11,7 @@ COLORS = np.linspace(0.2, 0.8, 15).reshape(5, 3)
 
 
 def sheet(order=(0, 1, 2, 3, 4), name="sheet"):
-    """Two triangles, and a vertex that neither has: the fifth of these."""
+    """Return a scene of a mesh of two triangles and a vertex that neither uses, the fifth in `order`."""
     corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0], [0, 0, 5]], float)
     paint = {"type": "diffuse", "reflectance": {"type": "mesh_attribute", "name": "vertex_color"}}
     faces = np.asarray(order)[[[0, 1, 2], [0, 2, 3]]]

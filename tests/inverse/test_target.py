@@ -1,4 +1,4 @@
-"""Targets: what a file rounded, clipped or left out is known, and what no target can be made of is refused."""
+"""Targets know what a file rounded, clipped or left out, and files that cannot be targets are refused."""
 
 import numpy as np
 import OpenEXR
@@ -15,7 +15,7 @@ def grey_png(path, codes, mode):
 
 
 def test_png_rounding_is_a_noise_of_the_stated_size(tmp_path):
-    """Of 30,000 values spread over all codes: the mean square of error / (step / sqrt(12)) is 1, known to 0.005."""
+    """For 30,000 values over all codes, the mean square of error / (step / sqrt(12)) is 1, known to 0.005."""
     image = srgb_to_linear(np.random.default_rng(0).uniform(0.02, 0.98, (100, 100, 3)))
     write_png(tmp_path / "a.png", image)
     target = pj.read_target(tmp_path / "a.png")
@@ -34,7 +34,7 @@ def test_full_scale_is_clipped_and_zero_is_not(tmp_path, mode, levels):
     assert usable[0, :, 0].tolist() == [True, True, True, True, False]
     wanted = srgb_to_linear(1.5 / levels) - srgb_to_linear(0.5 / levels)
     assert target.step[0, 1] == pytest.approx(wanted, rel=1e-3)
-    # A 0 may stand for half a step, as far as any other code is from what it stands for.
+    # Code 0 may stand for half a step; any other code may be as far from its value.
     assert target.step[0, 0] == pytest.approx(wanted, rel=1e-3)
 
 

@@ -1,4 +1,4 @@
-"""The statistics of a fit on linear problems that are known: bias, covariance, what is not determined, structure."""
+"""The statistics of a fit on known linear problems: bias, covariance, undetermined directions, structure."""
 
 from typing import NamedTuple
 
@@ -31,7 +31,7 @@ class Evidence(NamedTuple):
 
 
 def evidence(rng, truth=TRUTH, at=None, jacobian_noise=0.5, render_noise=0.5, target_noise=0.3):
-    """Renders of a linear model: image = J v + noise, with noise in J too; all correlated between channels."""
+    """Return renders of a linear model: image = J v + noise, with noise in J too; all correlated between channels."""
     J = np.random.default_rng(1).normal(size=(N, 3, len(truth)))
     at = np.zeros(len(truth)) if at is None else at
 
@@ -44,7 +44,7 @@ def evidence(rng, truth=TRUTH, at=None, jacobian_noise=0.5, render_noise=0.5, ta
 
 
 def test_steps_are_unbiased_and_scatter_as_stated():
-    """At the truth, where a fit ends. 400 steps: the mean is known to 1/20 of a standard error, a variance to 7 %."""
+    """400 steps at the truth, where a fit ends: the mean is known to 1/20 of a standard error, a variance to 7 %."""
     rng = np.random.default_rng(0)
     solutions = [evidence(rng, at=TRUTH).solve() for _ in range(400)]
     z = np.array([s.step / np.sqrt(np.diag(s.covariance)) for s in solutions])
@@ -53,7 +53,7 @@ def test_steps_are_unbiased_and_scatter_as_stated():
 
 
 def test_steps_from_afar_are_not_too_short():
-    """One noisy Jacobian J makes J'J too large: here by a quarter, and the step by a fifth too short."""
+    """A single noisy Jacobian J would make J'J too large, here by a quarter, and the step too short, by a fifth."""
     rng = np.random.default_rng(0)
     steps = np.array([evidence(rng).solve().step for _ in range(100)])
     error = steps.std(0) / np.sqrt(len(steps))
@@ -106,10 +106,10 @@ def test_where_nothing_is_free_nothing_moves():
 @pytest.mark.parametrize("noise", [0.0, 0.2, 1.0])
 @pytest.mark.parametrize("pattern", ["flat", "gradient", "patches"])
 def test_errors_of_rounding_are_as_stated(pattern, noise):
-    """Of a level that is the mean of 400 rounded values, whatever they have in common: 400 levels, steps of 1.
+    """A level is the mean of 400 rounded values that may have a pattern in common; 400 levels, steps of 1.
 
-    The mean square of z is known to 7 %. It is too small where errors cancel over a gradient without noise, of which
-    scatter over pixels knows nothing.
+    The mean square of z is known to 7 %. It is too small where errors cancel over a gradient without noise, which the
+    scatter over pixels does not show.
     """
     rng = np.random.default_rng(12)
     shapes = {"flat": [0.0], "gradient": np.linspace(0, 5.3, 400), "patches": [0, 0.3, 1.7, 2.45]}
@@ -127,7 +127,7 @@ def test_errors_of_rounding_are_as_stated(pattern, noise):
 
 
 def residuals(rng, size=40, smooth=0.0):
-    """Two renders of a view against one target, in the mean: independent noise, and a smooth misfit."""
+    """Return mean residuals of two renders of a view against one target: independent noise and a smooth misfit."""
     y, x = np.mgrid[0:size, 0:size] / 6
     misfit = smooth * (np.sin(x) * np.cos(y))[..., None]
     target = rng.normal(size=(size, size, 3))
@@ -141,7 +141,7 @@ def structure(view):
 def test_noise_has_no_structure():
     rng = np.random.default_rng(6)
     z = np.array([structure(residuals(rng))[1] for _ in range(100)])
-    # Of normal noise these are standard normal numbers: 100 of them beyond 4 by chance: 0.6 %.
+    # For normal noise these are standard normal: one of 100 lies beyond 4 with a probability of 0.6 %.
     assert np.abs(z).max() < 4
     assert abs(z.mean()) < 4 / np.sqrt(len(z)) and abs(z.var() - 1) < 4 * np.sqrt(2 / len(z))
 
@@ -159,14 +159,14 @@ def test_a_misfit_of_the_size_of_the_noise_has_structure():
 
 
 def test_a_misfit_far_below_the_noise_has_structure_in_a_large_image():
-    """It is 1/4 of the noise's standard deviation: 50 standard deviations in the 256 x 256 pixels together."""
+    """It is 1/4 of the noise's standard deviation, and 50 standard deviations over all 256 x 256 pixels together."""
     agreement, significance = structure(residuals(np.random.default_rng(9), size=256, smooth=0.6))
     assert agreement < 0.1 and significance > uncertainty.STRUCTURE_SIGNIFICANCE
 
 
 @pytest.mark.parametrize("size", [32, 64])
 def test_a_few_neighbours_that_are_far_off_have_structure(size):
-    """A lamp of 1/64 of the image, whose residuals alone are seen in any sum of squares."""
+    """A lamp covers 1/64 of the image, and its residuals dominate any sum of squares."""
     for seed in range(10):
         view = residuals(np.random.default_rng(seed), size)
         view[2 : 2 + size // 8, 5 : 5 + size // 8] -= 200
@@ -182,7 +182,7 @@ def test_a_firefly_is_no_structure(where):
 
 
 def test_pixels_without_noise_do_not_matter():
-    """A small object before a black background, say."""
+    """As where a small object is seen before a black background."""
     view = residuals(np.random.default_rng(10))
     wide = np.zeros((40, 400, 3))
     wide[:, :40] = view
@@ -190,12 +190,12 @@ def test_pixels_without_noise_do_not_matter():
     assert uncertainty.structure([np.zeros((40, 40, 3))]) == (0, 0)
 
 
-# What a Gaussian filter of standard deviation 1/2 does to noise.
+# Weights by which a Gaussian filter of standard deviation 1/2 spreads noise over pixels.
 SHARED = np.exp(-2.0 * np.arange(-2, 3) ** 2)
 
 
 def shared_noise(rng, size=48):
-    """(size, size, 3) of variance 1, correlated as pixels that share samples."""
+    """Return noise (size, size, 3) of variance 1, correlated like pixels that share samples."""
     noise = rng.normal(size=(size + 4, size + 4, 3))
     for axis in (0, 1):
         noise = np.apply_along_axis(np.convolve, axis, noise, SHARED, "valid")
