@@ -1,4 +1,4 @@
-"""What a path tracer is asked is checked once, when it is said."""
+"""Options of the path tracer are checked once, when they are given."""
 
 from __future__ import annotations
 
@@ -41,6 +41,6 @@ def test_strategies_of_a_scene_find_all_of_its_light(shipped):
 
 
 def test_options_of_the_same_choices_are_one_key():
-    """So that jitted kernels are found again."""
+    """So compiled kernels are reused."""
     assert Options() == DEFAULTS and hash(Options()) == hash(DEFAULTS)
     assert Options(split_depth=2) != DEFAULTS

@@ -1,4 +1,4 @@
-"""Random numbers of a vertex: a bsdf with lobes draws one more, and the others stay what they are."""
+"""Random numbers of a vertex: a bsdf with lobes draws one more, which does not change the others."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def test_a_bsdf_with_lobes_draws_a_third_number_and_changes_no_other(shipped, mo
     assert without.bsdf.shape == (len(depths), 2) and with_lobes.bsdf.shape == (len(depths), 3)
     for a, b in zip(without, with_lobes._replace(bsdf=with_lobes.bsdf[:, :2]), strict=True):
         np.testing.assert_array_equal(a, b)
-    # Uniform, and independent of the numbers beside it: 8192 of them, 4.5 standard errors each (false alarm 1e-5).
+    # It is uniform and independent of the others: 8192 samples, 4.5 standard errors for each test (false alarm 1e-5).
     lobe = np.asarray(with_lobes.bsdf[:, 2], float)
     error = 4.5 / np.sqrt(len(lobe))
     assert abs(lobe.mean() - 0.5) < error / np.sqrt(12)

@@ -1,4 +1,4 @@
-"""The path tracer of renders against that of textbooks: the same samples, where they draw the same random numbers."""
+"""The path tracer of `render` against the textbook's: samples are the same if they draw the same random numbers."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ ROOT = Path(__file__).resolve().parents[2]
 NAMES = sorted(path.stem for path in (*ROOT.glob("scenes/*.xml"), *ROOT.glob("tests/scenes/*.xml")))
 QUICK = ("cornell_box", "glass_and_mirror")
 SPP, SEED = 4, 7
-# What rounding leaves of a sample after some ten vertices, relative to it or to the mean of the image; and the share of
-# samples that it may send another way, at an edge or where roulette decides. A wrong term changes nearly all.
+# Rounding error of a sample after some ten vertices, relative to it or to the mean of the image; and the fraction of
+# samples that rounding may send another way, at an edge or in roulette. A wrong term changes nearly all samples.
 ROUNDING, ASTRAY = {jnp.float32: 1e-3, jnp.float64: 1e-9}, {jnp.float32: 5e-3, jnp.float64: 0}
 
 
 def rendered(scene):
-    """(SPP, H, W, 3) samples of `path`, each an image of one, by the kernel of `render`, which other tests have."""
+    """Return (SPP, H, W, 3) samples of `path`, one by one, by the kernel of `render`, which other tests compile too."""
     pixels, how = film.pixels(scene.film), {"options": DEFAULTS, "shape": film.image_shape(scene.film)}
     numbers = (pixel.numbers(pixels, sample, 1, SEED) for sample in range(SPP))
     return np.stack([pixel_means(on_all_devices(scene), pixels, *each, None, **how) for each in numbers])
 
 
 def assert_same_samples(scene, dtype):
-    scene = replace(nameless(scene), hide_emitters=False)  # which the textbook's does not
+    scene = replace(nameless(scene), hide_emitters=False)  # the textbook's tracer does not hide them
     fast, plain = rendered(scene), np.asarray(reference.samples(scene, SPP, SEED))
     assert fast.dtype == plain.dtype == dtype
     assert plain.mean() > 0

@@ -1,4 +1,4 @@
-"""With which probability paths go on."""
+"""Survival probabilities of paths."""
 
 from types import SimpleNamespace
 
@@ -13,7 +13,7 @@ from pathjax.integrators import roulette
     "throughput, passive, expected", [(0.1, None, 0.3), (0.2, 2.0, 0.3), (1, None, 0.95), (0, 1, 0.05)]
 )
 def test_paths_go_on_in_proportion_to_the_light_that_is_left(throughput, passive, expected):
-    """Between bounds, so that every path ends and none of them for certain; what refraction does is taken out."""
+    """It is bounded, so that every path ends but never with certainty; scaling by refraction is divided out."""
     color = jnp.array([throughput / 2, throughput, 0.0])
     passive = None if passive is None else jnp.float32(passive)
     scene = SimpleNamespace(rr_depth=3)
