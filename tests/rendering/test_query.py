@@ -1,4 +1,4 @@
-"""Ray queries: what blocks is what is met before the end, and both work wherever JAX's transformations put them."""
+"""Ray queries: `any_hit` agrees with `closest_hit`, and both work within JAX's transformations."""
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +18,7 @@ def spheres(root):
 def rays():
     rng = np.random.default_rng(0)
     origins = rng.uniform(-2, 2, (600, 3)).astype(np.float32)
-    return origins, rng.normal(size=(600, 3)).astype(np.float32) * 7  # of any length
+    return origins, rng.normal(size=(600, 3)).astype(np.float32) * 7  # not unit vectors
 
 
 def test_what_blocks_is_met_before_the_distance(spheres, rays):
@@ -64,5 +64,5 @@ def test_queries_within_jit_vmap_and_loops(spheres, rays):
         "map": lambda: jax.jit(lambda *parts: jax.lax.map(lambda part: both(*part), parts))(*parts),
     }.items():
         for expected, found in zip(alone, query(), strict=True):
-            # Other programs round otherwise in the last bits.
+            # Other programs differ in the last bits.
             np.testing.assert_allclose(np.ravel(found), expected, rtol=1e-5, err_msg=name)

@@ -1,4 +1,4 @@
-"""Nothing is lost: a render that was killed, stopped or refused its disk ends in the image of an undisturbed one."""
+"""Nothing is lost: a render that was killed, stopped or could not save ends in the image of an undisturbed one."""
 
 import errno
 import json
@@ -19,7 +19,7 @@ from pathjax.rendering.progressive import checkpoint, passes
 
 HOW = {"target_error": 0.015, "seed": 3}
 
-# Renders as HOW says; tells when it has begun to, and saves after every call of the kernel.
+# Renders with the arguments HOW; after every call of the kernel it saves and prints a line.
 CHILD = """
 import sys
 from pathjax.rendering.progressive import checkpoint
@@ -34,7 +34,7 @@ result = pj.render_until(pj.load_scene("scenes/cornell_box.xml", res=24), 0.015,
 print(result.reason)
 """
 
-# Dies by its own hand in the middle of the tenth file, or when that is whole and not yet in its place.
+# Kills itself in the middle of the tenth file, or when that is whole but not yet moved to its place.
 SUICIDE = """
 import os, signal, sys
 import numpy as np
@@ -97,7 +97,7 @@ def same(a, b):
 @needs_signals
 @pytest.mark.parametrize("kills", [2, pytest.param(20, marks=pytest.mark.slow)])
 def test_killed_at_random_moments(cornell, undisturbed, child, tmp_path, kills):
-    """Each child gets some 1 / kills of the way, so that most of them die at work."""
+    """Each child gets about 1 / kills of the way, so that most are killed while they render."""
     rng = np.random.default_rng(kills)
     file = tmp_path / "run.npz"
     for _ in range(kills):
@@ -199,7 +199,7 @@ def test_truncated_files(cornell, made, share):
 
 
 def test_flipped_bytes(cornell, made):
-    """Everything that is read is under a checksum or compared."""
+    """All data that is read has a checksum or is compared."""
     whole, rng = made.read_bytes(), np.random.default_rng(0)
     reference = pj.render_until(cornell, spp=4, seed=3).image
     refused = 0
@@ -260,7 +260,7 @@ def test_a_full_disk_leaves_the_last_checkpoint_and_costs_no_image(cornell, undi
     with pytest.warns(pj.InputWarning, match="run.npz: cannot be written: No space left") as warned:
         same(pj.render_until(cornell, **HOW, checkpoint=file), undisturbed)
     assert len(warned) == 1
-    assert next(saves) > 8  # it was tried again
+    assert next(saves) > 8  # saving was tried again
     monkeypatch.undo()
     assert [path.name for path in tmp_path.iterdir()] == ["run.npz"]
     with np.load(file) as saved:
@@ -286,7 +286,7 @@ def test_a_failure_that_passes_costs_nothing(cornell, undisturbed, tmp_path, mon
 
 
 def test_saving_takes_a_small_share_of_the_time(cornell, tmp_path, monkeypatch):
-    """A save that takes a second comes at most every 200."""
+    """A save that takes a second is made at most every 200 seconds."""
     clock, saved = [0.0], []
 
     def write_whole(path, write):

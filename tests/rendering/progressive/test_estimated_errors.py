@@ -1,4 +1,4 @@
-"""The error of an image: replicates and what is estimated from them, on numbers whose truth is known."""
+"""The error of an image: replicates and the estimates from them, on values whose truth is known."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ R = replicates.COUNT
 
 
 def normal_image(rng, sigma, count=64):
-    """Image and its variance (H, W, 3), and the truth 1: samples of standard deviation `sigma`."""
+    """Return an image of truth 1 and its variance, (H, W, 3) each, from samples of standard deviation `sigma`."""
     shape = np.broadcast_shapes(np.shape(sigma), (64, 64, 3))
     counts = np.full(shape[0] * shape[1], count, np.int32)
     spread = sigma / np.sqrt(replicates.shares(counts).reshape(R, *shape[:2], 1))
@@ -35,7 +35,7 @@ def test_samples_are_dealt_in_turn():
 
 @pytest.mark.parametrize("count", [2, 3, 4, 5, 7, 64])
 def test_mean_and_variance_of_unequal_replicates(count):
-    """The mean weighs samples alike; the variance estimate is unbiased: a z-test of 70,000 pixels (4 sigma)."""
+    """The mean weighs all samples equally, and the variance is unbiased: a z-test of 70,000 pixels (4 sigma)."""
     rng = np.random.default_rng(count)
     counts = np.full(70_000, count, np.int32)  # more than one block
     shares = replicates.shares(counts)[..., None]
@@ -63,8 +63,8 @@ def test_a_pixel_without_samples_is_black():
 
 @pytest.mark.parametrize("sigma", [1.0, np.linspace(0.2, 3, 64)[:, None, None]])
 def test_standard_errors_are_calibrated(sigma):
-    """A share of 1/4 of the own variance and 3/32 of each neighbour's makes 22.6 degrees of freedom, so z has the
-    variance 22.6 / 20.6 = 1.10 (a little more at the border); 4 standard errors of the 12,288 z^2 are 0.06."""
+    """1/4 of a pixel's own variance plus 3/32 of each neighbour's has 22.6 degrees of freedom, so z has the variance
+    22.6 / 20.6 = 1.10 (a little more at the border); 4 standard errors of the 12,288 z^2 are 0.06."""
     image, variance = normal_image(np.random.default_rng(0), sigma)
     z = (image - 1) / error_estimate.standard_error(image, variance, np.full((64, 64), 64))
     assert 1.03 < (z**2).mean() < 1.17
@@ -106,7 +106,7 @@ def test_agreement_of_few_samples_is_not_certainty():
 
 
 def test_image_error_is_the_root_of_rel_mse():
-    """Of 12,288 normal values: its relative standard error is sqrt(2/3 / 12288) / 2 = 0.4 %; four of them."""
+    """For 12,288 normal values its relative standard error is sqrt(2/3 / 12288) / 2 = 0.4 %; five are allowed."""
     image, variance = normal_image(np.random.default_rng(3), 0.5)
     error = error_estimate.image_error(image, variance)
     assert error.estimate == pytest.approx(0.5 / 8 / np.sqrt(1.01), rel=0.02)
@@ -124,7 +124,7 @@ def test_few_pixels_that_rule_the_error_make_it_unsure():
 
 
 def test_bound_is_exceeded_in_few_renders():
-    """Of 400 images of lognormal samples of skewness 6, 5 % by intent; 36 are beyond chance (1e-4, binomial)."""
+    """In 5 % of 400 images of lognormal samples of skewness 6, by design; 36 are beyond chance (1e-4, binomial)."""
     rng = np.random.default_rng(4)
     s, scale, count = 1.0, 0.02, np.full(256, 16, np.int32)
     truth = scale * np.sqrt(np.expm1(s**2) / 16 / 1.01)
@@ -146,7 +146,7 @@ def test_without_noise_the_error_is_0():
 
 
 def test_a_black_image_has_no_error():
-    """There is nothing to be relative to."""
+    """There is no level for it to be relative to."""
     black = np.zeros((4, 4, 3), np.float32)
     assert np.isnan(error_estimate.image_error(black, black)).all()
     assert (error_estimate.sample_weights(black, black) == 1).all()
@@ -158,7 +158,7 @@ def test_one_pixel_has_its_relative_error():
 
 
 def test_a_lamp_in_view_does_not_hide_the_noise_of_the_room():
-    """A tenth of the pixels, and 10^6 times brighter: the others keep their error."""
+    """The lamp is a tenth of the pixels and 10^6 times brighter; the others keep their error."""
     image, variance = normal_image(np.random.default_rng(8), 0.5)
     room = error_estimate.image_error(image, variance).estimate
     lamp = np.arange(64) < 6
@@ -199,7 +199,7 @@ def test_weights_without_noise_are_even():
 
 
 def everything(means, counts):
-    """What is estimated, of replicates (R, 64 * 64, 3): that in units of radiance, and that without a unit."""
+    """Return the estimates from replicates (R, 64 * 64, 3): those in units of radiance, and those without a unit."""
     image, variance = replicates.moments(means, counts)
     image, variance = image.reshape(64, 64, 3), variance.reshape(64, 64, 3)
     errors = error_estimate.standard_error(image, variance, counts.reshape(64, 64))

@@ -1,4 +1,4 @@
-"""Renders that stop by themselves: what they claim, when they stop, and that they are unbiased."""
+"""Renders that stop by themselves: the errors they claim, when they stop, and that they are unbiased."""
 
 import io
 import signal
@@ -30,7 +30,7 @@ def truth(cornell):
 
 
 def test_an_error_asked_for_is_the_error_got(cornell, truth):
-    """Over 8 seeds; the estimate's own relative standard error is 2 % of one image, and the bound's margin 4 %."""
+    """Over 8 seeds. For one image the estimate's relative standard error is 2 %, and the margin of the bound 4 %."""
     for target in (0.1, 0.05):
         results = [pj.render_until(cornell, target, seed=seed) for seed in range(8)]
         assert {r.reason for r in results} == {"target error"}
@@ -40,7 +40,7 @@ def test_an_error_asked_for_is_the_error_got(cornell, truth):
 
 
 def lit_by(scene, factor):
-    """The scene with all radiances times `factor`."""
+    """Return the scene with all radiances times `factor`."""
     values = pj.parameters(scene).items()
     return pj.with_parameters(scene, {name: factor * value for name, value in values if name.endswith(".radiance")})
 
@@ -56,7 +56,7 @@ GLOBE = """
 
 @pytest.fixture(scope="module")
 def globe(make_scene):
-    """A lamp that is hidden from the camera in front of a sphere, under a sky of which only the light is seen."""
+    """A sphere behind a lamp, under a sky; both emitters are hidden from the camera, which sees only their light."""
     return make_scene(GLOBE, res=16, depth=4, hide="true", origin="0, 0, 4", target="0, 0, 0", fov=40)
 
 
@@ -77,13 +77,13 @@ def test_a_power_of_two_in_all_lights_scales_the_image_and_changes_nothing_else(
 
 @pytest.mark.parametrize("factor, least_spp", [(0, 16), (1e-34, 16), (1e37, 17)])
 def test_no_target_is_claimed_where_the_error_cannot_be_told(cornell, factor, least_spp):
-    """In the dark, or where float32 underflows; where it overflows in the lamp, the rest is on target first."""
+    """In the dark, or where float32 underflows. Where it overflows in the lamp, the rest reaches the target first."""
     scene = lit_by(cornell, factor)
     result = pj.render_until(scene, 0.1)
     assert result.reason == "no estimate"
     assert least_spp <= result.spp < 1000
     assert np.isfinite(result.image).all() == (factor < 1)
-    # What would end the render anyway does so.
+    # Other limits still end the render.
     assert pj.render_until(scene, 1e-3, spp=32).reason == "spp"
     assert pj.render_until(scene, 1e-3, time_limit=0.05).reason == "time limit"
 
@@ -140,7 +140,7 @@ def test_without_noise_the_pilot_is_enough(shipped):
 
 
 def test_a_target_is_not_claimed_on_an_unsure_estimate(cornell, monkeypatch):
-    """The estimate alone would do."""
+    """The estimate alone would be on target."""
     unsure = error_estimate.ImageError(0.01, 0.5)
     monkeypatch.setattr(error_estimate, "image_error", lambda *_: unsure)
     result = pj.render_until(cornell, 0.1, spp=64)
@@ -168,7 +168,7 @@ def test_what_cannot_be_is_refused(cornell, wrong, says):
 
 @pytest.fixture
 def after_calls(monkeypatch):
-    """(number of calls of the kernel, what to do then)."""
+    """(number, act) -> None: calls `act` after every call of the kernel but the first `number`."""
 
     def install(number, act, plain=passes.extend):
         count = iter(range(number))
@@ -186,7 +186,7 @@ def after_calls(monkeypatch):
 
 @pytest.mark.parametrize("number", SIGNALS)
 def test_signals_end_a_render_with_what_is_done(cornell, after_calls, number):
-    earlier = signal.signal(number, signal.default_int_handler)  # whatever started the tests may have it ignored
+    earlier = signal.signal(number, signal.default_int_handler)  # the parent process may have it ignored
     try:
         after_calls(3 * calls_at_once() - 1, lambda: signal.raise_signal(number))
         result = pj.render_until(cornell, spp=10**6)
@@ -194,7 +194,7 @@ def test_signals_end_a_render_with_what_is_done(cornell, after_calls, number):
     finally:
         signal.signal(number, earlier)
     assert result.reason == "interrupted"
-    # Portions of 64, 192 and 192, each by one call of every thread; and what has begun of the two that each has ahead.
+    # Portions of 64, 192 and 192, each by one call of every thread, and those begun of the two that each has ahead.
     assert 448 <= result.spp <= 448 + 2 * 192
 
 
@@ -216,7 +216,7 @@ def test_render_in_another_thread(cornell):
 
 
 def test_a_state_left_after_any_call_leads_to_the_same_bits(cornell, monkeypatch):
-    """Chunks of 100 pixels, so that a pass is left in its middle."""
+    """Chunks have 100 pixels, so that a pass is interrupted in its middle."""
     monkeypatch.setattr(passes, "CHUNK_PIXELS", 100)
 
     def rendered(leave_after):
@@ -242,7 +242,7 @@ def test_a_state_left_after_any_call_leads_to_the_same_bits(cornell, monkeypatch
 
 @pytest.mark.parametrize("weight", [np.float32(1), np.nextafter(np.float32(1), np.float32(0))])
 def test_equal_weights_give_every_pixel_the_samples_asked_for(cornell, weight):
-    """Also where the division by their mean has rounded."""
+    """Also where the division by their mean has rounded them."""
     state = passes.start(cornell)
     state.weights[:] = weight
     passes.plan(state, 32)
@@ -265,17 +265,17 @@ def test_no_call_begins_once_it_is_stopped(cornell, monkeypatch):
     next(calls)
     stopped.set()
     list(calls)
-    # In each thread one that had just asked.
+    # At most one per thread, which had just asked.
     assert sum(begun) <= calls_at_once()
     assert (state.count < state.goal).any()
-    # What is left leads on to the same bits.
+    # The rest of the render leads to the same bits.
     for one in (state, whole):
         list(passes.extend(cornell, one, 5, DEFAULTS))
     np.testing.assert_array_equal(state.means, whole.means)
 
 
 def test_float64_within_a_context(shipped, x64, cornell):
-    """The calls run in other threads, which do not have it."""
+    """The calls run in other threads, which do not inherit the context."""
     with x64():
         double = shipped("cornell_box", np.float64, res=24)
         image = pj.render_until(double, spp=64, seed=4).image
@@ -299,7 +299,7 @@ SCENES = ("cornell_box", "furnace", "glass_and_mirror", "nine_spheres", "glass_b
 
 
 def images_of(scene, spp, seeds, adaptive):
-    """Images and standard errors (S, H, W, 3)."""
+    """Return images and standard errors, (S, H, W, 3) each."""
     limit = {"target_error": 1e-6} if adaptive else {}
     results = [pj.render_until(scene, spp=spp, seed=seed, **limit) for seed in seeds]
     return np.array([r.image for r in results], float), np.array([r.standard_error for r in results], float)
@@ -309,10 +309,10 @@ def images_of(scene, spp, seeds, adaptive):
 @pytest.mark.parametrize("adaptive", [False, True])
 @pytest.mark.parametrize("name", SCENES)
 def test_standard_errors_are_calibrated(shipped, name, adaptive):
-    """The variance of z over pixels lies within 0.8 to 1.25, by 4 of its standard errors over 16 seeds: a claim that
-    holds for other seeds too but for a chance of 1e-4. Measured are 0.88 (furnace) to 1.08 (nine spheres).
+    """The variance of z over pixels lies in 0.8 to 1.25, with a margin of 4 of its standard errors over 16 seeds, so
+    other seeds fail with a probability of 1e-4. Measured: 0.88 (furnace) to 1.08 (nine spheres).
 
-    It holds from some 64 spp on: with fewer, pixels that saw no light at all have errors of 0.
+    It holds from about 64 spp on: with fewer, pixels that saw no light at all have errors of 0.
     """
     scene = shipped(name, res=32)
     reference, _ = images_of(scene, 1024, range(1000, 1012), False)
