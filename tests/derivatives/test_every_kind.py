@@ -312,7 +312,7 @@ def test_derivatives_are_those_of_differences(scene_of, case):
 @pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
 def test_no_derivative_is_nan(scene_of, case):
-    """For a million paths at the scene's values, and fewer with each scalar, or all parameters, at their bounds."""
+    """For a million paths at the scene's values, and fewer with each constant, or all parameters, at their bounds."""
     scene = scene_of(case)
     known, values = scene.about.parameters, pj.parameters(scene)
     names = [name for name in values if not known[name].moves_paths]

@@ -1,4 +1,4 @@
-"""Camera rays are Mitsuba's, number for number."""
+"""Camera rays equal Mitsuba's for the same random numbers."""
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +12,7 @@ ORIGIN, TARGET, UP = [1.0, 2.0, -4.0], [0.3, 0.2, 0.5], [0.1, 1.0, 0.2]
 
 
 def look_at():
-    """Columns left, up, forward, origin: Mitsuba's."""
+    """Return Mitsuba's matrix, of columns left, up, forward, origin."""
     forward = np.subtract(TARGET, ORIGIN) / np.linalg.norm(np.subtract(TARGET, ORIGIN))
     left = np.cross(UP, forward) / np.linalg.norm(np.cross(UP, forward))
     m = np.eye(4)
@@ -130,7 +130,7 @@ def test_upper_left_corner_comes_first():
 
 
 def test_scale_in_to_world_changes_neither_directions_nor_distances():
-    """Ray directions are unit whatever the matrix holds."""
+    """Ray directions are unit vectors for any matrix."""
     scaled = look_at()
     scaled[:3, :3] *= 3
     for a, b in zip(*(rays_of(Perspective(m, 50.0), 60, 40, *numbers()) for m in (look_at(), scaled)), strict=True):

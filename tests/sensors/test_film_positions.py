@@ -1,4 +1,4 @@
-"""Samples of a pixel lie as its filter weighs them, with weights of mean 1."""
+"""Samples of a pixel are distributed by its filter, with weights of mean 1."""
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +9,7 @@ from scipy import stats
 from pathjax.sensors import film
 from pathjax.sensors.filters import Box, CatmullRom, Gaussian, Lanczos, Mitchell, Tent
 
-# Chance that a correct filter fails one test; seeds are fixed.
+# Probability that a correct filter fails one test; seeds are fixed.
 FALSE_ALARM = 1e-4
 N = 400_000
 
@@ -19,7 +19,7 @@ def built(filter, border=True):
 
 
 def sampled(made, pixel, u):
-    """Offsets in pixels from the centre of the pixel on the film, and weights, float64."""
+    """Return offsets in pixels from the centre of the pixel on the film, and weights, float64."""
     positions, weights = jax.jit(jax.vmap(lambda u: film.sample_position(made, jnp.int32(pixel), u)))(u)
     center = np.array([2 + pixel % 4, 1 + pixel // 4]) + 0.5
     return np.asarray(positions, np.float64) * [8, 6] - center, np.asarray(weights, np.float64)
@@ -53,7 +53,7 @@ FILTERS = {
     "catmullrom": (CatmullRom(), 2.0, cubic(0, 0.5)),
     "lanczos": (Lanczos(), 3.0, lambda x: np.sinc(x) * np.sinc(x / 3)),
 }
-# Their lobes are negative, and so are weights there.
+# Filters with negative lobes, where weights are negative too.
 RINGING = ("mitchell", "another mitchell", "catmullrom", "lanczos")
 
 
@@ -68,7 +68,7 @@ def test_weighted_samples_have_the_filter_for_their_density(name):
     fine = (np.arange(200) + 0.5) / 200
     share = np.array([shape(a + fine * (b - a)).mean() for a, b in zip(edges[:-1], edges[1:], strict=True)])
     share = np.outer(share, share) / share.sum() ** 2
-    # The rim may be passed by an ulp.
+    # Samples may pass the rim by an ulp.
     inside = np.clip(offsets, -radius * (1 - 1e-9), radius * (1 - 1e-9))
     total, squares = (np.histogram2d(*inside.T, [edges, edges], weights=w)[0] for w in (weights, weights**2))
     full = np.abs(share) * N > 20  # the corners of a Gaussian hold next to nothing
@@ -90,13 +90,13 @@ def test_heights_are_those_of_the_filter(name):
 
 @pytest.mark.parametrize("name", RINGING)
 def test_weights_are_one_but_for_the_sign_and_its_share(name):
-    """Samples are drawn by |f|: all weights have the size of the ratio of its integral to that of f."""
+    """Samples are drawn by |f|, so all weights have one size: the squared ratio of the integrals of |f| and f."""
     filter, radius, shape = FILTERS[name]
     x = np.linspace(-radius, radius, 100_001)
     size = (np.trapezoid(np.abs(shape(x)), x) / np.trapezoid(shape(x), x)) ** 2
     weights = sampled(built(filter), 0, uniform(50_000))[1]
     assert weights.min() < 0
-    # Where f changes its sign, a step of the table holds all heights from 0 on.
+    # Where f changes sign, one step of the table contains all heights from 0 up.
     assert np.quantile(np.abs(np.abs(weights) - size), 0.95) < 0.05 * size and np.abs(weights).max() < 5 * size
 
 
@@ -150,6 +150,6 @@ def test_filters_are_those_of_mitsuba(name):
     assert theirs.radius() == pytest.approx(radius)
     x = np.linspace(-radius, radius, 41)
     values = np.array([theirs.eval(float(v)) for v in x])
-    # Filters differ by a constant at most: both programs divide by their sum. Mitsuba's Gaussian is a polynomial fit,
-    # off by 5e-4.
+    # Filters may differ by a constant factor: both programs divide by their sum. Mitsuba's Gaussian is a polynomial
+    # fit, off by 5e-4.
     np.testing.assert_allclose(values / values[20], shape(x) / shape(0 * x)[0], atol=1e-3)

@@ -1,4 +1,4 @@
-"""Sensors that measure one number, against closed forms and Mitsuba."""
+"""Sensors that measure a single value, against closed forms and Mitsuba."""
 
 import numpy as np
 import pytest
@@ -25,7 +25,7 @@ ON = {
     "disk": {"type": "disk", "to_world": TILT},
     "cube": {"type": "cube", "to_world": TILT},
     "cylinder": {"type": "cylinder", "to_world": TILT},
-    # Not turned: Mitsuba's points of a sphere turn with it, but not their normals.
+    # Not turned: Mitsuba turns the points of a sphere with it, but not their normals.
     "sphere": {"type": "sphere", "center": [0.3, 1.6, 0.5], "radius": 0.4},
 }
 
@@ -36,7 +36,7 @@ def seen(sensor, width=1, filter="box", **objects):
 
 
 def around():
-    """A grey ball and a tube over a floor, a lamp and a sky."""
+    """Return a gold ball and a tube over a floor, a lamp and a sky."""
     metal = {"type": "roughconductor", "material": "Au", "alpha": 0.2}
     return {
         "sky": {"type": "constant", "radiance": {"type": "rgb", "value": [0.5, 1, 2]}},
@@ -58,7 +58,7 @@ def test_a_radiance_meter_measures_the_radiance_of_a_lamp(filter):
 
 
 def test_from_afar_a_lamp_has_its_share_of_the_disk_around_its_box():
-    """A ball of radius r has a box whose sphere has the radius r sqrt(3)."""
+    """The sphere around the box of a ball of radius r has the radius r sqrt(3)."""
     scene = pj.load_dict(seen({"type": "distant", "direction": [1, 2, 3]}, lamp=LAMP))
     shares = np.stack([np.asarray(pj.render(scene, spp=SPP, seed=seed))[0, 0] for seed in range(SEEDS)])
     # Four standard errors: a false alarm in 16,000.
@@ -66,14 +66,14 @@ def test_from_afar_a_lamp_has_its_share_of_the_disk_around_its_box():
 
 
 def of_mitsuba(mi, value):
-    """A dictionary of pathjax's as Mitsuba takes it."""
+    """Return a dictionary of pathjax in the form that Mitsuba takes."""
     if isinstance(value, Transform):
         return mi.ScalarTransform4f(value.matrix.tolist())
     return {key: of_mitsuba(mi, each) for key, each in value.items()} if isinstance(value, dict) else value
 
 
 def on(shape, **objects):
-    """A scene whose one sensor is on a shape."""
+    """Return a scene whose only sensor is on a shape."""
     scene = seen({"type": "irradiancemeter"}, **objects)
     meter = scene.pop("sensor")
     return {**scene, "measured": {**shape, "meter": {**meter, "id": "meter"}}}
@@ -81,7 +81,7 @@ def on(shape, **objects):
 
 @pytest.mark.parametrize(("center", "to_world"), [([30, 20, 10], Transform()), ([0, 0, 0], TILT)])
 def test_a_ball_that_measures_is_lit_from_a_sky_alike_from_all_sides(center, to_world):
-    """pi L, also of a ball that is turned, of whose rays Mitsuba sends some into the ball."""
+    """Irradiance is pi L, also for a turned ball, where Mitsuba sends some rays into the ball."""
     sky = {"type": "constant", "id": "sky", "radiance": {"type": "rgb", "value": [0.5, 1, 2]}}
     scene = pj.load_dict(on({"type": "sphere", "center": center, "to_world": to_world}, sky=sky))
     image, J = pj.jacobian(scene, ["sky.radiance"], spp=256)
@@ -90,7 +90,7 @@ def test_a_ball_that_measures_is_lit_from_a_sky_alike_from_all_sides(center, to_
 
 
 def test_irradiance_under_a_lamp_is_its_form_factor():
-    """pi L (r / d)^2 at a point that looks at the middle of a sphere, within 4 standard errors."""
+    """It is pi L (r / d)^2 at a point that faces the centre of a sphere, within 4 standard errors."""
     lamp = {"type": "sphere", "center": [0, 0, 5], "radius": 1, "emitter": {"type": "area", "radiance": 1.0}}
     small = {"type": "rectangle", "to_world": Transform().scale(1e-3)}
     scene = pj.load_dict(on(small, lamp=lamp))
@@ -98,7 +98,7 @@ def test_irradiance_under_a_lamp_is_its_form_factor():
     share = (1 / 5) ** 2
     error = np.pi * np.sqrt(share * (1 - share) / spp)
     np.testing.assert_allclose(pj.render(scene, spp=spp), np.pi * share, atol=4 * error)
-    # What is seen first is of rays, not of irradiance.
+    # Output variables are means over rays, not irradiances.
     toward = pj.render_aovs(pj.load_dict(on({**small, "flip_normals": True}, lamp=LAMP)), ["depth"], spp=64)["depth"]
     assert 2 - 1e-3 < float(toward.mean()) < 2 + 1e-3
 
@@ -121,7 +121,7 @@ def test_sensors_of_one_number_agree_with_mitsuba(case):
     [("radiancemeter", ("sky", "lamp")), pytest.param("distant", ("sky",), marks=pytest.mark.slow)],
 )
 def test_derivatives_through_glass_are_finite(case, lights):
-    """Where paths move with a parameter, though no ray moves with its place on the film."""
+    """Paths move with the IOR, though no ray moves with its film position."""
     glass = {"type": "sphere", "bsdf": {"type": "dielectric", "id": "clear"}}
     scene = pj.load_dict(seen(SENSORS[case], **{name: around()[name] for name in lights}, glass=glass))
     image, J = pj.jacobian(scene, ["clear.int_ior", f"{lights[-1]}.radiance"], spp=64)
@@ -143,7 +143,7 @@ VIEWS = {
 
 
 def test_a_batch_shows_what_each_of_its_sensors_sees():
-    """Two radiance meters and one of another kind, side by side."""
+    """Two radiance meters and a sensor of another kind, side by side."""
     meters = [{"type": "radiancemeter", "origin": [0, 1, z], "direction": [0, 0, -1]} for z in (5, -5)]
     afar = {"type": "distant", "direction": [0, 0, -1], "target": [0.1, 0.2, 0]}
     sensor = {"type": "batch", "a": meters[0], "b": afar, "c": meters[1]}
@@ -153,7 +153,7 @@ def test_a_batch_shows_what_each_of_its_sensors_sees():
 
 @pytest.mark.parametrize("lens", [{}, {"type": "thinlens", "aperture_radius": 0.1, "focus_distance": 5}])
 def test_a_batch_agrees_with_mitsuba(lens):
-    """Alike, and of two kinds; means of blocks of 4 x 4 pixels, as below."""
+    """With sensors of one kind, and of two; means over blocks of 4 x 4 pixels are compared."""
     mi = pytest.importorskip("mitsuba")
     mi.set_variant("llvm_ad_rgb")
     scene = seen({"type": "batch", "left": VIEWS["left"], "right": {**VIEWS["right"], **lens}}, **around())
@@ -163,7 +163,7 @@ def test_a_batch_agrees_with_mitsuba(lens):
     other = np.stack([np.array(mi.render(theirs, spp=64, seed=seed), float) for seed in range(SEEDS)])
     one, other = (each.reshape(SEEDS, 4, 4, 8, 4, 3).mean((2, 4)) for each in (one, other))
     error = np.sqrt((one.var(0, ddof=1) + other.var(0, ddof=1)) / SEEDS)
-    # Of 96 numbers one in 100 runs is off by five errors of 16 seeds each; rounding tilts edges by 1e-3.
+    # One of 96 values is off by five standard errors of 16 seeds in one of 100 runs; rounding shifts edges by 1e-3.
     assert (abs(one.mean(0) - other.mean(0)) < 5 * error + 1e-3 * one.mean(0)).all()
 
 

@@ -1,4 +1,4 @@
-"""Images of wide filters, in which every sample counts in all pixels under the filter."""
+"""Images with wide filters, where every sample counts in all pixels under the filter."""
 
 from dataclasses import replace
 from functools import partial
@@ -23,7 +23,7 @@ from pathjax.sensors.filters import Box, Gaussian, Tent
 
 FALSE_ALARM = 1e-4
 SKY = '<emitter type="constant"><rgb name="radiance" value="0.7, 1.3, 2"/></emitter>'
-# A grey ball, half before the sky and half beyond the border.
+# A diffuse ball, half in front of the sky and half beyond the border of the image.
 BALL = (
     SKY
     + """<shape type="sphere" id="ball"><point name="center" x="1" y="0.4" z="0"/><bsdf type="diffuse" id="grey">
@@ -49,7 +49,7 @@ def through(scene, filter, border=False, crop=None):
 
 
 def agree(one, other):
-    """Two stacks of independent images have one mean: the mean z^2 over blocks of pixels, whose noise is normal."""
+    """Assert that two stacks of independent images have one mean, by the largest |z| over pixels and channels."""
     z = (one.mean(0) - other.mean(0)) / np.sqrt(one.var(0, ddof=1) / len(one) + other.var(0, ddof=1) / len(other))
     freedom = len(one) + len(other) - 2
     worst = 2 * stats.t.sf(np.abs(z).max(), freedom / 2)
@@ -67,7 +67,7 @@ def test_a_constant_image_stays_constant_also_at_its_borders(make_scene, film, s
 
 
 def test_samples_count_by_the_filter_and_by_nothing_else(ball):
-    """The definition, written out: A / W over all samples, from those of the kernel."""
+    """The definition written out: A / W over all samples of the kernel."""
     spp, count = 3, film.pixel_count(ball.film)
     sampled = replace(ball, film=film.of_samples(ball.film), about=None)
     pixels = jnp.tile(jnp.arange(count, dtype=jnp.int32), spp)
@@ -84,7 +84,7 @@ def test_samples_count_by_the_filter_and_by_nothing_else(ball):
 
 
 def test_what_is_not_finite_spoils_only_what_it_counts_in(ball):
-    """A sample the pixels under the filter around it, and the adjoint of a pixel the samples there."""
+    """A sample spoils the pixels under the filter around it, and the adjoint of a pixel spoils the samples there."""
     here, edge, first = 27, reconstruction.halo(ball.film), jnp.int32(0)
     u = jnp.asarray(np.random.default_rng(3).uniform(size=(1, 1, 64, 2)), jnp.float32)
     pixels = np.stack([np.arange(64) % 8, np.arange(64) // 8], -1)
@@ -117,7 +117,7 @@ def test_pixels_that_share_samples_have_the_mean_of_those_that_do_not(ball, bord
         for scene, first in ((scene, 0), (own(scene), 100))
     )
     agree(one, other)
-    # Noise is less by what samples tell the pixels around.
+    # Sharing samples with the pixels around reduces noise.
     assert one.var(0).mean() < 0.5 * other.var(0).mean()
 
 
@@ -143,13 +143,13 @@ def test_derivatives_go_the_same_way(ball):
     present = jnp.asarray(pj.parameters(ball)[name])
     _, tangent = jax.jvp(of, (present,), (jnp.ones(3),))
     np.testing.assert_allclose(tangent, jnp.einsum("yxcc->yxc", J[name]), rtol=1e-5, atol=1e-6)
-    # The image is a polynomial of each channel, for max_depth 3 of its second power, and roulette begins at depth 5.
+    # The image is a polynomial in each channel, of degree 2 for max_depth 3, and roulette begins only at depth 5.
     difference = (of(present + 0.1) - of(present - 0.1)) / 0.2
     np.testing.assert_allclose(tangent, difference, rtol=1e-3, atol=1e-4)
 
 
 def test_a_recorded_jacobian_goes_the_same_way(ball, monkeypatch):
-    """As tangents do, from the same samples, beyond the border of the crop window too."""
+    """It equals that by tangents from the same samples, also with samples beyond the border of the crop window."""
     scene = through(ball, Gaussian(), True, (2, 1, 5, 4))
     names = list(pj.parameters(scene))
     image, J = pj.jacobian(scene, names, 3, 5)
@@ -228,11 +228,11 @@ def test_a_batch_is_rendered_as_its_entries(ball):
 
 @pytest.mark.slow
 def test_samples_of_a_pixel_may_be_of_any_number(ball):
-    """Each pixel's weigh 1 / n together, so uneven numbers leave the mean as it is, and a constant constant."""
+    """Each of a pixel's n samples weighs 1 / n, so uneven counts change no mean, and a constant stays constant."""
     count = film.pixel_count(ball.film)
     pixels, spp = film.pixels(ball.film), jnp.asarray(np.random.default_rng(1).integers(1, 12, count))
     work = pixels, *pixel.numbers(pixels, 0, spp, 1)
-    lit = replace(ball, max_depth=jnp.int32(1), about=None)  # light of the sky alone, white where it is seen
+    lit = replace(ball, max_depth=jnp.int32(1), about=None)  # only the sky's light, which is constant
     image = pixel_means(lit, *work, options=Options(shared=True)).reshape(8, 8, 3)
     np.testing.assert_allclose(image[:, 0], np.broadcast_to([0.7, 1.3, 2], (8, 3)), rtol=1e-5)
 
@@ -254,7 +254,7 @@ def extended(scene, state, spp, seed=5):
 
 @pytest.mark.slow
 def test_rounds_of_samples_spread_unevenly_leave_the_mean(ball):
-    """Weights that know nothing of the image, and runs of many calls."""
+    """Weights are independent of the image, and rounds take several calls."""
     weights = np.random.default_rng(2).random((8, 8)).astype(np.float32) * 4 + 0.2
     weights /= weights.mean()
     stack = []
@@ -272,7 +272,7 @@ def test_rounds_of_samples_spread_unevenly_leave_the_mean(ball):
 @pytest.mark.slow
 @pytest.mark.parametrize("devices", [3, 5])
 def test_a_kept_state_goes_on_to_the_same_bits(ball, tmp_path, monkeypatch, devices):
-    """With another number of devices too, for which the image would have been cut into other runs."""
+    """Also with another number of devices, for which the image would have been split into other runs."""
     from pathjax.rendering.progressive.checkpoint import Checkpoint
 
     monkeypatch.setattr(passes, "_LEAST_CHUNK", 1)
@@ -298,7 +298,7 @@ def test_a_kept_state_goes_on_to_the_same_bits(ball, tmp_path, monkeypatch, devi
 
 @pytest.mark.slow
 def test_estimated_errors_are_right(shipped):
-    """Standard errors and the image's own, at equal and at adaptive numbers of samples."""
+    """Both the standard errors of pixels and the error of the image, with equal and with adaptive sample counts."""
     scene = through(shipped("cornell_box", res=24), Gaussian())
     truth = np.mean([pj.render(scene, 1 << 13, seed) for seed in range(1000, 1004)], 0, dtype=float)
     for limit in ({"spp": 64}, {"target_error": 0.05}):
@@ -322,7 +322,7 @@ def test_the_correlation_of_noise_is_that_of_renders(ball):
 
 @pytest.mark.slow
 def test_noise_is_below_that_of_mitsuba_at_equal_samples(shipped, root, tmp_path):
-    """relMSE of the Cornell box, 64 x 64, over Mitsuba's independent sampler: measured 0.48."""
+    """relMSE of the 64 x 64 Cornell box, over that of Mitsuba's independent sampler; measured: 0.48."""
     mi = pytest.importorskip("mitsuba")
     scene = through(shipped("cornell_box", res=64), Gaussian())
     truth = np.mean([pj.render(scene, 1 << 13, seed) for seed in range(1000, 1002)], 0, dtype=float)
@@ -340,7 +340,7 @@ def test_noise_is_below_that_of_mitsuba_at_equal_samples(shipped, root, tmp_path
 
 @pytest.mark.slow
 def test_a_fit_takes_targets_of_pixels_that_share_samples(ball):
-    """Standard errors are calibrated, and noise is no structure: of 12 fits of three channels."""
+    """In 12 fits of three channels, standard errors are calibrated and noise is not taken for structure."""
     z = []
     scene = through(pj.with_parameters(ball, {"grey.reflectance": [0.2, 0.4, 0.7]}), Gaussian(), crop=None)
     for seed in range(12):

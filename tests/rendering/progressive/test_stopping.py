@@ -56,7 +56,7 @@ GLOBE = """
 
 @pytest.fixture(scope="module")
 def globe(make_scene):
-    """A sphere behind a lamp, under a sky; both emitters are hidden from the camera, which sees only their light."""
+    """A sphere behind a lamp, under a sky; both emitters are hidden from the camera."""
     return make_scene(GLOBE, res=16, depth=4, hide="true", origin="0, 0, 4", target="0, 0, 0", fov=40)
 
 
