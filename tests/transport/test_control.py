@@ -1,4 +1,4 @@
-"""Roulette that ends paths into a solution on patches: the mean stays whatever the patches hold."""
+"""Roulette that ends paths with a solution on patches: the mean stays the same whatever the patches hold."""
 
 from dataclasses import replace
 
@@ -20,7 +20,7 @@ BALL = """<shape type="sphere"><boolean name="flip_normals" value="true"/><bsdf 
 
 @pytest.fixture(scope="module")
 def box(shipped):
-    """Scene of long paths, its operator, and the light on its patches."""
+    """A scene of long paths, its operator, and the light on its patches."""
     scene = shipped("cornell_box", res=16, max_depth=32)
     op = transport.operator(scene, 100)
     return scene, op, op.solve().L
@@ -40,7 +40,7 @@ def lights(L):
 
 
 def test_exact_control_leaves_no_noise_where_a_path_ends(make_scene, estimate):
-    """Inside a sphere that emits 1, L = 1 / (1 - rho) everywhere: with sampling by bsdf alone every path has the light
+    """Inside a sphere that emits 1, L = 1 / (1 - rho) everywhere. With bsdf sampling alone every path gathers
     1 + rho + rho^2 + ..., and a control that knows the sum ends it anywhere without noise.
     """
     rho = np.array([0.3, 0.6, 0.9])
@@ -80,7 +80,7 @@ def test_mean_stays_with_other_strategies_and_hidden_lights(box, estimate, agree
 
 
 def test_solution_takes_noise_from_roulette(box, estimate):
-    """Survival does not know the scale of the light: with next to none, paths are as long, and end in darkness."""
+    """Survival does not depend on the scale of the light: with almost none, paths are as long but end in darkness."""
     scene, op, L = box
     bright, dark = (estimate(scene, spp=64, control=op.control(scale * L, 0.5)).variance.mean() for scale in (1, 1e-6))
     assert bright < 0.8 * dark

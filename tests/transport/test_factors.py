@@ -1,4 +1,4 @@
-"""Form factors against closed forms, against each other where the way to them differs, and their errors."""
+"""Form factors against closed forms and between methods, and their errors."""
 
 import numpy as np
 import pytest
@@ -23,7 +23,7 @@ def placed(*steps):
 
 
 def plates(gap=2, between=""):
-    """Two squares of side 2 that face each other across the z axis."""
+    """Return two squares of side 2 that face each other along the z axis."""
     return (
         shape("rectangle")
         + shape("rectangle", placed('<rotate x="1" angle="180"/>', f'<translate z="{gap}"/>'))
@@ -32,7 +32,7 @@ def plates(gap=2, between=""):
 
 
 def between_shapes(op):
-    """(P, P) form factors of whole primitives, float64."""
+    """Return (P, P) form factors between whole primitives, float64."""
     F, area = np.asarray(op.F.as_matrix(), float), np.asarray(op.area, float)
     primitive = np.asarray(op.patches.primitive)[np.asarray(op.patches.cell)]
     of = np.equal.outer(np.arange(primitive.max() + 1), primitive).astype(float)
@@ -54,7 +54,7 @@ def test_faces_of_a_cube(make_scene, side):
 
 
 def test_triangles_and_a_turned_scene(make_scene, tmp_path):
-    """A cube of 12 triangles, each cut into 4, stretched and turned: a box of sides 1, 2, 3, against its rectangles."""
+    """A box of 12 triangles, cut into some 48 patches, with sides 1 : 2 : 3 and turned, against its rectangles."""
     corners = [(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]
     quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
     faces = [f for a, b, c, d in quads for f in ((a, b, c), (a, c, d))]
@@ -68,7 +68,7 @@ def test_triangles_and_a_turned_scene(make_scene, tmp_path):
     assert (np.bincount(primitive) > 1).any()
 
     def by_area(op, face):
-        """Exchange between faces, ordered by its size."""
+        """Return the exchange between faces, sorted."""
         exchange = between_shapes(op) * np.bincount(primitive_of(op), np.asarray(op.area))[:, None]
         return np.sort(np.add.reduceat(np.add.reduceat(exchange, face, 0), face, 1).ravel())
 
@@ -95,7 +95,7 @@ def test_inside_of_a_sphere(shipped):
     np.testing.assert_allclose(op.F.as_matrix(), np.broadcast_to(area / (4 * np.pi), (len(area),) * 2), rtol=1e-6)
 
 
-# ---- what hides --------------------------------------------------------------------------------------------------
+# ---- occlusion ---------------------------------------------------------------------------------------------------
 
 
 def test_a_plate_hides_what_is_behind_it(make_scene):
@@ -103,14 +103,14 @@ def test_a_plate_hides_what_is_behind_it(make_scene):
     op = transport.operator(make_scene(plates(between=screen)), 36, method="dense", rays=16)
     F = between_shapes(op)
     assert F[0, 1] == F[1, 0] == 0
-    # The screen's front looks at the upper plate; its back is black.
+    # The screen's front faces the upper plate; its back is black.
     assert F[2, 1] > 0 and F[2, 0] == F[0, 2] == 0
-    assert np.asarray(op.factors.errors)[0].max() > 0  # 16 rays are not certain
+    assert np.asarray(op.factors.errors)[0].max() > 0  # 16 rays leave an error
 
 
 @pytest.mark.parametrize("boxes", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_dense_and_ray_cast_form_factors_agree_within_their_errors(shipped, empty_cornell, boxes):
-    """Of all pairs that 20 rays or more should join, and of the light that each patch receives."""
+    """For all pairs that 20 rays or more should join, and for the light that each patch receives."""
     scene = shipped("cornell_box", res=16) if boxes else empty_cornell(res=16)
     rays = 2048
     dense = transport.operator(scene, 150, method="dense", rays=128)
@@ -120,7 +120,7 @@ def test_dense_and_ray_cast_form_factors_agree_within_their_errors(shipped, empt
     density = rays / 2 * (1 / area + 1 / area.mean())
     expected = F * area[:, None] * (density[:, None] + density)
     pairs = expected > 20
-    # Poisson's error of the expected number: that of the observed one is too small where by chance few were met.
+    # Poisson error of the expected count; that of the observed count is too small where by chance few rays hit.
     errors = np.hypot(F[pairs] / np.sqrt(expected[pairs]), np.asarray(dense.factors.errors)[pairs])
     light = np.random.default_rng(1).uniform(size=dense.Le.shape).astype(np.float32)
     of_light = (np.asarray(op.T.mv(light)) for op in (dense, cast))

@@ -1,4 +1,4 @@
-"""The transport operator, what solves with it, and what it looks like through the camera."""
+"""The transport operator, its solvers, and its images through the camera."""
 
 from dataclasses import replace
 
@@ -40,7 +40,7 @@ def square(center, rotation, reflectance, radiance=None, name="wall"):
 
 
 def box(albedo, radiance=None):
-    """A closed cube whose pairs of faces across z, x, y have albedos albedo[0], [1], [2] and so radiances."""
+    """Return a closed cube whose pairs of faces across z, x, y have albedo[0], [1], [2], and likewise radiances."""
     faces = zip(FACES.items(), np.repeat(range(3), 2), "abcdef", strict=True)
     return "".join(
         square(at, turn, albedo[k], None if radiance is None else radiance[k], name) for (at, turn), k, name in faces
@@ -57,7 +57,7 @@ def primitive_of(op):
 
 
 def centers(op, scene):
-    """(U, 3) of the patches of rectangles."""
+    """Return the centres (U, 3) of patches of rectangles."""
     (table,) = scene.geometry.tables
     c, a, b, _ = np.moveaxis(np.asarray(table.frames, float)[primitive_of(op)], 1, 0)
     cell = np.asarray(op.patches.cell)
@@ -90,7 +90,7 @@ def test_indirect_light_in_a_sphere_is_uniform_whatever_emits(shipped):
 
 
 def test_spherical_cavity_with_a_lamp_by_ray_casting(make_scene):
-    """A disk spans a cap of a sphere and emits like it: all of the wall that sees it receives Le times its share f.
+    """A disk spans a cap of a sphere and emits like it: the wall that sees it receives Le times the cap's fraction f.
 
     The cap is two of nine belts of the sphere, so light is uniform on each patch and only the rays err.
     """
@@ -128,19 +128,19 @@ def test_cube_of_three_albedos_that_emits_what_it_absorbs(make_scene):
 
 
 def corner(a, b):
-    """Share of a point's light that a parallel rectangle a x b at distance 1 with a corner above it gets."""
+    """Return the share of a point's light on a parallel rectangle a x b at distance 1, a corner above the point."""
     ra, rb = np.hypot(1, a), np.hypot(1, b)
     return (a / ra * np.arctan(b / ra) + b / rb * np.arctan(a / rb)) / (2 * np.pi)
 
 
 def upright(along, height, away):
-    """The same of a rectangle across its horizon, away from it, from its foot on along x height."""
+    """Return that on an upright rectangle at distance `away` that extends from its foot by `along` x `height`."""
     d = np.hypot(height, away)
     return (np.arctan2(along, away) - away / d * np.arctan2(along, d)) / (2 * np.pi)
 
 
 def shares_of_faces(x, face):
-    """(6,) shares of the light of points x (N, 3) on a face of the cube that its faces get; closed forms."""
+    """Return shares (6, N) of the light of points x (N, 3) on a face of the cube that each face gets; closed forms."""
     axis = np.flatnonzero(face)[0]
     others = [i for i in range(3) if i != axis]
     result = []
@@ -183,8 +183,8 @@ def test_cube_of_three_albedos_converges_by_the_square_of_the_patches(make_scene
 
 
 def test_facing_plates_converge_by_the_square_of_the_patches(make_scene):
-    """A plate that glows lights each point of the other by a closed form, and the patches' means differ from the points
-    in their middles by O(h^2).
+    """The light of a glowing plate at each point of the other has a closed form, and the patches' means differ from
+    the values at their centres by O(h^2).
     """
     gap, sides = 8, (4, 8, 16)
     scene = make_scene(plates(gap))
@@ -220,7 +220,7 @@ def test_reciprocity_and_adjoint_hold_to_rounding(cornell):
     np.testing.assert_allclose(exchange, exchange.T, rtol=1e-6)
     f, g = np.random.default_rng(1).uniform(size=(2, *op.Le.shape)).astype(np.float32)
     assert inner(op, op.T.mv(f), g) == pytest.approx(inner(op, f, op.adjoint.mv(g)), rel=1e-6)
-    # lineax transposes T in the plain sum over patches.
+    # lineax's transpose of T is for the plain sum over patches.
     assert np.vdot(op.T.mv(f), g) == pytest.approx(np.vdot(f, op.T.transpose().mv(g)), rel=1e-6)
 
 
@@ -240,13 +240,13 @@ def test_residuals_fall_fastest_by_gmres(cornell):
     assert (np.diff(least) < 0).all()
     assert (least <= neumann * 1.001).all()
     assert least[-1] < neumann[-1] / 10
-    # In the end each bounce of the series leaves the radius of what was there.
+    # In the end each bounce of the series multiplies the residual by the spectral radius.
     assert neumann[-1] / neumann[-2] == pytest.approx(float(op.spectral_radius().max()), rel=0.03)
 
 
 def test_spectral_radius_is_the_largest_eigenvalue(cornell):
     _, op = cornell
-    # Those of a symmetric matrix, as areas times factors are one.
+    # They are those of a symmetric matrix, since area times factors is symmetric.
     exchange = np.asarray(op.area, float)[:, None] * np.asarray(op.F.as_matrix(), float)
     np.testing.assert_allclose(exchange, exchange.T, rtol=1e-4, atol=1e-6 * exchange.max())
     roots = np.sqrt(np.asarray(op.albedo, float) / np.asarray(op.area, float)[:, None]).T
@@ -255,7 +255,7 @@ def test_spectral_radius_is_the_largest_eigenvalue(cornell):
 
 
 def test_spectral_radius_of_plates_that_see_but_each_other(make_scene):
-    """-radius is an eigenvalue too; one patch each: the form factor times the albedo."""
+    """-radius is an eigenvalue too. With one patch each, the radius is the form factor times the albedo."""
     op = transport.operator(make_scene(plates()), 2)
     np.testing.assert_allclose(op.spectral_radius(), op.factors.matrix[0, 1] * RHO, rtol=1e-5)
 
@@ -281,7 +281,7 @@ def test_a_dark_scene_stays_dark(make_scene):
 
 
 def test_derivatives_in_a_furnace_are_closed_forms(shipped):
-    """L = Le / (1 - rho): dL/drho = Le / (1 - rho)^2; and of bounce k, k rho^(k-1)."""
+    """L = Le / (1 - rho), so dL/drho = Le / (1 - rho)^2; for bounce k it is k rho^(k-1)."""
     scene = shipped("furnace", res=16)
     op = transport.operator(scene, 24)
 
@@ -331,10 +331,10 @@ def test_image_shows_backs_and_misses_black(make_scene):
 
 
 def against_renders(scene, operators, truncated=None, seeds=8, spp=256):
-    """Relative RMS over 32 x 32 pixels, the block means of any finer image, of what differs between an operator and
-    the path tracer with the same rays from the camera; and that of the tracer's standard error.
+    """Return the relative RMS, over pixels, of the difference of each operator and the path tracer with the same camera
+    rays; that of the standard error of the last one's difference; and the mean images of the operators.
 
-    truncated: number of bounces instead of all light: term `truncated` of the series against that of the paths.
+    truncated: a number of bounces, to compare the terms of just that number; None: compare all light.
     """
 
     def render(depth, seed):
@@ -367,8 +367,8 @@ def refined(empty_cornell):
 
 @pytest.mark.slow
 def test_operator_against_the_path_tracer(refined):
-    """The bias falls with refinement down to the noise. Of an error of second order, halving the patches takes three
-    quarters away, so a third of what the last refinement changed is left.
+    """The bias falls with refinement down to the noise. Halving the size of patches removes three quarters of an error
+    of second order, so a third of the last change remains.
     """
     errors, noise, images = against_renders(*refined)
     biases = np.sqrt(np.maximum(errors**2 - noise**2, 0))
@@ -380,7 +380,7 @@ def test_operator_against_the_path_tracer(refined):
 @pytest.mark.slow
 @pytest.mark.parametrize("bounces", [0, 1, 2, 3, 4])
 def test_terms_of_the_series_against_renders(refined, bounces):
-    """Each term, by the same measure."""
+    """By the same measure, for each term."""
     errors, noise, images = against_renders(*refined, truncated=bounces)
     changed = np.sqrt(((images[2] - images[1]) ** 2).mean() / (images[2] ** 2).mean())
     assert errors[2] < np.hypot(changed / 3, 1.1 * noise) + 1e-6

@@ -1,4 +1,4 @@
-"""Cutting scenes into patches: cells of equal area, found again from their points; what cannot be cut is named."""
+"""Cutting scenes into patches: cells of equal area, found again from their points; refused shapes are named."""
 
 import contextlib
 from dataclasses import replace
@@ -46,7 +46,7 @@ def test_points_of_a_patch_lie_in_it(make_scene, x64, dtype):
             patch, u = x
             primitive, p, n, _ = patches_module.point(cells, shapes, patch, u)
             back = at(cells.back, patch)
-            # The normal of the side that the patch is on, as a ray that comes from there finds it.
+            # The normal of the patch's side, as seen by a ray that comes from there.
             t = jnp.full_like(u[0], 0.01)
             ray, hit = Ray(p + t * n, -n, 2 * t, jnp.int32(-1)), Hit(t, primitive, jnp.int32(-1))
             seen_from_back = dot(geometry.surface(shapes, ray, hit).n, ray.d) > 0
