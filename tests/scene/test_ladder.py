@@ -1,4 +1,4 @@
-"""Padding to the ladder: scenes that differ in numbers share kernels, and what is added is never found."""
+"""Padding to the ladder: scenes that differ in counts share kernels, and padded entries are never used."""
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +20,7 @@ def point(x, y):
 
 
 def lamp(x):
-    """A mesh that shines, as a whole."""
+    """Return a mesh that emits as a whole."""
     return f"""<shape type="obj"><string name="filename" value="meshes/octahedron.obj"/>
         <transform name="to_world"><scale value="0.2"/><translate x="{x}" y="1" z="0"/></transform>
         <emitter type="area"><rgb name="radiance" value="{1 + x}"/></emitter></shape>"""
@@ -31,7 +31,7 @@ SUN = '<emitter type="directional"><vector name="direction" x="0" y="-1" z="0"/>
 
 @pytest.fixture
 def lit(make_scene):
-    """(points, lamps, suns) -> a scene with so many lights."""
+    """(points, lamps, suns) -> a scene with that many lights."""
 
     def lit(points, lamps=0, suns=0):
         body = "".join(point(i % 5, i // 5) for i in range(points)) + "".join(lamp(i / 3) for i in range(lamps))
@@ -75,9 +75,9 @@ def test_fogs_that_differ_in_their_cells_share_kernels_and_keep_their_depths(mak
 
 @pytest.mark.parametrize("counts", [pytest.param((3, 2, 2), marks=pytest.mark.slow), (11, 10, 3)])
 def test_lights_are_chosen_as_without_padding(lit, counts):
-    """The same light by the same number, the largest and the least too, with the same probability."""
+    """Each random number, also the least and the largest, chooses the same light with the same probability."""
     scene = lit(*counts)
-    # Between the ends none on a border between two lights, where rounding decides.
+    # Between the ends, no number is on a border between two lights, where rounding decides.
     u = jnp.concatenate([jnp.arange(1, 100) * 0.6180339887 % 1, jnp.array([0, 2**-24, 1 - 2**-24])])
     refs = jnp.array([[0.0, 0, 3], [4, 2, 1], [-2, 1, 0]])
 
@@ -93,7 +93,7 @@ def test_lights_are_chosen_as_without_padding(lit, counts):
         return map(np.asarray, found(nameless(scene)))
 
     (number, pdf, known), (number_padded, pdf_padded, known_padded) = map(chosen, (scene, padded(scene)))
-    # Of each light its number with padding: added ones come before those of their kind.
+    # Index of each light with padding: added lights come before those of their kind.
     lights, more = scene.emitters, padded(scene).emitters
     ends = np.cumsum([each.count for each in more])
     moved = np.concatenate([np.arange(end - each.count, end) for each, end in zip(lights, ends, strict=True)])
@@ -101,7 +101,7 @@ def test_lights_are_chosen_as_without_padding(lit, counts):
     np.testing.assert_allclose(pdf_padded, pdf, rtol=1e-6)
     near = moved[: known.shape[1]]
     np.testing.assert_allclose(known_padded[:, near], known, rtol=1e-6)
-    # Where the other child of a node is empty, its share is 1 but for rounding.
+    # Where one child of a node is empty, the other's share is 1 up to rounding.
     assert np.delete(known_padded, near, 1).max() <= np.finfo(np.float32).eps
 
 
@@ -115,7 +115,7 @@ def test_images_are_those_without_padding(lit, counts):
 
 @pytest.mark.parametrize(("count", "rows"), [(1, 1), (2, 2), (3, 4), (5, 8), (SELECTED_ROWS, SELECTED_ROWS)])
 def test_tables_from_which_lanes_select_grow_little(make_scene, count, rows):
-    """Gathering from a padded table had cost a seventh of a render, selecting from 8 rows and not 2 an eighth."""
+    """Gathering from a padded table cost a seventh of a render, and selecting from 8 rows instead of 2 an eighth."""
     scene = make_scene("".join(f'<shape type="sphere"><bsdf type="diffuse" id="b{k}"/></shape>' for k in range(count)))
     assert [len(leaf) for leaf in jax.tree.leaves(padded(scene).materials.tables)] == [rows]
 
