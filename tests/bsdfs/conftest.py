@@ -1,4 +1,4 @@
-"""What the tests of bsdfs share: values of Mitsuba's."""
+"""Fixtures shared by the tests of bsdfs: Mitsuba's values."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ import pytest
 
 @pytest.fixture
 def mitsuba_values():
-    """(kind, parameters, wi (N, 3), wo (N, 3)) -> values (N, 3) and densities (N,) of a bsdf of Mitsuba's."""
+    """(kind, parameters, wi (N, 3), wo (N, 3)) -> values (N, 3) and densities (N,) of one of Mitsuba's bsdfs."""
     mi = pytest.importorskip("mitsuba")
     mi.set_variant("scalar_rgb")
 
     def given(name, value):
-        # Colours are (3,), or named so; other numbers stand as they are.
+        # Colours have the shape (3,) or a name with "reflectance"; other numbers stay as they are.
         if np.ndim(value):
             return {"type": "rgb", "value": list(map(float, value))}
         return {"type": "rgb", "value": float(value)} if "reflectance" in name else value

@@ -1,4 +1,4 @@
-"""What each bsdf samples has its density and weight; energy, reciprocity, Snell's law; sides; kinds of users."""
+"""Densities and weights of samples, energy, reciprocity, Snell's law, sides of surfaces, and kinds of users."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ METAL = {"eta": np.array([0.2, 0.9, 1.1]), "k": np.array([3.9, 2.4, 2.1])}
 
 
 def table_of(*instances, dtype=np.float32):
-    """The one table of bsdfs of one kind."""
+    """Return the table of bsdfs of one kind."""
     (table,) = bsdfs.build(list(instances), dtype, (), Parameters()).tables
     return jax.device_put(table)
 
@@ -74,7 +74,7 @@ def test_kinds_of_the_package_pass_the_checks_that_users_get(kind, values):
 
 
 class Uneven(Diffuse):
-    """Draws uniformly over the upper half, and says that it draws by the cosine."""
+    """Samples the upper hemisphere uniformly, but reports the density of cosine sampling."""
 
     @staticmethod
     def sample(p, wi, u):
@@ -87,7 +87,7 @@ class Uneven(Diffuse):
 
 
 class Glowing(Diffuse):
-    """Scatters a fifth more than arrives."""
+    """Scatters 1.2 times the light that arrives."""
 
     @staticmethod
     def evaluate(p, wi, wo):
@@ -115,7 +115,7 @@ class OneWay(Diffuse):
 
 
 class Numb(Diffuse):
-    """Its weight has no derivative in the reflectance."""
+    """The weight has no derivative in the reflectance."""
 
     @staticmethod
     def sample(p, wi, u):
@@ -124,7 +124,7 @@ class Numb(Diffuse):
 
 
 class Attached(Diffuse):
-    """Its density has a derivative in the reflectance."""
+    """The density has a derivative in the reflectance."""
 
     @staticmethod
     def sample(p, wi, u):
@@ -240,7 +240,7 @@ def test_dielectric_of_equal_media_is_invisible_at_any_angle():
 
 
 def test_dielectric_returns_all_energy():
-    """Weight, times eta^2 where refracted, is the share of power: what is sampled carries 1 in each case."""
+    """The weight, times eta^2 where refracted, is the share of power, which is 1 for every sample."""
     wi = directions(10_000, upper=False)
     drawn = draw(GLASS, wi, uniform(10_000, 2))
     z = np.asarray(wi)[:, 2]
@@ -251,7 +251,7 @@ def test_dielectric_returns_all_energy():
 @pytest.mark.parametrize("fresnel", bsdfs.FRESNEL)
 @pytest.mark.parametrize("row", [0, 1, 2])
 def test_dielectric_and_its_other_branch_share_the_light(row, fresnel):
-    """One reflects and one refracts; what cannot be drawn has pdf 0."""
+    """One branch reflects and the other refracts; an impossible branch has pdf 0."""
     glass, n = GLASS.with_setting("fresnel", fresnel), 10_000
     wi, u = directions(n, upper=False), uniform(n, 2)
     drawn = draw(glass, wi, u, row)
@@ -331,7 +331,7 @@ SCENE = """<scene version="3.0.0">
 
 @pytest.fixture
 def kinds(monkeypatch):
-    """The table of kinds, as it was when the test is over."""
+    """Yield the table of kinds, which is restored after the test."""
     monkeypatch.setattr(bsdfs, "KINDS", dict(bsdfs.KINDS))
     return bsdfs.KINDS
 
@@ -448,7 +448,7 @@ assert image.shape == (8, 8, 3)
 
 
 def test_a_bsdf_is_added_by_its_file_and_one_row(tmp_path):
-    """In a copy of the package: nothing else is edited, and it is loaded, listed, rendered and differentiated."""
+    """With no other edit to a copy of the package, the bsdf is loaded, listed, rendered and differentiated."""
     copy = tmp_path / "pathjax"
     subprocess.run(["cp", "-r", str(PACKAGE), str(copy)], check=True)
     (copy / "bsdfs/paper.py").write_text(ONE_MORE)
@@ -456,7 +456,7 @@ def test_a_bsdf_is_added_by_its_file_and_one_row(tmp_path):
     row = '    "diffuse": Diffuse,\n'
     text = room.read_text()
     assert text.count(row) == 1
-    # The row, and the import that it needs.
+    # The row needs an import.
     text = text.replace(row, row + '    "paper": Paper,\n')
     first = "from pathjax.bsdfs.diffuse"
     text = text.replace(first, "from pathjax.bsdfs.paper import Paper\n" + first)

@@ -1,4 +1,4 @@
-"""Fresnel reflectances against closed forms, their derivatives against complex steps, finite everywhere."""
+"""Fresnel reflectances against closed forms, their derivatives against complex steps, and finiteness everywhere."""
 
 import itertools
 
@@ -27,7 +27,7 @@ def dielectric(cos_i, eta):
 
 
 def exact_dielectric(cos_i, eta):
-    """Textbook form, complex so that it may be differentiated by a complex step; not under total reflection."""
+    """Textbook form, for complex arguments too, so that complex steps differentiate it; not for total reflection."""
     cos_t = np.sqrt((cos_i**2 + eta**2 - 1) / eta**2)
     r_s = (cos_i - eta * cos_t) / (cos_i + eta * cos_t)
     r_p = (eta * cos_i - cos_t) / (eta * cos_i + cos_t)
@@ -35,7 +35,7 @@ def exact_dielectric(cos_i, eta):
 
 
 def exact_conductor(cos_i, eta, k):
-    """Complex amplitudes; independent of the real form in the code."""
+    """From complex amplitudes, independently of the real form in the package."""
     n = eta + 1j * k
     cos_t = np.sqrt(1 - (1 - cos_i**2) / n**2)
     r_s = (cos_i - n * cos_t) / (cos_i + n * cos_t)
@@ -66,7 +66,7 @@ def test_brewsters_angle_leaves_half_of_the_s_wave(eta):
 def test_closed_form_at_all_angles(eta):
     cos_i = np.float32(np.linspace(critical_cos(eta) + 1e-3 if eta < 1 else 1e-3, 1, 1001)).astype(np.float64)
     eta = float(np.float32(eta))
-    # Near the critical angle the root of a small difference keeps half of the digits.
+    # Near the critical angle the square root of a small difference keeps half of the digits.
     np.testing.assert_allclose(dielectric(cos_i, eta)[0], exact_dielectric(cos_i, eta), atol=2e-4 if eta < 1 else 1e-5)
 
 
@@ -94,7 +94,7 @@ def test_reciprocity(eta):
     cos_i = np.linspace(0.01, 1, 200)
     r, cos_t = dielectric(cos_i, eta)
     back, cos_back = dielectric(cos_t, 1 / eta)
-    # The way back runs near the critical angle, where a rounding of cos_t changes R by 1e-4.
+    # The reverse direction is near the critical angle, where a rounding of cos_t changes R by 1e-4.
     np.testing.assert_allclose(back, r, atol=3e-4)
     # A rounding of cos_t^2 is magnified by eta^2 / (2 cos_i); there are two of them.
     np.testing.assert_array_less(np.abs(cos_back - cos_i), 2 * 2**-24 * max(eta**2, 1) / (2 * cos_i) + 1e-6)
@@ -137,11 +137,11 @@ def test_schlick_is_the_polynomial_in_the_angle_on_the_thinner_side_from_either_
     expected = ((eta - 1) / (eta + 1)) ** 2 + (1 - ((eta - 1) / (eta + 1)) ** 2) * (1 - cos_i) ** 5
     r, cos_t = schlick(cos_i, eta)
     np.testing.assert_allclose(r, expected, atol=ROUNDING)
-    np.testing.assert_allclose(schlick(cos_t, 1 / eta)[0], expected, atol=1e-4)  # of a cosine that was rounded
+    np.testing.assert_allclose(schlick(cos_t, 1 / eta)[0], expected, atol=1e-4)  # the cosine was rounded
 
 
 def test_schlick_is_off_by_what_its_users_accept():
-    """At IOR 1.5 by up to 0.036, at 85 degrees; of diffuse light it reflects 6.6 % too little."""
+    """At IOR 1.5 the error is up to 0.036, at 85 degrees, and the reflectance of diffuse light is 6.6 % too low."""
     cos_i = np.sqrt((np.arange(10_000) + 0.5) / 10_000)  # cosine-distributed
     difference = schlick(cos_i, 1.5)[0] - exact_dielectric(cos_i, 1.5)
     assert np.abs(difference).max() == pytest.approx(0.0357, abs=1e-4)
@@ -171,7 +171,7 @@ def test_derivative_at_normal_incidence():
 
 @pytest.mark.parametrize("eta", [1 / 1.33, 1 / 1.5, 1 / 2.419])
 def test_derivatives_around_the_critical_angle(x64, eta):
-    """1e-3 rad before it they are large and right; 1e-3 rad beyond it reflection is total and stays so."""
+    """1e-3 rad below it they are large and correct; 1e-3 rad beyond it reflection is total, so they are 0."""
     critical = np.arcsin(eta)
     gradient = jax.jit(jax.grad(lambda c, e: fresnel.dielectric(c, e)[0], (0, 1)))
     cos_i = np.cos(critical - 1e-3)
@@ -180,7 +180,7 @@ def test_derivatives_around_the_critical_angle(x64, eta):
     slopes = gradient(cos_i, eta)
     np.testing.assert_allclose(slopes, exact, rtol=1e-8)
     assert abs(slopes[1]) > 10
-    # In float32 the small cos_t^2 keeps its digits up to a rounding of the cosine over it.
+    # In float32 the relative error of the small cos_t^2 is the rounding of the cosine divided by it.
     rounded = np.float32([cos_i, eta]).astype(float)
     exact = exact_dielectric(rounded[0], rounded[1] + 1j * step).imag / step
     slope = jax.jit(jax.grad(lambda e, c: fresnel.dielectric(c, e)[0]))(np.float32(eta), np.float32(cos_i))
@@ -197,7 +197,7 @@ def test_dielectric_derivatives_are_finite_everywhere_in_float64(x64):
 
 
 def assert_finite_everywhere(dtype):
-    """By either way of differentiating, for ratios that no glass has, too."""
+    """Check both modes of differentiation, and IORs beyond those of any glass."""
     cos_i, eta = [], []
     near = np.nextafter(dtype(1), 0), np.nextafter(dtype(1), 2)
     for e in [*ETAS, 1.0, *near, *np.geomspace(1e-30, 1e30, 121)]:
@@ -238,7 +238,7 @@ def test_conductor_is_that_of_complex_amplitudes(eta, k):
 def test_conductor_without_absorption_is_a_dielectric(eta):
     cos_i = np.linspace(0.01, 1, 200)
     cos_i = cos_i[np.abs(cos_i - critical_cos(eta)) > 1e-2] if eta < 1 else cos_i
-    # From the difference a^2 = t0 the root keeps half of the digits.
+    # a^2 is a difference, so its square root keeps half of the digits.
     np.testing.assert_allclose(conductor(cos_i, eta, 0), dielectric(cos_i, eta)[0], atol=2e-5)
 
 
@@ -260,17 +260,17 @@ def test_conductor_derivatives_are_the_analytic_ones(x64):
             slopes = gradient(x)
             h = 1e-6
             numeric = [(reference(x + h * e) - reference(x - h * e)) / (2 * h) for e in np.eye(3)]
-            # Central differences: h^2 of truncation, 1e-16 / h of rounding.
+            # Errors of central differences: h^2 from truncation, 1e-16 / h from rounding.
             np.testing.assert_allclose(slopes, numeric, rtol=1e-6, atol=1e-8)
 
 
 def exact_conductor_slopes(cos_i, eta, k):
-    """Value and derivatives in eta and k, by complex analysis, in the widest floats there are; eta + i k is not 0."""
+    """Value and derivatives in eta and k, by complex analysis, in long double; eta + i k must not be 0."""
     cos_i, eta, k = (np.asarray(x, np.longdouble) for x in (cos_i, eta, k))
     n = eta + 1j * k
     w = np.sqrt(np.where(eta < 0.5, n * n - (1 - cos_i) * (1 + cos_i), (n - 1) * (n + 1) + cos_i**2))
     dw, sin2 = n / w, (1 - cos_i) * (1 + cos_i)
-    # c - w and the like of their squares, where n is next to 1; r_p is r_s times a ratio.
+    # c - w comes from factored squares where n may be near 1; r_p is r_s times a ratio.
     c_w = np.where(eta < 0.5, cos_i - w, (1 - n) * (1 + n) / (cos_i + w))
     r_s, dr_s = c_w / (cos_i + w), -2 * cos_i * dw / (cos_i + w) ** 2
     ratio, d_ratio = (w * cos_i - sin2) / (w * cos_i + sin2), 2 * sin2 * cos_i * dw / (w * cos_i + sin2) ** 2
@@ -281,7 +281,7 @@ def exact_conductor_slopes(cos_i, eta, k):
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_conductor_and_its_derivatives_keep_their_digits(x64, dtype):
-    """From eta or k = 0 to 1e6, from normal to grazing incidence, where next to all is reflected or next to nothing."""
+    """For eta and k from 0 to 1e6, from normal to grazing incidence, for reflectances from nearly 0 to nearly 1."""
     numbers = [0, *np.geomspace(1e-7, 1e6, 14), 0.999, 1.001, 1.5, 2, 3.9]
     cosines = [*np.geomspace(1e-6, 0.1, 6), 0.3, 0.5, 0.7, 0.9, 0.99, 0.9999, 1]
     c, e, k = (x.ravel().astype(dtype) for x in np.meshgrid(cosines, numbers, numbers))
@@ -291,7 +291,7 @@ def test_conductor_and_its_derivatives_keep_their_digits(x64, dtype):
     exact, *exact_slopes = exact_conductor_slopes(c, e, k)
     eps = np.finfo(dtype).eps
     np.testing.assert_allclose(value, exact, rtol=0, atol=4 * eps)
-    # At the angle where a large eta reflects no p-wave, the slope of that is 0 and the rest a small difference.
+    # At the angle where a large eta reflects no p-wave, the p-wave's slope is 0 and the rest is a small difference.
     size = np.hypot(*exact_slopes) + np.finfo(dtype).tiny
     for slope, exact_slope in zip(slopes, exact_slopes, strict=True):
         error = np.where(np.abs(c * e - 1) < 0.1, 0, np.abs(slope - exact_slope) / size)
@@ -299,7 +299,7 @@ def test_conductor_and_its_derivatives_keep_their_digits(x64, dtype):
 
 
 def test_conductor_derivatives_have_no_seams():
-    """Where cases of the formula meet: the real part of n^2 - sin^2 is 0, or as large as the imaginary part; n is 1."""
+    """Where cases of the formula meet: the real part of n^2 - sin^2 is 0 or equals the imaginary part, or n is 1."""
     cases = [(1, 1, 1), (1, 2, 2), (0.6, 1, 0.6), (0.0001, 1, 2), (1, 1 + 2**0.5, 1), (1, 0.5, 0.3), (0.5, 1, 0)]
     c, e, k = np.float32(cases).T
     slopes = jax.jit(jax.vmap(jax.grad(fresnel.conductor, (1, 2))))(c, e, k)

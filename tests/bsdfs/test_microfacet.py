@@ -1,4 +1,4 @@
-"""Distributions of facet normals: what is drawn has the stated density, which is normalised, and float32 will do."""
+"""Distributions of facet normals: samples have the stated density, which is normalised, and float32 suffices."""
 
 from functools import partial
 
@@ -24,7 +24,7 @@ def _ask(kind, method, alpha, *vectors):
 
 
 def ask(kind, method, alpha, *vectors, dtype=np.float32):
-    """A method for each of the last of the vectors, (N, 2 or 3)."""
+    """Call a method for each row of the last vector, (N, 2 or 3)."""
     alpha, vectors = ([jnp.asarray(x, dtype) for x in each] for each in (alpha, vectors))
     return np.asarray(_ask(kind, method, alpha, *vectors), np.float64)
 
@@ -35,10 +35,10 @@ def direction(cos, azimuth=2.2):
 
 
 def hemisphere(alpha, n=256):
-    """Normals (N, 3) at midpoints of cells, spread as those of an ellipsoid are, and the solid angle of each (N,)."""
+    """Return normals (N, 3) at midpoints of cells, distributed as on an ellipsoid, and their solid angles (N,)."""
     s, phi = ((np.arange(n) + 0.5) / n for _ in range(2))
     s, phi = (x.ravel() for x in np.meshgrid(s, 2 * np.pi * phi, indexing="ij"))
-    t, dt = 1 - (1 - s) ** 2, 2 * (1 - s)  # sin^2 on the sphere that becomes the ellipsoid: more of the tails
+    t, dt = 1 - (1 - s) ** 2, 2 * (1 - s)  # sin^2 on the sphere that becomes the ellipsoid; denser in the tails
     z, r = np.sqrt(1 - t), np.sqrt(t)
     m = np.stack([alpha[0] * r * np.cos(phi), alpha[1] * r * np.sin(phi), z], -1)
     length = np.linalg.norm(m, axis=1)
@@ -52,7 +52,7 @@ def test_facets_cover_the_surface_once(kind, alpha):
     area = ask(kind, "area", alpha, m) * share
     assert area @ m[:, 2] == pytest.approx(1, abs=1e-3)
     for cos in COSINES:
-        # Heitz 2014, equation 14: masking leaves of the facets that face a direction what covers cos theta.
+        # Heitz 2014, equation 14: the facets visible from a direction have the projected area cos theta.
         wi = direction(cos)
         facing = area @ np.maximum(m @ wi, 0)
         assert ask(kind, "drawn", alpha, wi[None]) * facing == pytest.approx(1, abs=1e-3)
@@ -64,7 +64,7 @@ def test_facets_cover_the_surface_once(kind, alpha):
 @alphas
 def test_normals_are_drawn_with_the_stated_density(kind, alpha, n=100_000, cells=16):
     def cell(m):
-        """By the slopes, which roughness scales."""
+        """Return the cell of each normal, by slopes over roughness."""
         x, y = (m[:, i] / alpha[i] / m[:, 2].clip(1e-6) for i in range(2))
         t, phi = 1 / np.sqrt(1 + x * x + y * y), np.arctan2(y, x) / (2 * np.pi) % 1
         return (t * cells).astype(int).clip(0, cells - 1) * cells + (phi * cells).astype(int) % cells
@@ -87,7 +87,7 @@ def test_normals_are_drawn_with_the_stated_density(kind, alpha, n=100_000, cells
 
 @kinds
 def test_float32_is_as_good_as_float64_down_to_the_least_roughness(kind):
-    """For normals that are drawn; and nothing is NaN at the ends of all ranges."""
+    """For sampled normals; nothing is NaN at the ends of all ranges."""
     ends = np.array([0, 2**-24, 0.3, 0.5, 1 - 2**-24])
     u = np.stack(np.meshgrid(ends, ends), -1).reshape(-1, 2)
     for alpha in ((a, a) for a in (MIN_ALPHA, 1e-3, 0.03, 1.0)):
@@ -98,8 +98,8 @@ def test_float32_is_as_good_as_float64_down_to_the_least_roughness(kind):
             with jax.enable_x64(True):
                 m = ask(kind, "sample", alpha, wi, u, dtype=np.float64)
                 assert np.isfinite(m).all()
-                # What a normal's components are rounded by, 6e-8, is divided by the roughness. Far in the tails, of the
-                # very ends of u, the logarithm of a density has a steeper slope.
+                # The rounding of a normal's components, 6e-8, is divided by the roughness. Far in the tails, at the
+                # ends of u, the logarithm of a density has a steeper slope.
                 near = np.hypot(m[:, 0], m[:, 1]) < 4 * alpha[0] * m[:, 2]
                 for method, at, error in (
                     ("area", m[near], 2e-6 / alpha[0]),

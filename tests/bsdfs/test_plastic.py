@@ -1,4 +1,4 @@
-"""Smooth plastic: its checks, closed forms, derivatives, and its values beside Mitsuba's."""
+"""Smooth plastic: the checks of all kinds, closed forms, derivatives, and values against Mitsuba's."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def test_plastic_passes_the_checks_of_all_kinds(values):
 
 
 def test_diffuse_light_that_passes_an_interface_is_its_integral():
-    """1 - 2 integral R(cos) cos dcos, by the midpoint rule; the fits claim 0.002."""
+    """1 - 2 integral R(cos) cos dcos, by the midpoint rule; the fits claim an error of 0.002."""
     cos = (np.arange(20_000) + 0.5) / 20_000
     for eta in (0.2, 0.4, 0.6, 0.67, 0.8, 1.1, 1.5, 2.4):
         R = jax.vmap(lambda c, eta=eta: fresnel.dielectric(c, jnp.float32(eta))[0])(jnp.asarray(cos, jnp.float32))
@@ -42,7 +42,7 @@ def test_diffuse_light_that_passes_an_interface_is_its_integral():
 
 
 def scattered(materials, wi):
-    """Share of light that is scattered, (3,): the base by quadrature, and the mirrored part in closed form."""
+    """Share of light that is scattered, (3,): the base by quadrature, the mirrored part in closed form."""
     table = materials.tables[0]
     inside, outside = (float(table.column(name).values[0]) for name in ("int_ior", "ext_ior"))
     n, cos_i = inside / outside, float(wi[2])
@@ -54,7 +54,7 @@ def scattered(materials, wi):
 
 @pytest.mark.parametrize("nonlinear", [pytest.param(None, marks=slow), True])
 def test_samples_scatter_what_base_and_coat_do_and_so_do_their_derivatives(nonlinear):
-    """`check_bsdf` leaves out the mean of the weights where Dirac lobes are part of it."""
+    """`check_bsdf` does not check the mean of the weights of bsdfs with Dirac lobes."""
     count, sigmas, step = 200_000, 4.5, 0.01
     materials = testing.material(Plastic, int_ior=1.7, nonlinear=nonlinear, **COLORS)
     u = testing.random_numbers(materials, count, 8)
@@ -62,12 +62,12 @@ def test_samples_scatter_what_base_and_coat_do_and_so_do_their_derivatives(nonli
     assert tangents.keys() == {"diffuse_reflectance", "specular_reflectance", "int_ior", "ext_ior"}
     for wi in testing.directions(Plastic):
         weights = np.asarray(testing.sample(materials, wi, u).weight, float)
-        error = sigmas * weights.std(0) / np.sqrt(count) + 1e-3  # of the quadrature
+        error = sigmas * weights.std(0) / np.sqrt(count) + 1e-3  # error of the quadrature
         assert (abs(weights.mean(0) - scattered(materials, wi)) < error).all()
         for name, tangent in tangents.items():
             moved = np.asarray(testing.sample_tangent(materials, tangent, wi, u).weight, float)
             ahead, behind = (scattered(testing._plus(materials, s * step, tangent), wi) for s in (1, -1))
-            error = sigmas * moved.std(0) / np.sqrt(count) + 3e-3  # of quadrature and differences
+            error = sigmas * moved.std(0) / np.sqrt(count) + 3e-3  # error of quadrature and differences
             assert (abs(moved.mean(0) - (ahead - behind) / (2 * step)) < error).all(), (name, wi)
 
 
@@ -87,7 +87,7 @@ def test_a_black_lobe_is_drawn_sometimes_so_that_its_derivative_is_known():
     "values", [{}, {"nonlinear": True}, {**COLORS, "int_ior": 1.9}, {"int_ior": 1.0, "ext_ior": 1.5, "nonlinear": True}]
 )
 def test_values_and_densities_are_those_of_mitsuba(mitsuba_values, values):
-    """Lobes are chosen as Mitsuba does, but where a reflectance is all but black or textured."""
+    """Lobes are chosen as in Mitsuba, except where a reflectance is nearly black or textured."""
     rng = np.random.default_rng(1)
     wi, wo = (w / np.linalg.norm(w, axis=1, keepdims=True) for w in rng.normal(size=(2, 200, 3)))
     wi[:, 2] = abs(wi[:, 2])
@@ -121,7 +121,7 @@ def test_plastic_of_added_lobes_passes_the_checks_of_all_kinds(values):
 
 @pytest.mark.parametrize("values", ADDED, ids=str)
 def test_values_of_added_lobes_are_those_of_mitsuba(mitsuba_values, values):
-    """To 0.35 % of the part of Beckmann's shadows, by whose approximation both go."""
+    """Both use the same approximation of Beckmann's shadowing."""
     rng = np.random.default_rng(1)
     wi, wo = (w / np.linalg.norm(w, axis=1, keepdims=True) for w in rng.normal(size=(2, 200, 3)))
     wi[:, 2] = abs(wi[:, 2])

@@ -1,4 +1,4 @@
-"""Burley's principled bsdfs: their checks, values beside Mitsuba's, extremes, and what of them is compiled."""
+"""Burley's principled bsdfs: the checks of all kinds, values against Mitsuba's, extremes, and what is compiled."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def kind_of(values):
 
 
 def evaluated(kind, values, wi, wo):
-    """Values (N, 3) and densities (N,)."""
+    """Return values (N, 3) and densities (N,)."""
     materials, zero = testing.material(kind, **values), jnp.int32(0)
 
     def of_pair(wi, wo):
@@ -51,7 +51,7 @@ def evaluated(kind, values, wi, wo):
     ids=str,
 )
 def test_principled_passes_the_checks_of_all_kinds(values):
-    """Of a coat the lobe is too narrow for the quadrature that the rest of `check_bsdf` goes by."""
+    """The lobe of a coat is too narrow for the quadrature that the rest of `check_bsdf` relies on."""
     kind = kind_of(values)
     materials = testing.material(kind, **values)
     for wi in testing.directions(kind):
@@ -68,7 +68,7 @@ def test_principled_passes_the_checks_of_all_kinds(values):
 @slow
 def test_all_lobes_are_drawn_with_the_density_that_is_stated():
     materials = testing.material(ClearPrincipled, **ALL)
-    for wi in testing.directions(ClearPrincipled)[1::3]:  # one from either side
+    for wi in testing.directions(ClearPrincipled)[1::3]:  # one from each side
         testing.check_weights(materials, wi)
         testing.check_chi_square(materials, wi, 20_000, 1e-4)
 
@@ -122,11 +122,11 @@ def pairs(n, seed=1, both=True):
     ids=str,
 )
 def test_values_are_those_of_mitsuba(mitsuba_values, values):
-    """From both sides. Densities differ, as lobes are chosen otherwise."""
+    """From both sides. Densities differ, since lobes are chosen differently."""
     wi, wo = pairs(300, both="spec_trans" in values)
     f, _ = evaluated(kind_of(values), values, wi, wo)
     expected, _ = mitsuba_values("principled", values, wi, wo)
-    # Mitsuba's luminance has other digits; and of smooth coats the half vector's rounding moves D.
+    # Mitsuba's luminance weights have other digits, and for smooth coats the half vector's rounding changes D.
     np.testing.assert_allclose(f, expected, rtol=2e-3, atol=1e-6)
     assert (expected > 0).any()
 
@@ -181,7 +181,7 @@ def test_extremes_of_thin_ones_are_finite(roughness):
     + [(Principled, "metallic", 1.0)],
 )
 def test_lobes_without_a_share_are_drawn_for_their_derivative_in_it(kind, name, share):
-    """Facets so smooth draw nothing of what the base has, and a base nothing of what facets let through."""
+    """Facets this smooth sample none of the directions of the base, and the base none of the light they transmit."""
     wi, wo = pairs(300, both=kind is not Principled)
     values = {**ORANGE, "roughness": 0.3 * (1 - share)}
     _, density = evaluated(kind, {**values, name: share}, wi, wo)
@@ -251,7 +251,7 @@ def test_what_is_out_of_range_is_refused(make_scene, inside, words):
 
 @slow
 def test_derivatives_of_an_image_are_those_of_independent_images(make_scene, estimate, derivatives, agree):
-    """Central differences, of images of other seeds, in every parameter."""
+    """Central differences of images with other seeds, in every parameter."""
     values = {name: value for name, value in ALL.items() if name != "base_color"}
     inside = "".join(number(name, value) for name, value in values.items()) + number("clearcoat_gloss", 0.1)
     scene, step = scene_with(make_scene, inside + '<rgb name="base_color" value="0.8, 0.4, 0.2"/>'), 0.05

@@ -1,4 +1,4 @@
-"""Rough bsdfs: the checks of all kinds, values beside Mitsuba's, small roughnesses, and what scene files may say."""
+"""Rough bsdfs: the checks of all kinds, values against Mitsuba's, small roughnesses, and scene files."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def test_rough_metals_pass_the_checks_of_all_kinds(values):
 
 
 def pairs(n, seed=1):
-    """Directions (N, 3) above the surface; the first ones nearly in it."""
+    """Return directions (N, 3) above the surface; the first quarter are near the horizon."""
     wi, wo = np.random.default_rng(seed).normal(size=(2, n, 3))
     for w in (wi, wo):
         w[:, 2] = abs(w[:, 2])
@@ -56,15 +56,15 @@ def test_values_and_densities_are_mitsubas(distribution, roughness, mitsuba_valu
     wi, wo = pairs(300)
     f, pdf = ours(RoughConductor, values, wi, wo)
     expected, density = mitsuba_values("roughconductor", values, wi, wo)
-    # The half vector is rounded to 6e-8, and the logarithm of D changes with it by up to 1e3 of the smoothest.
+    # The half vector is rounded by 6e-8, and the logarithm of D of the smoothest facets changes by 1e3 times that.
     np.testing.assert_allclose(f, expected, rtol=2e-4, atol=1e-12)
-    # Mitsuba's densities of Beckmann's normals hold the rational approximation, which errs by 0.35 %.
+    # Mitsuba's density for Beckmann uses the rational approximation, whose error is 0.35 %.
     np.testing.assert_allclose(pdf, density, rtol=4e-3 if distribution == "beckmann" else 2e-4, atol=1e-12)
 
 
 @pytest.mark.parametrize("distribution", ["ggx", "beckmann"])
 def test_weights_of_small_roughnesses_are_right_in_float32(distribution, x64):
-    """Down to 1e-3 as in float64, whose samples are mirrored at nearly the same normals."""
+    """Down to 1e-3 they equal those of float64, whose samples are mirrored at nearly the same normals."""
     u = np.random.default_rng(3).integers(0, 1 << 24, (2000, 2)) * 2.0**-24
 
     def drawn(alpha, dtype, wi):
@@ -79,14 +79,14 @@ def test_weights_of_small_roughnesses_are_right_in_float32(distribution, x64):
             single = drawn(alpha, np.float32, wi)
             with x64():
                 double = drawn(alpha, np.float64, wi)
-            # In the tails of GGX, which reach all directions, what is left of 1 - u has fewer digits.
+            # In the tails of GGX, which reach all directions, 1 - u has fewer digits.
             np.testing.assert_allclose(single.wo, double.wo, atol=1e-4)
-            # Where wo lies nearly in the surface its cosine has lost digits, and with it the share of facets seen.
+            # Where wo is near the horizon its cosine has lost digits, and so has the share of visible facets.
             clear = np.asarray(double.wo)[:, 2] > 0.3 * alpha
             np.testing.assert_allclose(
                 np.asarray(single.weight)[clear], np.asarray(double.weight)[clear], rtol=1e-5 + 5e-6 / alpha
             )
-            # Of Beckmann's normals G1 is within 0.35 % of what the density holds.
+            # For Beckmann, G1 is within 0.35 % of its exact value, which the density uses.
             most = 1.0035 if distribution == "beckmann" else 1 + 1e-5
             assert (np.asarray(single.weight) >= 0).all() and (np.asarray(single.weight) <= most).all()
 
@@ -98,7 +98,7 @@ TINTS = {"specular_reflectance": np.array([0.5, 0.9, 1.0]), "specular_transmitta
 @pytest.mark.parametrize("distribution", ["ggx", "beckmann"])
 @pytest.mark.parametrize("values", [{"alpha": 0.3, **GLASS}, {**BRUSHED, "int_ior": 1.0, "ext_ior": 2.4}], ids=str)
 def test_values_and_densities_of_rough_glass_are_mitsubas(distribution, values, mitsuba_values):
-    """Reflected and refracted, from outside and from inside."""
+    """For reflection and refraction, from outside and from inside."""
     values = {**values, **TINTS, "distribution": distribution}
     wi, wo = pairs(400)
     wi[::2, 2] *= -1
@@ -124,8 +124,8 @@ def test_rough_glass_passes_the_checks_of_all_kinds(values):
 @slow
 @pytest.mark.parametrize("values", [{"alpha": 0.3, **GLASS}, {**BRUSHED, "int_ior": 1.33, "ext_ior": 2.4}], ids=str)
 def test_rough_glass_of_ggx_passes_the_checks_but_for_derivatives_in_its_ior(values, monkeypatch):
-    """Its facets stand upright too: at grazing angles f ends at an edge, which differences see and samples do not, and
-    which the midpoint rule finds with more points."""
+    """GGX has upright facets, so f ends at an edge at grazing angles. Differences see the edge and samples do not; the
+    midpoint rule resolves it with more points."""
     monkeypatch.setattr(testing, "POINTS", 60)
     materials = testing.material(RoughDielectric, distribution="ggx", **values)
     for wi in testing.directions(RoughDielectric):
@@ -137,18 +137,18 @@ def test_rough_glass_of_ggx_passes_the_checks_but_for_derivatives_in_its_ior(val
 
 
 def test_rough_glass_is_reciprocal_through_and_through():
-    """Radiance / n^2 is what is kept: f of one way, times n^2 of where it comes from, is that of the other way."""
+    """Radiance / n^2 is conserved: f(wi, wo) n_o^2 = f(wo, wi) n_i^2, with the IOR on the side of each direction."""
     values = {"alpha": 0.3, "distribution": "ggx", **GLASS}
     wi, wo = pairs(300)
     wo[:, 2] *= -1
     there, back = ours(RoughDielectric, values, wi, wo)[0], ours(RoughDielectric, values, wo, wi)[0]
-    # wi is outside: n = 1; f carries the cosine of its second direction.
+    # wi is outside, where n = 1; `ours` includes the cosine of its second direction.
     np.testing.assert_allclose(there / abs(wo[:, 2:]) * 1.5**2, back / abs(wi[:, 2:]), rtol=1e-3, atol=1e-6)
 
 
 @pytest.mark.parametrize("distribution", ["ggx", "beckmann"])
 def test_rough_glass_of_small_roughness_acts_as_smooth_glass(distribution):
-    """Of roughness 1e-3, from both sides, at the critical angle too: mean weights of either lobe."""
+    """At roughness 1e-3 both lobes have the mean weights of smooth glass, from both sides and at the critical angle."""
     rough = testing.material(RoughDielectric, alpha=1e-3, distribution=distribution, **GLASS)
     smooth = testing.material(Dielectric, **GLASS)
     for wi in testing.directions(RoughDielectric):
@@ -158,7 +158,7 @@ def test_rough_glass_of_small_roughness_acts_as_smooth_glass(distribution):
             reflected = np.asarray(drawn.wo)[:, 2] * wi[2] > 0
             weight = np.asarray(drawn.weight, np.float64)[:, 0]
             means.append([np.mean(weight * reflected), np.mean(weight * ~reflected)])
-        # Of 20,000 choices 4 standard deviations; the roughness changes angles by 1e-3, the reflectance by less.
+        # 4 standard deviations of 20,000 choices; the roughness changes angles by 1e-3, and the reflectance by less.
         np.testing.assert_allclose(*means, atol=4 * 0.5 / np.sqrt(20_000) * 2.25)
 
 
@@ -181,8 +181,8 @@ SMALL = '<float name="alpha" value="1e-3"/><string name="distribution" value="{}
 def test_images_and_derivatives_of_small_roughnesses_are_those_of_smooth_surfaces(
     kind, distribution, make_scene, derivatives, agree
 ):
-    """Of roughness 1e-3, which turns what is seen by as much: less than the noise of edges. In the logarithm of alpha
-    an image then changes by about alpha^2, which is 0 beside the noise."""
+    """Roughness 1e-3 turns rays by about 1e-3, which is less than the noise at edges. The derivative in the logarithm
+    of alpha is about alpha^2, which is 0 within the noise."""
     of = lambda kind, inside: make_scene(MIRRORED.format(kind, inside), res=16, origin="0, 1, 4")  # noqa: E731
     smooth, rough = of(kind, INSIDE[kind]), of(f"rough{kind}", INSIDE[kind] + SMALL.format(distribution))
     names = [name for name in pj.parameters(smooth) if name.startswith("it.") and "ior" not in name]
@@ -197,7 +197,7 @@ def test_images_and_derivatives_of_small_roughnesses_are_those_of_smooth_surface
 
 
 def test_derivatives_in_a_roughness_that_counts_as_a_larger_one_are_refused(make_scene):
-    """No image changes with it, and nothing that descends would ever leave it."""
+    """No image changes with it, so gradient descent would never leave it."""
     scene = make_scene(MIRRORED.format("roughconductor", '<float name="alpha" value="0"/>'))
     with pytest.raises(pj.InputError, match=r"it\.alpha = 0 has no derivative: what is below 0\.0001 counts as that"):
         pj.jacobian(scene, ["it.alpha"])
@@ -213,7 +213,7 @@ def test_nothing_is_nan_between_nearly_equal_media():
 
 
 def test_a_pane_reflects_between_its_faces_any_number_of_times():
-    """At normal incidence a slab lets 2 n / (n^2 + 1) through; from both sides, tinted, and going straight on."""
+    """At normal incidence a slab transmits 2 n / (n^2 + 1) straight on, tinted, from both sides."""
     pane = testing.material(ThinDielectric, **TINTS, **GLASS)
     u = testing.random_numbers(pane, 20_000, 1)
     for z in (1.0, -1.0):
@@ -261,7 +261,7 @@ SPLIT = """<scene version="3.0.0">
 
 
 def test_rough_glass_is_no_smooth_interface_to_splitting_and_derivatives(tmp_path):
-    """Nothing splits there, and its IOR is an ordinary parameter, which moves no paths."""
+    """Paths do not split there, and its IOR is an ordinary parameter, which moves no paths."""
     file = tmp_path / "scene.xml"
     file.write_text(SPLIT)
     scene = pj.load_scene(file)

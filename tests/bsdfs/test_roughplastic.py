@@ -1,4 +1,4 @@
-"""Rough plastic, and the light that passes its coat: closed forms, checks, derivatives, values beside Mitsuba's."""
+"""Rough plastic and its coat: closed forms, the checks of all kinds, derivatives, and values against Mitsuba's."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ slow = pytest.mark.slow
 
 
 def transmitted(distribution, alpha, eta):
-    """T at COSINES, and the share that is reflected inside."""
+    """Return T at COSINES, and the share reflected inside."""
     made = coat.coats(distribution, np.array([alpha]), np.array([eta]))[0]
 
     @jax.jit
@@ -34,11 +34,11 @@ def transmitted(distribution, alpha, eta):
 
 @pytest.mark.parametrize("eta, error", [(1.5, 2e-3), (1 / 1.5, 2e-2)])
 def test_a_smooth_coat_passes_what_fresnel_says(eta, error):
-    """Where eta is below 1 nothing, at the first three cosines."""
+    """Where eta is below 1, nothing passes at the first four cosines."""
     T, share = transmitted("beckmann", 1e-4, eta)
     R = jax.vmap(lambda mu: fresnel.dielectric(mu, jnp.float32(eta))[0])(COSINES)
     np.testing.assert_allclose(T, 1 - R, atol=error)
-    # Mitsuba's mean of 64 cosines is lower than the integral by 1/64 and some, most where the last reflect alone.
+    # Mitsuba's mean over 64 cosines is too low by 1/64 or more, mostly where only the last cosines reflect.
     reflected = 1 - float(fresnel.diffuse(jnp.float32(1 / eta)))
     assert share == pytest.approx(63 / 64 * reflected, rel=0.01 if eta > 1 else 0.1)
 
@@ -55,7 +55,7 @@ def test_a_smooth_coat_passes_what_fresnel_says(eta, error):
     ],
 )
 def test_a_rough_coat_passes_what_its_facets_do(distribution, alpha, eta):
-    """The mean over the normals that `microfacet` draws."""
+    """T is a mean over the normals that `microfacet` samples."""
     count, error = 40_000, 1e-3 if eta > 1 else 8e-3
     facets = bsdfs.microfacet.DISTRIBUTIONS[distribution].of(jnp.float32(alpha), jnp.float32(alpha))
     u = jnp.asarray(np.random.default_rng(1).random((count, 2)), jnp.float32)
@@ -76,7 +76,7 @@ def test_a_rough_coat_passes_what_its_facets_do(distribution, alpha, eta):
 
 @pytest.mark.parametrize("distribution", ["ggx", pytest.param("beckmann", marks=slow)])
 def test_terms_are_linear_with_the_right_derivatives(distribution):
-    """How T and the share inside change, when the coat is made anew, is what a kernel sees of a coat that is not."""
+    """A kernel does not recompute the coat; its derivatives equal differences between recomputed coats."""
     alpha, eta, step = 0.3, 1.5, 0.01
     made = jnp.asarray(coat.coats(distribution, np.array([alpha]), np.array([eta]))[0])
 
@@ -129,7 +129,7 @@ def test_the_smoothest_the_roughest_and_none_are_finite(distribution):
     ids=str,
 )
 def test_values_are_those_of_mitsuba(mitsuba_values, values):
-    """To 0.001 in what passes the coat; densities, too, but for 0.35 % of those of Beckmann's normals."""
+    """Within 0.001 in the light that passes the coat; densities of Beckmann's normals differ by up to 0.35 %."""
     rng = np.random.default_rng(1)
     wi, wo = (w / np.linalg.norm(w, axis=1, keepdims=True) for w in rng.normal(size=(2, 200, 3)))
     wi[:, 2] = abs(wi[:, 2])
@@ -155,7 +155,7 @@ def plate(make_scene, alpha, ior=1.5):
 
 
 def test_a_coat_follows_its_parameters(make_scene):
-    """A coat is made for one alpha and one IOR; with others it is made anew, also where they are traced."""
+    """A coat is computed for one alpha and one IOR; new values, traced or not, recompute it."""
     wanted = plate(make_scene, 0.5, 1.7)
     values = {"it.alpha": 0.5, "it.int_ior": 1.7}
     scenes = (
@@ -171,7 +171,7 @@ def test_a_coat_follows_its_parameters(make_scene):
 @pytest.mark.parametrize("distribution", ["beckmann", "ggx"])
 @pytest.mark.parametrize("alpha, eta", [(0.05, 1 / 1.5), (0.1, 1 / 1.1), (0.3, 1 / 1.5)])
 def test_light_that_is_reflected_totally_from_outside_is_that_of_mitsuba(mitsuba_values, distribution, alpha, eta):
-    """To 0.01 of the brightest: both interpolate, Mitsuba between 64 cosines."""
+    """Within 0.01 of the brightest value: both interpolate, Mitsuba between 64 cosines."""
     mu = np.linspace(0.02, 1, 40)
     wi = np.stack([np.sqrt(1 - mu * mu), 0 * mu, mu], 1)
     wo = np.tile([0.6, 0, 0.8], (40, 1)) if eta > 0.8 else np.tile([0, 0, 1.0], (40, 1))
@@ -189,7 +189,7 @@ def test_light_that_is_reflected_totally_from_outside_is_that_of_mitsuba(mitsuba
 
 @slow
 def test_derivatives_of_an_image_are_those_of_independent_images(make_scene, estimate, derivatives, agree):
-    """Central differences, of images of other seeds; the steps' own error is below the noise."""
+    """Central differences of images with other seeds; the truncation error is below the noise."""
     scene, step = plate(make_scene, 0.3), 0.05
     _, slopes = derivatives(scene, ["it.alpha", "it.int_ior"], 512, 16)
     for name, slope in slopes.items():

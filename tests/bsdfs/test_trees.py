@@ -1,4 +1,4 @@
-"""Bsdfs that hold bsdfs: what scatters, how often, in what frame; what passes; closed forms of images; refusals."""
+"""Bsdfs that hold bsdfs: chances and frames of leaves, light that passes, closed forms of images, refusals."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from pathjax.errors import InputError
 from pathjax.integrators import vertex
 from pathjax.kinds import Parameters
 
-# Chance that a right tree fails one of the statistical tests here; seeds are fixed.
+# Chance that a correct tree fails one of the statistical tests here; seeds are fixed.
 FALSE_ALARM = 1e-4
 COUNT = 1 << 14
 RED, GREEN, MIRROR = Diffuse.instance("red"), Diffuse.instance("green"), Conductor.instance("mirror")
@@ -41,7 +41,7 @@ def built(instance):
 
 
 def walked(materials, wi, differentiated=False):
-    """Leaves for evenly spaced numbers."""
+    """Return the leaves for evenly spaced uniform numbers."""
     u = (jnp.arange(COUNT) + 0.5) / COUNT
     frame = Frame(*map(jnp.asarray, (X, Y, Z)))
     walk = jax.vmap(lambda u: bsdfs.leaf(materials, jnp.int32(0), SURFACE, frame, jnp.asarray(wi), u, differentiated))
@@ -49,7 +49,7 @@ def walked(materials, wi, differentiated=False):
 
 
 def shares(instance, wi=Z):
-    """Of what scatters: names of kinds with rows -> how often, by evenly spaced numbers."""
+    """Return {"kind row" of each leaf: share of evenly spaced uniform numbers that reach it}."""
     materials = built(instance)
     leaves = walked(materials, wi)
     found = {}
@@ -90,7 +90,7 @@ def test_each_of_what_a_tree_holds_has_its_own_sides(instance, back):
 
 
 def test_what_lies_on_a_back_sees_light_as_on_a_front():
-    """Mirrored: as Mitsuba has it, the frame is then left-handed."""
+    """The frame is mirrored, and so left-handed, as in Mitsuba."""
     slanted = normals([0.6, 0, 0.8], RED)
     wi = np.float32([0.36, 0.48, -0.8])
     leaf = walked(built(TwoSided.of("t", slanted, slanted)), wi)
@@ -103,13 +103,13 @@ def test_what_lies_on_a_back_sees_light_as_on_a_front():
 def test_a_normal_that_points_below_is_turned_the_other_way_or_shows_its_back(flips):
     below = normals([0.6, 0, -0.8], RED, flip_invalid_normals=flips)
     leaf = walked(built(below), np.float32([-0.6, 0, 0.8]))
-    if flips:  # in its own plane, as Mitsuba does: what is left below stays there
+    if flips:  # tilted the other way, as in Mitsuba; it still points below
         np.testing.assert_allclose(leaf.frame.n[0], [-0.6, 0, -0.8], atol=1e-6)
     assert int(leaf.kind[0]) == -1
 
 
 def test_heights_turn_the_normal_as_they_slope():
-    """Along u the surface grows by 2 a unit, along v by 3, and heights by 1 and -0.5."""
+    """Per unit of u and v the surface extends by 2 and 3, and heights grow by 1 and -0.5."""
 
     class Slope(pj.textures.Texture):
         @staticmethod
@@ -138,7 +138,7 @@ def test_shares_that_pass_are_those_of_walks():
 
 
 def test_directions_of_a_mixture_follow_its_density():
-    """Of a diffuse bsdf and a turned one, by chi-square."""
+    """Chi-square for a blend of a diffuse bsdf and a turned one."""
     materials, wi = built(blend(0.4, RED, normals([0.5, 0.3, 0.8], GREEN))), np.float32([0.48, 0.36, 0.8])
     rng = np.random.default_rng(0)
     u, u_leaf = (jnp.asarray(rng.random(shape), jnp.float32) for shape in ((100_000, 2), (100_000,)))
@@ -174,7 +174,7 @@ HALF = f'<bsdf type="mask" id="leaf">{GREY}</bsdf>'
 
 
 def test_a_masked_plate_under_the_sky(make_scene):
-    """opacity * reflectance + 1 - opacity; the derivative in the opacity is right at its bounds too."""
+    """opacity * reflectance + 1 - opacity; the derivative in the opacity is correct at its bounds too."""
     scene = make_scene(PLATE.format(HALF) + SKY, res=8, fov=1)
     rho = np.array([0.6, 0.3, 0])
     for opacity in (0, 0.5, 1):
@@ -186,7 +186,7 @@ def test_a_masked_plate_under_the_sky(make_scene):
 @pytest.mark.slow
 @pytest.mark.parametrize("integrator, lit", [("path", 3), ("volpath", 2)])
 def test_light_that_no_ray_meets_comes_through_masks(load_text, integrator, lit):
-    """Onto a floor, from the side, through a screen that the camera does not see."""
+    """Light from the side reaches a floor through a screen that the camera does not see."""
     screen = (
         '<shape type="rectangle"><transform name="to_world"><scale value="30"/><rotate y="1" angle="-90"/>'
         '<translate x="5"/></transform><bsdf type="mask" id="screen"><float name="opacity" value="0.25"/>'
@@ -201,7 +201,7 @@ def test_light_that_no_ray_meets_comes_through_masks(load_text, integrator, lit)
         assert image[depth - 1].any() == (depth == lit)
 
 
-# What stands in front of the floor, and the shares of light that a pane inside lets through, and what is around it.
+# Bsdf around a pane -> share of light that the pane may transmit, share that passes beside the pane.
 PANES = {
     "{}": (1, 0),
     '<bsdf type="mask"><float name="opacity" value="0.25"/>{}</bsdf>': (0.25, 0.75),
@@ -213,7 +213,7 @@ PANES = {
 @pytest.mark.parametrize("integrator", [pytest.param("path", marks=pytest.mark.slow), "volpath"])
 @pytest.mark.parametrize("around", PANES)
 def test_light_that_no_ray_meets_comes_through_panes_where_they_are_no_bounce(load_text, around, integrator):
-    """Along their normal a share 2 n / (n^2 + 1), as in Mitsuba; onto a floor, out of sight of the camera."""
+    """They transmit 2 n / (n^2 + 1), the share at normal incidence, as in Mitsuba; the camera sees only the floor."""
     glass = '<float name="int_ior" value="1.5"/><float name="ext_ior" value="1"/>'
     pane = around.format(f'<bsdf type="thindielectric" id="pane">{glass}</bsdf>')
     place = '<transform name="to_world"><rotate y="1" angle="45"/><translate x="5" z="5"/></transform>'
@@ -237,7 +237,7 @@ def test_info_tells_of_a_pane_that_shadows_what_it_would_let_pass(load_text, int
 
 @pytest.mark.parametrize("kind, share", [("polarizer", 0.5), ("circular", 0.5), ("retarder", 1)])
 def test_sheets_that_polarise_let_a_share_through_and_absorb_the_rest(make_scene, kind, share):
-    """Seen before the sky, within 5 standard errors; the derivative is that of the mean in each sample."""
+    """In front of the sky, within 5 standard errors; derivatives within 3 %."""
     sheet = f'<bsdf type="{kind}" id="it"><float name="transmittance" value="0.8"/></bsdf>'
     scene = make_scene(PLATE.format(sheet) + SKY, res=8, fov=1)
     image, J = pj.jacobian(scene, ["it.transmittance"], spp=1024)
@@ -267,7 +267,7 @@ def test_a_furnace_of_masks_stays_white(make_scene):
 
 @pytest.fixture(scope="module")
 def screened(make_scene):
-    """A blend and a mask of half the opacity before it, under a lamp behind a screen of a quarter."""
+    """A blend behind a mask of opacity 1/2, under a lamp behind a screen of opacity 1/4."""
     half = '<float name="weight" value="0.4"/><bsdf type="diffuse"/>'
     metal = '<bsdf type="roughconductor"><float name="alpha" value="0.4"/></bsdf>'
     floor = f'<bsdf type="blendbsdf" id="floor">{half}{metal}</bsdf>'
