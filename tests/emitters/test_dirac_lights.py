@@ -1,4 +1,4 @@
-"""Lights without size, of which a point of a surface sees one direction: against closed forms and Mitsuba's own."""
+"""Dirac lights, which a point of a surface sees in one direction: against closed forms and Mitsuba's."""
 
 import math
 
@@ -19,7 +19,7 @@ from pathjax.kinds import Parameters, Row
 
 ALBEDO = np.array([0.2, 0.5, 0.8])
 GREY = '<bsdf type="diffuse" id="grey"><rgb name="reflectance" value="0.2, 0.5, 0.8"/></bsdf>'
-# It looks at the origin alone, and sees light that is reflected once.
+# A camera that sees only the origin, and light reflected once.
 VIEW = {"origin": "1, 2, 1.5", "fov": 1e-3, "res": 2, "depth": 2}
 # Samples lie within 3e-5 of the origin, and float32 adds 1e-6.
 NEAR = 2e-4
@@ -55,7 +55,7 @@ def plate(*steps, inside=GREY):
 FLOOR = plate()
 
 
-# One of each kind that gives no light, and a sheet that is out of the way: for scenes that share a kernel.
+# A dark light of each kind, and a sheet out of the way, so that scenes share a kernel.
 DARK = {
     kind: emitter(kind, color(name, 0, 0, 0), f"dark {kind}")
     for kind, name in (
@@ -67,7 +67,7 @@ BELOW = plate('<translate y="-9"/>', inside='<bsdf type="diffuse"/>')
 
 
 def under(kind, light, floor=FLOOR, sheet=BELOW):
-    """A floor under one light of this kind, and what lets all such scenes share a kernel."""
+    """Return a floor under one light of this kind, with the dark lights by which all such scenes share a kernel."""
     return floor + sheet + light + "".join(dark for other, dark in DARK.items() if other != kind)
 
 
@@ -76,7 +76,7 @@ def reflected(irradiance):
 
 
 def rendered(scene, **how):
-    """The mean of all pixels, one sample each."""
+    """Return the mean of all pixels, with one sample each."""
     return np.asarray(pj.render(scene, 1, **how), float).mean((0, 1))
 
 
@@ -101,7 +101,7 @@ def test_to_world_moves_the_origin_to_a_point_light(make_scene):
 
 
 def spot(angle, inside, distance=2.0):
-    """Straight above the origin, aimed `angle` degrees beside it."""
+    """A spot straight above the origin, aimed `angle` degrees beside it."""
     x, y = math.sin(math.radians(angle)), distance - math.cos(math.radians(angle))
     return emitter("spot", color("intensity", *INTENSITY) + inside + lookat((0, distance, 0), (x, y, 0)))
 
@@ -131,7 +131,7 @@ def cone(cutoff=None, beam=None):
 )
 def test_a_spot_falls_linearly_in_the_angle(make_scene, cutoff, beam, angle, falloff):
     scene = make_scene(under("spot", spot(angle, cone(cutoff, beam))), **VIEW)
-    # Samples lie within 1e-3 degrees, seen from the light; the narrowest ramp is 0.4 degrees wide.
+    # Seen from the light, samples lie within 1e-3 degrees; the narrowest ramp is 0.4 degrees wide.
     np.testing.assert_allclose(rendered(scene), reflected(INTENSITY * falloff / 4), rtol=3e-3 if falloff % 1 else NEAR)
 
 
@@ -145,13 +145,13 @@ def test_a_directional_light_falls_with_the_cosine(make_scene, tilt, given):
     scene = make_scene(under("directional", light, floor), **VIEW)
     normal = np.array([-math.sin(math.radians(tilt)), math.cos(math.radians(tilt)), 0])
     cosine = max(-towards @ normal / np.linalg.norm(towards), 0)
-    # The camera is behind the floor that is tilted most.
+    # The camera is behind the floor with the largest tilt.
     expected = reflected(np.array([1, 2, 3]) * cosine) * (normal @ [1, 2, 1.5] > 0)
     np.testing.assert_allclose(rendered(scene), expected, rtol=NEAR)
 
 
 def test_defaults_are_mitsubas(make_scene):
-    """1 in the origin, along z, within 20 degrees; a uniform spectrum has the colour that it has as a radiance."""
+    """Intensity 1 at the origin, along z, within 20 degrees; uniform spectra have the colour of uniform radiance."""
     wall = plate('<rotate x="1" angle="-90"/>', '<translate z="1"/>')
     for kind in ("point", "spot", "directional"):
         light = f'<emitter type="{kind}" id="{kind}"/>'
@@ -165,7 +165,7 @@ def test_defaults_are_mitsubas(make_scene):
 
 @pytest.mark.parametrize("at, lit", [((0, 0), 1), ((0.9, 0), 1), ((0, 0.9), 1), ((1.1, 0), 0), ((0, -1.1), 0)])
 def test_a_projector_lights_a_screen_evenly(make_scene, at, lit):
-    """It receives pi times `irradiance` over the square of the distance, wherever the picture falls."""
+    """Wherever the image falls, the screen receives pi times `irradiance` over the square of the distance."""
     x, z = -2 * at[0], -2 * at[1]
     above = lookat((x, 2, z), (x, 0, z), (0, 0, 1))
     light = emitter("projector", color("irradiance", 1, 2, 3) + lens(90) + above)
@@ -190,7 +190,7 @@ SHADOWS = [
 
 @pytest.mark.parametrize("name, kind", SHADOWS)
 def test_what_stands_in_the_way_casts_a_shadow(make_scene, name, kind):
-    """Glass too: a light without size is seen through it from no direction that a bsdf draws, in Mitsuba as here."""
+    """Glass casts one too: a direction sampled from its bsdf never meets a light without size, as in Mitsuba."""
     light = LAMPS[name]
     # Sheets of glass and of metal, one of them out of the way, share a kernel.
     others = "".join(BELOW.replace("diffuse", other) for other in SMOOTH if kind in SMOOTH and other != kind)
@@ -205,7 +205,7 @@ def test_what_stands_in_the_way_casts_a_shadow(make_scene, name, kind):
 
 
 def test_a_light_shines_off_the_wall_that_it_lies_in(make_scene):
-    """Far from the origin and aslant, where rounding hides the light from a tenth of all points."""
+    """In a tilted scene far from the origin, rounding alone would hide the light from a tenth of all points."""
     tilt, wide, there = np.radians(17), '<scale value="9"/>', '<translate x="1000" y="{}" z="1000"/>'
     tilted = '<rotate x="1" angle="17"/>'
     turn = np.array([[1, 0, 0], [0, np.cos(tilt), -np.sin(tilt)], [0, np.sin(tilt), np.cos(tilt)]])
@@ -234,7 +234,7 @@ def test_at_the_light_itself_nothing_is_nan():
 
 @pytest.mark.parametrize("kind", LAMPS)
 def test_images_are_linear_in_the_light(make_scene, kind):
-    """To the last bits, with the light that walls throw at each other."""
+    """Up to rounding, with interreflection."""
     ball = '<shape type="sphere"><point name="center" x="0.4" y="0.3" z="0"/><float name="radius" value="0.3"/></shape>'
     scene = make_scene(FLOOR + ball + "".join(LAMPS.values()), origin="1, 2, 1.5", depth=4)
     names = {light: f"{light}.{'irradiance' if light == 'directional' else 'intensity'}" for light in LAMPS}
@@ -290,8 +290,8 @@ LIGHTS = {
 
 @pytest.mark.parametrize("strategy", ["mis", pytest.param("light", marks=pytest.mark.slow)])
 def test_lights_of_all_kinds_add_up(make_scene, estimate, agree, strategy):
-    """z-test with the false-alarm rate of `agree`, 1e-4: one of them is chosen for each sample. Where the others are
-    dark each is exact, but the lamp, and the sky that it hides a part of, which 16,384 samples know to `NEAR`."""
+    """z-test with the false-alarm rate of `agree`, 1e-4, since each sample chooses one light. One light alone is exact,
+    except the lamp, and the sky that the lamp partly hides, which 16,384 samples estimate within `NEAR`."""
     together = make_scene(FLOOR + "".join(LIGHTS.values()), **VIEW)
     names = [name for name in pj.parameters(together) if not name.endswith("reflectance")]
     assert len(names) == len(LIGHTS)
@@ -311,7 +311,7 @@ def test_terms_of_the_series_and_first_hits(make_scene):
 
 
 def integral(falloff):
-    """Over the sphere, of a function of the angle in degrees."""
+    """Integrate a function of the polar angle in degrees over the sphere."""
     theta = (np.arange(2_000_000) + 0.5) / 2_000_000 * np.pi
     return 2 * np.pi * np.sum(falloff(np.degrees(theta)) * np.sin(theta)) * np.pi / 2_000_000
 
@@ -322,14 +322,14 @@ def table(kind, dtype=np.float32, **values):
 
 @pytest.mark.parametrize("cutoff, beam", [(20, 15), (90, 0), (50, 50), (170, 20), (2, 1)])
 def test_a_spot_is_chosen_by_the_root_of_its_share_of_directions(cutoff, beam):
-    """The error of an image is then least, if all directions are seen alike."""
+    """This minimises the error of an image if all directions are equally visible."""
     made = table(Spot, intensity=(3, 3, 3), cutoff_angle=cutoff, beam_width=beam)
     share = integral(lambda a: np.interp(a, [beam, cutoff + 1e-9], [1, 0])) / (4 * np.pi)
     np.testing.assert_allclose(Spot.power(AllRows(made)), [4 * 3 * np.sqrt(share)], rtol=1e-3)
 
 
 def test_the_narrowest_spot_has_some_power():
-    """Else it would never be chosen."""
+    """Otherwise it would never be chosen."""
     assert Spot.power(AllRows(table(Spot, cutoff_angle=1e-4)))[0] > 0
 
 
@@ -346,7 +346,7 @@ def mitsuba():
 
 @pytest.fixture(scope="module")
 def pictures(tmp_path_factory):
-    """File of 4 x 6 texels."""
+    """File with an image of 4 x 6 texels."""
     texels = np.random.default_rng(1).random((4, 6, 3), np.float32)
     file = tmp_path_factory.mktemp("pictures") / "small.exr"
     write_exr(file, {channel: texels[..., k] for k, channel in enumerate("RGB")}, {})
@@ -442,7 +442,7 @@ def test_bad_values_are_refused_with_file_line_and_cause(make_scene, light, word
 
 
 def test_a_strategy_that_meets_no_such_light_is_refused(make_scene):
-    """Without light samples their light would be missing from the image."""
+    """Without light samples the image would lack their light."""
     scene = make_scene(FLOOR + BULB + SUN + SKY)
     message = "'bsdf' misses all light of the point, directional emitters.*use one of mis, light$"
     for call in (

@@ -1,4 +1,4 @@
-"""Sampling a light integrates to its solid angle and irradiance, and a ray that finds it knows the same density."""
+"""Light samples integrate to solid angle and irradiance, and a ray that hits the light gets the same density."""
 
 from dataclasses import replace
 
@@ -24,11 +24,11 @@ from pathjax.shapes import Cube, Disk, Mesh, Rectangle, Sphere, geometry
 # Chance that a correct light fails one statistical comparison; seeds are fixed.
 FALSE_ALARM = 1e-5
 N = 60_000
-# Relative error that float32 leaves in a density seen at an angle.
+# Relative error of float32 in a density at oblique angles.
 ROUNDING = 2e-5
 RADIANCE = np.array([3.0, 2.0, 1.0])
 GREY = Diffuse.instance("grey")
-choice_of = jax.jit(emitters.choice, static_argnums=1)  # as in kernels, and one program
+choice_of = jax.jit(emitters.choice, static_argnums=1)  # jitted as in kernels; one program
 
 
 def affine(linear, translation):
@@ -68,7 +68,7 @@ def carried(points, m):
 
 
 def polygons_of(geo):
-    """Flat outlines (K, 3), counter-clockwise from the front."""
+    """Return flat outlines (K, 3), counter-clockwise seen from the front."""
     match geo:
         case Rectangle(m):
             return [carried(SQUARE, m)]
@@ -87,7 +87,7 @@ def polygons_of(geo):
 
 
 def solid_angle_and_irradiance(outline, ref, normal):
-    """Of the front of a polygon above the horizon: Van Oosterom and Strackee 1983; Lambert 1760."""
+    """For the front of a polygon above the horizon (Van Oosterom and Strackee 1983; Lambert 1760)."""
     front = np.cross(outline[1] - outline[0], outline[2] - outline[0])
     if np.dot(front, ref - outline[0]) <= 0:
         return 0.0, 0.0
@@ -142,17 +142,17 @@ def _sample(scene, choice, refs, u, u_part):
 
 
 def sampled_primitives(scene, ref, strategy="mis"):
-    """Primitives of N samples of the lights from one point."""
+    """Return the primitives of N light samples from one point."""
     refs = jnp.broadcast_to(jnp.asarray(ref, jnp.float32), (N, 3))
     choice = choice_of(scene.emitters, strategy)
     return np.asarray(_sample(replace(scene, about=None), choice, refs, *uniform(N, 1)).primitive)
 
 
 def sample_and_trace(scene, refs, strategy="mis"):
-    """N samples of the lights, shared out in blocks to `refs` (K, 3), and what a ray along each finds."""
+    """Return N light samples, in blocks for each of `refs` (K, 3), and what a ray along each sample hits."""
     refs = jnp.asarray(np.repeat(refs, N // len(refs), 0), jnp.float32)
     choice = choice_of(scene.emitters, strategy)
-    # Without its names: scenes of one structure then share a kernel, which saves most of the time of these tests.
+    # Without names, scenes of one structure share a kernel, which saves most of the time of these tests.
     out = _sample_and_trace(replace(scene, about=None), choice, refs, *uniform(len(refs), 1))
     return jax.tree.map(lambda x: np.asarray(x, np.float64) if x.dtype == jnp.float32 else np.asarray(x), out)
 
@@ -190,7 +190,7 @@ def test_samples_integrate_and_rays_agree(kind):
             error = values.std() / np.sqrt(each) + ROUNDING * truth
             assert 2 * stats.norm.sf(abs(values.mean() - truth) / error) > FALSE_ALARM, (ref, values.mean(), truth)
 
-    # The same direction, found by a ray. Samples on the last ulps of a rim may pass by.
+    # A ray along the sample hits the same light, except that samples on the last ulps of a rim may miss it.
     ok = drawn.pdf > 0
     same = ok & (hit.primitive == drawn.primitive)
     assert (ok & ~same).sum() <= 1e-4 * ok.sum()
@@ -257,7 +257,7 @@ def test_hard_positions_give_no_nan(case):
 
 
 def test_distant_sphere_keeps_its_solid_angle():
-    """1 - cos of a half angle of 1e-5 has no digit of its own in float32."""
+    """In float32, 1 - cos of a half angle of 1e-5 has no correct digit."""
     ref = CENTER + [0.5e5, 0, 0]
     drawn, _, _, _ = sample_and_trace(scene_of(shape(BALL)), [ref])
     np.testing.assert_allclose(1 / drawn.pdf, np.pi * 1e-10, rtol=1e-3)
@@ -300,7 +300,7 @@ def test_lights_are_chosen_by_power(strategy):
     assert choice.cdf[-1] == pytest.approx(1, abs=1e-6)
 
     primitive = sampled_primitives(scene, CENTER + [0, 0, 3], strategy)
-    # Primitives count the sphere, the rectangle, the disk and the triangles; the background is -1.
+    # Primitives are the sphere, the rectangle, the disk and the triangles, in this order; the background is -1.
     light = np.select([primitive == 0, primitive == 1, primitive == 2, primitive > 2], [1, 0, 3, 2], 4)
     counts = np.bincount(light, minlength=len(probability))
     assert stats.chisquare(counts, probability * N).pvalue > FALSE_ALARM
@@ -319,7 +319,7 @@ def test_triangles_of_a_mesh_are_chosen_by_area():
 
 
 def test_a_small_mesh_beside_a_large_one_is_sampled_all_over():
-    """A lamp of 1e-4 of the size of a window: the running area of both must keep the lamp's digits."""
+    """The lamp has 1e-4 of the size of the window, and the cumulative area of both must keep the lamp's digits."""
     large, small = convex_mesh(100.0), convex_mesh(0.01)
     window = Mesh(large.vertices + [0, 0, 1000], large.faces, None, None)
     scene = scene_of(shape(window), shape(small, RADIANCE * 1e8, name="lamp"))
@@ -331,7 +331,7 @@ def test_a_small_mesh_beside_a_large_one_is_sampled_all_over():
 
 
 def test_derivatives_of_the_choice_are_zero():
-    """Which light is drawn is not differentiated; its radiance is."""
+    """The choice of a light is not differentiated; its radiance is."""
     scene = scene_of(shape(Rectangle(PLACED)), shape(BALL, name="ball"))
     def pdf(scale):
         changed = with_parameters(scene, {"light.emitter.radiance": RADIANCE * scale})
@@ -341,7 +341,7 @@ def test_derivatives_of_the_choice_are_zero():
 
 
 def test_lights_are_sampled_by_their_weights(make_scene):
-    """Of equal lamps; strategy "light" finds alone what has the weight 0."""
+    """For equal lamps; strategy "light" ignores weights, since it must also find lamps of weight 0."""
     lamp = """<shape type="rectangle"><transform name="to_world"><translate x="{}"/></transform>
       <emitter type="area">{}</emitter></shape>"""
     weight = '<float name="sampling_weight" value="{}"/>'

@@ -1,4 +1,4 @@
-"""Pictures of all directions: against closed forms, against what is drawn from them, and against Mitsuba's own."""
+"""Environment maps: against closed forms, samples against densities, and images against Mitsuba's."""
 
 import subprocess
 import sys
@@ -29,11 +29,11 @@ BALLS = """<shape type="sphere"><point name="center" x="-1" y="0.8" z="0"/><floa
   <shape type="sphere"><point name="center" x="0.2" y="0.5" z="1.5"/><float name="radius" value="0.5"/>
     <bsdf type="dielectric"/></shape>"""
 VIEW = {"origin": "0.5, 2, 5", "target": "0, 0.5, 0"}
-LARGE = 33, 64  # texels of pictures above the floor, 8 pixels wide, of which all images are made by one kernel
+LARGE = 33, 64  # texels of images above the floor: with films 8 pixels wide, all are rendered by one kernel
 
 
 def picture(height, width, seed=0, hot=()):
-    """Random texels (H, W, 3), those of `hot` a thousand times as bright."""
+    """Return random texels (H, W, 3); those in `hot` are a thousand times as bright."""
     texels = np.random.default_rng(seed).uniform(0.1, 1, (height, width, 3)).astype(np.float32)
     for place in hot:
         texels[place] *= 1000
@@ -67,7 +67,7 @@ def directions(count, seed=1):
 
 
 def place(d, height, width):
-    """Rows and columns (N,) of directions (N, 3), counted in texels, of which centres are whole numbers."""
+    """Return rows and columns (N,) of directions (N, 3), in texels, whose centres are at whole numbers."""
     y = np.arctan2(np.hypot(d[:, 0], d[:, 2]), d[:, 1]) / np.pi * (height - 1)
     return y, np.arctan2(d[:, 0], -d[:, 2]) / (2 * np.pi) % 1 * width - 0.5
 
@@ -104,21 +104,21 @@ def test_radiance_is_bilinear_between_texels(name):
     texels, d = PICTURES[name], directions(2000)
     p = row(texels, scale=2.0, to_world=TURN)
     radiance, _ = seen(p._table, jnp.asarray(d, jnp.float32))
-    # Rounding of an angle, times the largest slope.
+    # The rounding of an angle, times the largest slope.
     rounding = 1e-6 * max(texels.shape[:2]) * texels.max()
     np.testing.assert_allclose(radiance, 2 * interpolated(texels, d @ TURN), rtol=1e-5, atol=rounding)
 
 
 @pytest.mark.parametrize("name", PICTURES)
 def test_directions_are_drawn_by_their_density(name):
-    """Chi-square over quarters of patches, as many as are expected to hold 10 samples."""
+    """Chi-square over those quarters of patches that are expected to hold 10 samples or more."""
     texels, count = PICTURES[name], 100_000
     height, width = max(len(texels), 2), texels.shape[1]
     p = row(texels)
     u = np.random.default_rng(3).integers(0, 1 << 23, (count, 3)) * 2.0**-23 + 2.0**-24
     d = np.asarray(drawn(p._table, jnp.asarray(u, jnp.float32)), float)
     np.testing.assert_allclose(np.linalg.norm(d, axis=1), 1, atol=1e-6)
-    # Quarters of equal solid angle: the density is bilinear, so its mean over one is that of its middle.
+    # Quarters of equal solid angle: the density is bilinear, so its mean over a quarter is its value in the middle.
     cos = np.cos(np.linspace(0, np.pi, height))
     cos = np.append(np.stack([cos[:-1], (cos[:-1] + cos[1:]) / 2], 1).ravel(), -1)
     _, x = place(d, height, width)
@@ -142,7 +142,7 @@ def test_directions_are_drawn_by_their_density(name):
 
 
 def test_tabled_probabilities_are_those_of_random_numbers():
-    """These are the odd multiples of 2^-24: as many of them fall into each patch as its probability says."""
+    """Random numbers are odd multiples of 2^-24, and each patch gets exactly its probability's share of them."""
     made = row(picture(8, 300, hot=[(3, 7)]))
     for cdf in (made.rows, *made.columns.reshape(7, 301)):
         steps = np.asarray(cdf, float) * 2**23
@@ -150,7 +150,7 @@ def test_tabled_probabilities_are_those_of_random_numbers():
 
 
 def test_density_follows_what_is_above_the_mean():
-    """Or a twentieth of the luminance, if that is more. Compared are means over patches, and what is within a patch."""
+    """Or 1/20 of the luminance where that is more. The test compares means over patches and values within patches."""
     texels = picture(9, 12, hot=[(4, 3)])
     texels[4, 3] /= 100
     p = row(texels)
@@ -165,14 +165,14 @@ def test_density_follows_what_is_above_the_mean():
         density = np.asarray(seen(p._table, jnp.asarray(d, jnp.float32))[1], float)
         wanted = interpolated(np.repeat(kept[..., None], 3, -1), d)[:, 0]
         ratios.append(weights @ density / (weights @ wanted))
-        # A sixteenth of it is even; and cosines for angles make 0.1 in rows as broad as these.
+        # 1/16 of the mean is added to it; and interpolation in cosines, not angles, changes rows this broad by 0.1.
         follows = (16 * wanted + weights @ wanted) / 17
         np.testing.assert_allclose(density / ratios[-1], follows, atol=0.1 * wanted.max())
     np.testing.assert_allclose(ratios, ratios[0], rtol=1e-3)
 
 
 def test_black_texels_are_looked_at_beside_bright_ones():
-    """So that light in them has a derivative of bounded weight."""
+    """So that derivatives in the light of black texels have bounded weights."""
     texels = np.zeros((9, 12, 3), np.float32)
     texels[4, 3] = 1
     t, f = np.array([4 - 1e-3, 5 - 1e-3]) / 8 * np.pi, np.full(2, (3 - 1e-3 + 0.5) / 12 * 2 * np.pi)
@@ -223,7 +223,7 @@ def test_double_precision(x64):
 
 @pytest.fixture(scope="module")
 def sky(tmp_path_factory):
-    """(texels, inside) -> an emitter that reads them from a file."""
+    """(texels, inside) -> element of an emitter that reads them from a file."""
     folder = tmp_path_factory.mktemp("skies")
     numbers = iter(range(1000))
 
@@ -249,7 +249,7 @@ def test_an_even_picture_is_a_constant_background(make_scene, sky, estimate, agr
 
 @pytest.mark.parametrize("strategy", ["mis", pytest.param("light", marks=pytest.mark.slow)])
 def test_a_bright_texel_lights_a_floor(make_scene, sky, estimate, agree, strategy):
-    """It is a tent over two patches, of the azimuth and the polar angle each, whose integral over sin cos is known."""
+    """It is a tent, two patches wide in azimuth and polar angle, whose integral weighted by sin cos is known."""
     texels = np.zeros((*LARGE, 3), np.float32)
     texels[10, 37] = [3000, 1000, 500]
     theta, step = 10 * np.pi / 32, np.pi / 32
@@ -268,7 +268,7 @@ def test_images_are_linear_in_the_scale(make_scene, sky):
 
 
 def test_texels_are_a_parameter(make_scene, sky):
-    """Set anew, traced or not, they are drawn as those of a file are; the image is linear in them."""
+    """New texels, traced or not, are sampled as those of a file are; the image is linear in them."""
     old, new = picture(*LARGE), picture(*LARGE, seed=5, hot=[(1, 2)])
     scene = make_scene(FLOOR + sky(old, name="texels"), **VIEW, res=8)
     read = make_scene(FLOOR + sky(new, name="texels"), **VIEW, res=8)
@@ -371,7 +371,7 @@ def test_arrays_are_pictures_too():
         assert list(pj.parameters(scene)) == ["sky.radiance", "sky.scale"]
     with pytest.raises(pj.InputError, match=r"must have the shape \(H, W\)"):
         pj.load_dict({"type": "scene", "view": camera, "sky": {"type": "envmap", "data": np.ones((2, 2, 5))}})
-    # Of a bitmap Mitsuba leaves alpha out.
+    # Mitsuba ignores the alpha of a bitmap.
     with_alpha = np.concatenate([texels, texels[..., :1]], -1)
     scene = pj.load_dict({"type": "scene", "view": camera, "sky": {"type": "envmap", "bitmap": with_alpha}})
     np.testing.assert_array_equal(scene.emitters[0].table.column("texels").values, texels.ravel())
@@ -415,10 +415,10 @@ def test_images_are_mitsubas(make_scene, mitsuba, sky, estimate, agree, estimate
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="reads what Linux tells of memory")
 def test_a_large_picture_is_loaded_without_copies(write_scene, sky):
-    """Beside its 100 MB there are two thirds as much of tables, and in passing 1.5 as much again at most.
+    """Its tables take two thirds of its own 100 MB, and at the peak at most 1.5 times that size is in use beside it.
 
-    In a process of its own, whose peak is that of this picture: getrusage tells that of the process it came from, if
-    that was higher.
+    The script runs in a process of its own and reads VmHWM, since getrusage would report the peak of the parent process
+    where that was higher.
     """
     path = write_scene(FLOOR + sky(np.tile(picture(64, 128), (32, 32, 1))), res=2)
     script = f"""

@@ -1,4 +1,4 @@
-"""Many lights in a tree: what is chosen, how often, and images that do not depend on it."""
+"""Many lights in a tree: chances of each light, and images that do not depend on them."""
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +16,7 @@ LIGHTS, SIDE = 13, 2.0
 
 
 def room(depth=3, kinds=("rectangle", "sphere", "point"), sky=False, lights=LIGHTS):
-    """A box of lights on the floor, of these kinds in turn."""
+    """Return a scene with lights in a box above the floor, of these kinds in turn."""
     rng, T = np.random.default_rng(5), pj.Transform
     scene = {
         "type": "scene",
@@ -70,13 +70,13 @@ def test_lights_are_found_as_often_as_their_probabilities_say(sky):
         known = np.append(known, chosen.pdf[near:])
         np.testing.assert_allclose(known.sum(), 1, rtol=1e-5)
         np.testing.assert_allclose(likely, known[number], rtol=1e-5)
-        # Evenly spread numbers: counts are within one of each border, of which there are two.
+        # Numbers are evenly spaced, so each of the two borders of a light shifts its count by at most one.
         np.testing.assert_allclose(np.bincount(number, minlength=count), known * draws, atol=4)
         assert stats.kstest(np.asarray(again[:, 0]), "uniform").pvalue > FALSE_ALARM
 
 
 def tree_of(points, normals, power):
-    """Of small lights."""
+    """Return the tree of small lights."""
     places = np.stack([points, points, normals], 1).astype(np.float32)
     leaf = light_tree.arranged(places)
     return jax.jit(light_tree.built)(jnp.asarray(places), jnp.asarray(leaf), jnp.asarray(power, jnp.float32))
@@ -86,7 +86,7 @@ probability = jax.jit(light_tree.probability)
 
 
 def test_lights_that_face_a_point_are_chosen_more_often():
-    """Two flat lights by the cosine; beside one that faces away, a round one by a quarter of its area."""
+    """Two flat lights by their cosines; beside one that faces away, a round one by a quarter of its power."""
     tilted = [(0, 0, 1), (0, np.sin(0.9), np.cos(0.9))]
     tree = tree_of([(0, 0, 0), (0, 0, 0)], tilted, [1, 1])
     least = light_tree._LEAST_AROUND / 4
@@ -106,7 +106,7 @@ def test_near_and_bright_lights_are_chosen_more_often():
 
 @pytest.mark.slow
 def test_images_do_not_depend_on_how_lights_are_chosen(agree, estimate, monkeypatch):
-    """Lights in the tree, by power, and found by bsdf sampling alone."""
+    """With lights chosen by the tree, by power, or hit by bsdf samples alone."""
     with_tree = room(kinds=("rectangle", "sphere"), sky=True)
     monkeypatch.setattr(light_tree, "FEWEST", LIGHTS + 1)
     by_power = room(kinds=("rectangle", "sphere"), sky=True)
@@ -119,7 +119,7 @@ def test_images_do_not_depend_on_how_lights_are_chosen(agree, estimate, monkeypa
 
 @pytest.mark.slow
 def test_derivatives_know_which_light_was_chosen():
-    """J^T v by the sweep, which looks lights up again, against J v by tangents."""
+    """J^T v by the sweep, which looks up the lights again, against J v by tangents."""
     scene = room(kinds=("rectangle", "sphere"))
     names = [f"light{number}.radiance" for number in range(LIGHTS)]
     rng = np.random.default_rng(0)

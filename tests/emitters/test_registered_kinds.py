@@ -1,4 +1,4 @@
-"""Kinds of light that a user's script registers are read from scene files, rendered, and differentiated."""
+"""Kinds of light registered by a user's script: read from scene files, rendered, and differentiated."""
 
 import math
 
@@ -14,7 +14,7 @@ from pathjax.kinds import Color, Number
 
 
 class Bulb(emitters.DiracEmitter):
-    """In the origin, moved along y."""
+    """A point light at (0, height, 0)."""
 
     intensity = Color(1.0, bounds=(0, math.inf), textured=False, radiance=True)  # W / sr
     height = Number(0.0)
@@ -32,7 +32,7 @@ class Bulb(emitters.DiracEmitter):
 
 
 class Sun(emitters.DiracEmitter):
-    """From straight above."""
+    """A distant light from straight above."""
 
     irradiance = Color(1.0, bounds=(0, math.inf), textured=False, radiance=True)
     distant = True
@@ -69,7 +69,7 @@ class Dome(emitters.Background):
 
 
 class Tinted(emitters.SurfaceEmitter):
-    """Green where it is seen along y, red where across."""
+    """Green seen along y, red seen across y."""
 
     strength = Number(1.0, bounds=(0, math.inf))
 
@@ -91,7 +91,7 @@ def registered(monkeypatch):
 
 FLOOR = """<shape type="rectangle"><transform name="to_world"><rotate x="1" angle="-90"/>{}</transform>
   <bsdf type="diffuse" id="floor"><rgb name="reflectance" value="0.5"/></bsdf></shape>"""
-# The point (0, 0, 0) of the floor, from above and aside.
+# The point (0, 0, 0) of the floor, seen obliquely from above.
 VIEW = {"origin": "1, 2, 1", "fov": 0.01, "res": 2, "depth": 2}
 
 
@@ -107,7 +107,7 @@ BULB = emitter("bulb", color("intensity", "6, 3, 0") + '<float name="height" val
 SUN = emitter("sun", color("irradiance", "1, 2, 3"))
 DOME = emitter("dome", color("radiance", "0.3, 0.6, 0.9"))
 SKY = emitter("constant", color("radiance", "0.1, 0.2, 0.4"))
-# Of a floor of albedo rho its share rho / pi of the irradiance: I / h^2; E; L integral of cos^2 = 2 pi / 3; pi L.
+# Radiance of a floor of albedo rho: rho / pi times the irradiance I / h^2; E; L integral of cos^2 = L 2 pi / 3; pi L.
 ANSWERS = {
     BULB: 0.5 / np.pi * np.array([6, 3, 0]) / 4,
     SUN: 0.5 / np.pi * np.array([1, 2, 3]),
@@ -125,7 +125,7 @@ def test_a_dirac_light_alone_leaves_no_noise(make_scene, light, strategy):
 
 @pytest.mark.parametrize("strategy", ["mis", "light"])
 def test_lights_of_all_kinds_add_up(make_scene, estimate, agree, strategy):
-    """Two that no ray hits, and two backgrounds, of which one is sampled by one strategy alone."""
+    """Two Dirac lights and two backgrounds, one of which is sampled by one strategy only."""
     scene = make_scene(FLOOR.format('<scale value="9"/>') + SKY + BULB + DOME + SUN, **VIEW)
     assert [emitters.name(lights) for lights in scene.emitters] == ["bulb", "constant", "sun", "dome"]
     agree(estimate(scene, 64, 16, strategy=strategy), sum(ANSWERS.values()), pixelwise=False)
@@ -145,7 +145,7 @@ def test_the_parameters_of_a_registered_kind_are_differentiated(make_scene):
     assert {"bulb.intensity", "bulb.height"} <= set(pj.parameters(scene))
     _, J = pj.jacobian(scene, ["bulb.intensity", "bulb.height"], 1)
     np.testing.assert_allclose(J["bulb.intensity"][0, 0], np.eye(3) * 0.5 / np.pi / 4, rtol=1e-4)
-    # d/dh of I / h^2 is -2 / h of it.
+    # d/dh of I / h^2 is -2 / h times I / h^2, with h = 2.
     np.testing.assert_allclose(J["bulb.height"][0, 0], -ANSWERS[BULB], rtol=1e-3)
 
 
@@ -154,7 +154,7 @@ LAMP = '<shape type="rectangle"><transform name="to_world"><rotate x="1" angle="
 
 @pytest.mark.parametrize("strategy", ["mis", pytest.param("light", marks=pytest.mark.slow)])
 def test_two_kinds_of_lamp_are_sampled_and_hit_as_one_another(make_scene, estimate, agree, strategy):
-    """What bsdf sampling alone finds of them; under a sphere of one kind, beside a rectangle of the other."""
+    """Images equal those of bsdf sampling alone; the lamps are a sphere of one kind and a rectangle of the other."""
     body = FLOOR.format('<scale value="9"/>') + LAMP.format('<translate y="2" x="1"/>', emitter("area"))
     body += '<shape type="sphere"><point name="center" x="-2" y="3" z="0"/>' + emitter("tinted") + "</shape>"
     scene = make_scene(body, **VIEW)

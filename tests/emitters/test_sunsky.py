@@ -1,4 +1,4 @@
-"""The clear sky: where its sun stands, what it sends down, what is drawn, and Mitsuba's own."""
+"""The clear sky: position of the sun, radiance, sampling, and values against Mitsuba's."""
 
 from __future__ import annotations
 
@@ -43,18 +43,18 @@ def parameters(scene):
     ],
 )
 def test_directions_are_drawn_by_their_density(values):
-    """Of a sun across the horizon, switched off, and below, where there is no light; wide, for the test's grid."""
+    """For a sun across the horizon, switched off, or below, where there is no light; it is wide for the test's grid."""
     testing.check_emitter(SunSky, samples=50_000, sun_aperture=20.0, **values)
 
 
 def test_a_wider_sun_shines_as_much():
-    """Its irradiance, radiance times solid angle."""
+    """The irradiance, radiance times solid angle, does not change."""
     usual, wide = sky(), sky(sun_aperture=10.0)
     np.testing.assert_allclose(wide.disc * wide.one_minus_cos, usual.disc * usual.one_minus_cos, rtol=1e-6)
 
 
 def test_its_power_is_the_mean_luminance_over_the_sphere():
-    """By points spread evenly over the sky, where the cells have four each."""
+    """By points spread evenly over the sky, four in each cell."""
     p, count = sky(sun_scale=0.0, sun=(0.0, 0.6, 0.8)), 20_000
     z, turn = (np.arange(count) + 0.5) / count, np.arange(count) * (np.sqrt(5) - 1) / 2
     r = np.sqrt(1 - z * z)
@@ -74,7 +74,7 @@ def test_its_power_is_the_mean_luminance_over_the_sphere():
     ],
 )
 def test_the_sun_stands_where_place_and_time_say(fields, direction):
-    """South is +x and west +y; within a quarter of a degree, by which the sun goes north on that day."""
+    """South is +x and west is +y; within a quarter of a degree, by which the sun moves north on that day."""
     greenwich = {"year": 2024, "month": 3, "day": 20, "longitude": 0.0, "timezone": 0.0}
     if "timezone" in fields:
         fields = {**fields, "hour": fields["hour"] + fields["timezone"]}
@@ -142,9 +142,9 @@ SKIES = [
 
 @pytest.mark.slow
 def test_radiance_is_that_of_mitsuba():
-    """In directions all over the sky, and within the sun; Mitsuba rounds angles, by 1e-4 of the radiance.
+    """In directions all over the sky and within the sun; Mitsuba rounds angles, which changes radiance by 1e-4 of it.
 
-    It rounds the solid angle of the sun, too, to the eight bits that float32 leaves of 1 - cos: that is undone.
+    It also rounds the solid angle of the sun to the eight bits that float32 leaves of 1 - cos; the test undoes that.
     """
     pytest.importorskip("mitsuba")
     rng, cases, found = np.random.default_rng(0), [], []

@@ -1,4 +1,4 @@
-"""Lights that textures cover: against the same light cut into pieces, and against Mitsuba."""
+"""Lights covered by textures: against the same light cut into pieces, and against Mitsuba."""
 
 import jax
 import numpy as np
@@ -15,7 +15,7 @@ COLORS = np.array([[[5, 1, 0], [0, 2, 4]], [[0, 0, 0], [3, 3, 30]]], np.float32)
 
 
 def lamp(inside, x=0.0, z=0.0, half=1.0, name="lamp"):
-    """A square one above the floor that faces down; u grows with x, v with z."""
+    """Return a square lamp above the floor that faces down; u grows with x, v with z."""
     return f"""<shape type="rectangle" id="{name}"><transform name="to_world"><rotate x="1" angle="90"/>
       <scale value="{half}"/><translate x="{x}" y="1.5" z="{z}"/></transform>{inside}</shape>"""
 
@@ -38,7 +38,7 @@ def picture(tmp_path_factory):
 
 
 def pieces():
-    """The same as four lamps of one colour each."""
+    """Return the same light as four lamps of one colour each."""
     colors = ((COLORS[j, i], i, j) for j in (0, 1) for i in (0, 1))
     parts = []
     for color, i, j in colors:
@@ -55,7 +55,7 @@ def test_a_picture_shines_as_its_texels_do(make_scene, picture, estimate, agree,
 
 
 def test_a_picture_is_seen_as_it_is(make_scene, picture):
-    """By the camera, from below."""
+    """The camera sees it from below."""
     scene = make_scene(lamp(area(picture)), origin="0, 0, 0", target="0, 1, 0", up="0, 0, 1", fov=10, res=2, depth=1)
     image = np.asarray(pj.render(scene, 16))
     expected = {tuple(color) for color in COLORS.reshape(-1, 3).tolist()}
@@ -70,7 +70,7 @@ def test_lights_are_chosen_by_the_mean_of_what_covers_them(make_scene, picture):
 
 
 def test_what_lights_are_chosen_by_follows_the_parameters_of_what_covers_them(make_scene, picture, tmp_path):
-    """Of boards of colours, of numbers, of pictures and of boards: as if the file had those values."""
+    """For checkerboards of colours, numbers, images or checkerboards: as if the file had the new values."""
     board = '<texture type="checkerboard" name="{}" id="{}">{}</texture>'.format
     uniform = '<texture type="uniform" name="color1" id="even"><float name="value" value="0.25"/></texture>'
     inner = board("color0", "inner", '<rgb name="color0" value="0.5, 0, 0"/>' + uniform)
@@ -88,7 +88,7 @@ def test_what_lights_are_chosen_by_follows_the_parameters_of_what_covers_them(ma
 
 
 def test_a_light_that_was_black_is_found_by_light_samples(make_scene):
-    """Beside another one, which alone had a power when the scene was loaded."""
+    """Beside another light, the only one with power when the scene was loaded."""
     black = CHECKS.replace("1, 0.5, 0", "0").replace("0, 0.1, 0.9", "0").replace("radiance", "irradiance")
     aimed = '<transform name="to_world"><lookat origin="0, 2, 0" target="0, 0, 0" up="0, 0, 1"/></transform>'
     projector = f'<emitter type="projector">{aimed}{black}</emitter>'
@@ -112,7 +112,7 @@ def test_images_are_linear_in_the_colours_of_a_light(make_scene):
 
 @pytest.mark.slow
 def test_texels_of_a_floor_under_such_a_light_are_differentiated(make_scene, picture):
-    """By a sweep over the paths, against differences; images are all but linear in albedos of one bounce."""
+    """The sweep over paths against differences; images of one bounce are nearly linear in albedos."""
     reflectance = picture.replace("radiance", "reflectance").replace("four", "floor")
     file = reflectance.split('value="')[1].split('"')[0]
     write_exr(file, {channel: np.full((2, 2), 0.5, np.float32) for channel in "RGB"}, {})
@@ -145,7 +145,7 @@ def test_what_cannot_cover_a_light_is_refused(make_scene, tmp_path):
 
 @pytest.mark.slow
 def test_light_samples_find_what_bsdf_samples_do(make_scene, picture, estimate, agree):
-    """Of a cube, whose faces share one picture."""
+    """For a cube, whose faces share one image."""
     scene = make_scene(FLOOR + lamp(area(picture), half=0.4).replace('"rectangle"', '"cube"'), **VIEW)
     agree(estimate(scene, 256, strategy="bsdf"), estimate(scene, 256, strategy="light", first_seed=90))
 
