@@ -19,7 +19,7 @@ FACES = [[0, 1, 2], [0, 2, 3]]
 
 
 def ply(of_vertices=(), vertex_rows=None, of_faces=(), face_rows=None, faces=FACES):
-    """A text PLY of a square; further properties as "type name"."""
+    """Return a text PLY of a square, with further properties as "type name"."""
     header = ["ply", "format ascii 1.0", f"element vertex {len(POINTS)}", *(f"property float {x}" for x in "xyz")]
     header += [*(f"property {each}" for each in of_vertices), f"element face {len(faces)}"]
     header += ["property list uchar int vertex_indices", *(f"property {each}" for each in of_faces), "end_header"]
@@ -72,14 +72,14 @@ def test_integers_are_shares_of_the_largest(attributes):
 
 
 def test_attributes_follow_their_faces_and_vertices(attributes):
-    """A quad and a triangle, one of two faces that have no area, and corners that get a normal of their own."""
+    """For a quad and a triangle, beside a face without area, with vertices that are split to get their own normals."""
     faces = [[0, 1, 1], [0, 1, 2, 3], [0, 2, 1]]
     text = ply(named("r", "g", "b"), COLORS.tolist(), named("r", "g", "b"), [(9, 9, 9), (1, 2, 3), (4, 5, 6)], faces)
     made, _ = attributes(text)
     np.testing.assert_array_equal(made.attributes["face_color"], [(1, 2, 3)] * 2 + [(4, 5, 6)])
     for vertex, color in zip(made.vertices, made.attributes["vertex_color"], strict=True):
         np.testing.assert_allclose(color, COLORS[POINTS.index(tuple(vertex.astype(int)))])
-    assert len(made.vertices) > 4  # the faces of both sides cancel in their normals
+    assert len(made.vertices) > 4  # normals of faces on both sides cancel, so vertices are split
 
 
 def body(folder, attribute="vertex_color", more="", shape="ply"):

@@ -36,7 +36,7 @@ def wrapped(i, n, wrap):
 
 
 def reference(tex, uv):
-    """(N, 2) -> (N, 3), float64."""
+    """Look up a texture in NumPy: uv (N, 2) -> colours (N, 3), float64."""
     made, tex = tex, SimpleNamespace(**tex.values)
     if tex.to_uv is not None:
         uv = np.c_[uv, np.ones(len(uv))] @ tex.to_uv.T
@@ -82,19 +82,19 @@ TO_UV = np.array([[2.0, 0.5, 0.25], [-0.5, 3.0, -0.125]])
 
 
 def test_bitmaps_are_those_of_numpy():
-    """All wraps and both interpolations beside each other in one table, images of different sizes."""
+    """All wrap modes and both filters are in one table, with images of different sizes."""
     kinds = [(i, w) for i in ("bilinear", "nearest") for w in WRAPS]
     made = [bitmap(3 + k, 7 - k, k, nearest=i == "nearest", wrap=w) for k, (i, w) in enumerate(kinds)]
     uv = random_uv()
     found = lookup_all(made, uv)
     for tex, colors in zip(made, found, strict=True):
-        # Fractions of a texel are rounded at |uv| < 3 times a size of 8.
+        # Rounding of texel coordinates, which are up to 3 times a size of 8.
         tolerance = 1e-5
         wrong = np.abs(colors - reference(tex, uv)).max(1) > tolerance
         if tex.values["nearest"]:
             size = np.array(tex.values["texels"].shape[1::-1])
             place = np.float64(np.float32(uv)) * size
-            wrong &= np.abs(place - np.round(place)).min(1) > 1e-5  # on a border either side is right
+            wrong &= np.abs(place - np.round(place)).min(1) > 1e-5  # on a border either texel is right
         assert not wrong.any(), (tex.values["nearest"], tex.values["wrap"], uv[wrong][:3])
 
 
@@ -102,7 +102,7 @@ def test_to_uv_is_applied_before_the_look_up():
     made = [bitmap(4, 5, to_uv=TO_UV), checkerboard(TO_UV)]
     uv = np.random.default_rng(5).uniform(-2, 2, (5000, 2))
     place = (np.c_[uv, np.ones(len(uv))] @ TO_UV.T) * 2
-    clear = np.abs(place - np.round(place)).min(1) > 1e-4  # of the checkerboard's borders
+    clear = np.abs(place - np.round(place)).min(1) > 1e-4  # away from the checkerboard's borders
     for tex, colors in zip(made, lookup_all(made, uv), strict=True):
         np.testing.assert_allclose(colors[clear], reference(tex, uv)[clear], atol=2e-5)
 
@@ -114,7 +114,7 @@ def test_checkerboard_starts_with_color0_and_repeats():
 
 @pytest.mark.parametrize("holds", ["numbers", "a board"])
 def test_a_board_of_numbers_is_that_of_mitsuba(holds):
-    """Whose `eval_1` begins with the other colour than its `eval`."""
+    """Mitsuba's `eval_1` starts with the other colour than its `eval`."""
     mi = pytest.importorskip("mitsuba")
     mi.set_variant("scalar_rgb")
     inner, theirs = 0.7, 0.7
@@ -132,19 +132,19 @@ def test_a_board_of_numbers_is_that_of_mitsuba(holds):
         expected.append(theirs.eval_1(si))
     known = {}
     found = lookup_all([textures.of_number(ours, known)], uv)[0][:, 0]
-    assert (np.abs(found - expected) < 1e-6).mean() > 0.99  # but for rounding at the borders
+    assert (np.abs(found - expected) < 1e-6).mean() > 0.99  # except for rounding at borders
     assert textures.of_number(ours, known) is known[ours]
 
 
 def nested():
-    """A board of an image and of a board of another board."""
+    """Return a checkerboard of an image and a checkerboard that holds a third one."""
     inner = Checkerboard.instance("inner", color0=checkerboard(), color1=0.5, to_uv=np.diag([5.0, 3.0, 1.0])[:2])
     outer = np.array([[2.0, 0, 0.1], [0, 1.5, 0.2]])
     return Checkerboard.instance("outer", color0=bitmap(4, 6), color1=inner, to_uv=outer)
 
 
 def test_a_board_of_textures_looks_them_up_at_the_uv_of_the_surface():
-    """Beside others, among them some that it holds and that stand alone, too."""
+    """In a table with other textures, some of which it also holds."""
     board = nested()
     image, inner = board.values["color0"], board.values["color1"]
     uv = random_uv()
@@ -198,7 +198,7 @@ def test_textures_are_those_of_mitsuba(kind):
         more = {"bitmap": image, "raw": True, "filter_type": kind, "wrap_mode": "mirror"}
     theirs = mi.load_dict({"type": "checkerboard" if kind == "checkerboard" else "bitmap", "to_uv": transform, **more})
     uv = np.random.default_rng(7).random((300, 2))
-    place = (np.c_[uv, np.ones(len(uv))] @ TO_UV.T) * np.array([12, 12])  # every border of the three
+    place = (np.c_[uv, np.ones(len(uv))] @ TO_UV.T) * np.array([12, 12])  # the borders of all three textures
     uv = uv[np.abs(place - np.round(place)).min(1) > 1e-3]
     si = mi.SurfaceInteraction3f()
     expected = []
@@ -223,7 +223,7 @@ SCENE = """<scene version="3.0.0">
 
 
 class Ramp(textures.Texture):
-    """From one colour to another along u."""
+    """A ramp from one colour to another along u."""
 
     left = Color(0.2, textured=False)
     right = Color(0.8, textured=False)
@@ -241,7 +241,7 @@ def test_a_users_texture_is_rendered_and_differentiated(tmp_path, monkeypatch):
     scene = pj.with_parameters(scene, {"it.left": [0.0, 0, 0]})
     image, jacobian = pj.jacobian(scene, ["it.left", "it.right"], spp=64)
     lit = np.asarray(image)[3:5, 3:5, 0]
-    # One bounce under a sky of 1: the image is the texture, and its derivatives are the shares of the two.
+    # One bounce under a sky of 1: the image is the texture, and its derivatives are the shares of the two colours.
     np.testing.assert_allclose(lit.mean(), 0.4, atol=0.01)
     shares = [np.asarray(jacobian[name])[3:5, 3:5, 0, 0].mean() for name in ("it.left", "it.right")]
     np.testing.assert_allclose(shares, [0.5, 0.5], atol=0.02)

@@ -1,4 +1,4 @@
-"""Volumes as textures: what a surface has of them, derivatives in their values, what files say."""
+"""Volumes as textures: values on surfaces, derivatives in values, and scene files."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def record(data, wrap="clamp", nearest=False):
 
 
 def wrapped(i, size, wrap):
-    """Where cell i of an endless row lies in one of this size."""
+    """Return the cell, in a row of this size, that cell i of an endless row stands for."""
     if wrap == "mirror":
         i = i % (2 * size)
         return np.where(i < size, i, 2 * size - 1 - i)
@@ -37,7 +37,7 @@ def wrapped(i, size, wrap):
 
 @pytest.mark.parametrize("wrap, nearest", CHOICES)
 def test_a_surface_has_the_values_of_where_it_is(wrap, nearest):
-    """Also beyond the grid; a smaller one of one channel lies before it in the table."""
+    """Also beyond the grid; a smaller volume of one channel precedes it in the table."""
     data = RNG.random((3, 4, 2, 3))
     other = Volume.instance("other", volume=record(RNG.random((1, 2, 1, 1))))
     made, codes = textures.build(
@@ -57,7 +57,7 @@ def test_a_surface_has_the_values_of_where_it_is(wrap, nearest):
         return made.look_up(jnp.asarray(codes[it], jnp.int32), SimpleNamespace(uv=surfaces.uv, p=p))
 
     found = jax.jit(jax.vmap(look_up))(jnp.asarray(p, jnp.float32))
-    # Where a face of cells is nearer than rounding either side is right.
+    # Within rounding of a face between cells either side is right.
     near = (np.abs(x + 0.5 * nearest - np.rint(x + 0.5 * nearest)) < 1e-4).any(1)
     np.testing.assert_allclose(found[~near], expected[~near], atol=1e-5)
     assert near.mean() < 0.05
@@ -69,7 +69,7 @@ def test_volumes_pass_the_checks_of_textures(wrap, nearest):
 
 
 def scene(reflectance, **more):
-    """A plate that fills the film, under a sky: its colour is the image."""
+    """Return a scene of a plate that fills the film, under a sky: the image is its colour."""
     film = {"type": "hdrfilm", "width": 4, "height": 4, "filter": {"type": "box"}}
     camera = {"type": "orthographic", "to_world": pj.Transform().translate([0, 0, -3]).matrix, "film": film}
     plate = {"type": "rectangle", "flip_normals": True, "bsdf": {"type": "diffuse", "id": "it", **reflectance}}
@@ -84,7 +84,7 @@ def volume(data, **more):
 
 
 def test_a_plate_shows_a_slice_and_its_derivative_is_the_share_of_the_image():
-    """Between two layers, of which the farther one is twice as bright; columns of cells are halves of the plate."""
+    """The plate lies between two layers, the farther twice as bright; each column of cells covers half of it."""
     data = np.stack([np.full((1, 2), 0.2), np.full((1, 2), 0.4)])
     made = scene(volume(data, filter_type="nearest"))
     np.testing.assert_allclose(pj.render(made, spp=4), 0.4, rtol=1e-5)
