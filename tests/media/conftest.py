@@ -1,4 +1,4 @@
-"""What the tests of media share."""
+"""Fixtures shared by the tests of media."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pathjax.kinds import Parameters
 
 @pytest.fixture
 def average_to_1():
-    """(medium, ray, throughput, count, rounding) -> weights of flights, whose mean is 1 by 4 standard errors."""
+    """(medium, ray, throughput, count, rounding) -> weights of flights, whose mean it asserts to be 1."""
 
     def check(medium, ray, throughput, count, rounding):
         scattering = media.Homogeneous.scattering(medium, media.Isotropic.instance())

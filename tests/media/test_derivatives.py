@@ -1,4 +1,4 @@
-"""Derivatives of surfaces in scenes with media, and what follows from those of media: fits."""
+"""Derivatives in parameters of surfaces in scenes with media, and fits of media."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ pytestmark = pytest.mark.slow
 
 
 def test_a_sweep_adds_up_what_the_jacobian_holds(shipped, monkeypatch):
-    """Of surfaces and lights in a scene with media, where paths meet particles between them."""
+    """For surfaces and lights in a scene with media, in which paths scatter between them."""
     scene = shipped("media", res=16)
     wanted = {name: find(scene, name) for name in pj.parameters(scene)}
     wanted = {name: parameter for name, parameter in wanted.items() if matrix_free.is_swept(scene, parameter)}
@@ -42,7 +42,7 @@ def test_both_branches_of_glass_may_be_followed_in_media(shipped, estimate, agre
 
 
 def test_an_extinction_is_recovered_from_an_image(make_scene):
-    """Of a ball that only absorbs, within 4 standard errors (a false alarm in 5,000, of three colours)."""
+    """For a ball that only absorbs, within 4 standard errors (a false alarm in 5,000, over three channels)."""
     text = """<shape type="sphere"><bsdf type="null"/><medium type="homogeneous" name="interior" id="ink">
       <rgb name="sigma_t" value="{}"/><float name="albedo" value="0"/></medium></shape><emitter type="constant"/>"""
     wanted = np.array([0.4, 0.7, 1.0])

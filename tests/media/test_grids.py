@@ -1,4 +1,4 @@
-"""Media whose extinction and albedo stand in grids: integrals along rays, light, derivatives, and what files say."""
+"""Media with extinction and albedo in grids: integrals along rays, light, derivatives, and scene files."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from pathjax.media import grids
 from pathjax.media.gridvolume import GridVolume, boxed, read_vol, write_vol
 
 slow = pytest.mark.slow
-CUBE = pj.Transform().scale(2).translate([-0.5, -0.5, -0.5]).matrix  # the unit cube becomes that from -1 to 1
+CUBE = pj.Transform().scale(2).translate([-0.5, -0.5, -0.5]).matrix  # maps the unit cube to [-1, 1]^3
 NAME = "cube_interior.sigma_t"
 
 
@@ -28,7 +28,7 @@ def volume(data, to_world=CUBE, **more):
 
 
 def record(data, to_world, nearest=False):
-    placed = boxed(np.ones(3), to_world).box  # of the same unit cube
+    placed = boxed(np.ones(3), to_world).box  # box of the same unit cube
     to_cells = np.diag([*data.shape[2::-1], 1.0])
     to_cells[:3, 3] = -0.5
     return GridVolume(data, (to_cells @ np.linalg.inv(to_world))[:3], placed, nearest=nearest)
@@ -48,7 +48,7 @@ TURNED = pj.Transform().rotate([1, 2, 3], 40).scale([2, 1.5, 1]).translate([-0.6
 
 @pytest.fixture(scope="module", params=["trilinear", "nearest", "one of each"])
 def two(request):
-    """Grids of one number and of three."""
+    """Grids of one channel and of three."""
     data, filters = (RNG.random((3, 4, 2, 1)) * 3, RNG.random((1, 5, 3, 3))), request.param
     one = record(data[0], TURNED, nearest=filters != "trilinear")
     return grids.build([one, record(data[1], CUBE, nearest=filters == "nearest")], np.float32)
@@ -56,8 +56,8 @@ def two(request):
 
 @pytest.mark.parametrize("form", [pytest.param("lanes", marks=slow), "vmap"])
 def test_depths_are_integrals_of_what_is_looked_up(two, form):
-    """The midpoint rule is off by its own error alone, some 1e-3 of what it adds up, and by half a step for each face
-    at which values jump by up to 3.
+    """The only difference is the error of the midpoint rule: some 1e-3 of the sum, and half a step for each face at
+    which values jump by up to 3.
     """
     o, d = rays(300)
     number = jnp.arange(300, dtype=jnp.int32) % 2
@@ -104,7 +104,7 @@ def test_a_distance_is_where_the_depth_is_reached(two):
 def test_weights_of_a_flight_average_to_1_in_a_grid_of_colours(average_to_1):
     fog = media.Heterogeneous.instance("it", sigma_t=record(RNG.random((3, 3, 3, 3)) * 3, np.eye(4)), albedo=np.ones(3))
     ray = Ray(jnp.array([-0.2, 0.3, 0.4]), jnp.array([0.8, 0.0, 0.6]), jnp.float32(jnp.inf), jnp.int32(-1))
-    average_to_1(fog, ray, jnp.array([1.0, 0.2, 3.0]), 100_000, 1e-5)  # of a way in parts
+    average_to_1(fog, ray, jnp.array([1.0, 0.2, 3.0]), 100_000, 1e-5)  # rounding over the parts of a flight
 
 
 # ---- light ----------------------------------------------------------------------------------------------------------
@@ -121,7 +121,7 @@ def scene(inside):
 
 @slow
 def test_what_absorbs_in_a_grid_is_beers_law_and_so_is_its_derivative():
-    """Along z values are 1, 3, 2; they stay so in the outer halves of the cells, each 2/3 thick."""
+    """Along z values are 1, 3, 2, and constant in the outer halves of the outer cells; each cell is 2/3 thick."""
     fog = {"type": "heterogeneous", "albedo": 0.0, "scale": 0.7, "sigma_t": volume(np.reshape([1, 3, 2], (3, 1, 1)))}
     made = scene(fog)
     depth = (1 / 2 + (1 + 3) / 2 + (3 + 2) / 2 + 2 / 2) * 2 / 3
@@ -132,7 +132,7 @@ def test_what_absorbs_in_a_grid_is_beers_law_and_so_is_its_derivative():
 
 @slow
 def test_cells_that_are_not_interpolated_absorb_by_beers_law_and_so_do_derivatives_in_them():
-    """Each cell is 2/3 thick; of the image's derivative in it the share is drawn by points on the way."""
+    """Each cell is 2/3 thick; points sampled along the ray estimate each cell's share of the image's derivative."""
     cells = np.reshape([1.0, 3, 2], (3, 1, 1))
     fog = {"type": "heterogeneous", "albedo": 0.0, "sigma_t": volume(cells, filter_type="nearest")}
     made = scene(fog)
@@ -143,7 +143,7 @@ def test_cells_that_are_not_interpolated_absorb_by_beers_law_and_so_do_derivativ
         return pj.render(pj.with_parameters(made, {NAME: values}), 1024).mean()
 
     found = jax.grad(image)(pj.parameters(made)[NAME])
-    # Of 4096 points a third is expected in each cell: within 4 standard errors.
+    # A third of 4096 points is expected in each cell; within 4 standard errors.
     np.testing.assert_allclose(found.ravel() / (-2 * through), 1 / 3, atol=4 * np.sqrt(2 / 9 / 4096))
 
 
@@ -162,7 +162,7 @@ def test_the_nearest_value_is_that_of_the_cell():
 
 @slow
 def test_values_of_a_grid_are_a_parameter():
-    """As above: the centres of cells share a way evenly. Its point is drawn, but shares add up to 1 in each sample."""
+    """As above, cells share a flight evenly. A point of it is sampled, but shares add up to 1 in each sample."""
     cells = np.reshape([1, 3, 2], (3, 1, 1))
     made = scene({"type": "heterogeneous", "albedo": 0.0, "scale": 0.7, "sigma_t": volume(cells)})
     values = pj.parameters(made)[NAME]
@@ -176,7 +176,7 @@ def test_values_of_a_grid_are_a_parameter():
 
     found = jax.grad(lambda x: image(x).mean())(values)
     np.testing.assert_allclose(found.sum(), -0.7 * 2 * through, rtol=1e-4)
-    # Of 1024 points a third is expected in each cell: within 4 standard errors.
+    # A third of 1024 points is expected in each cell; within 4 standard errors.
     np.testing.assert_allclose(found.ravel() / found.sum(), 1 / 3, atol=4 * np.sqrt(2 / 9 / 1024))
     pushed = jax.jvp(image, (values,), (jnp.ones_like(values),))[1]
     np.testing.assert_allclose(pushed, -0.7 * 2 * through, rtol=1e-4)
@@ -184,7 +184,7 @@ def test_values_of_a_grid_are_a_parameter():
 
 @slow
 def test_products_in_grids_are_the_transpose_of_each_other():
-    """<v, J u> = <J' v, u> to rounding, of extinctions and albedos of two media, one in the light of the other."""
+    """<v, J u> = <J' v, u> to rounding, for extinctions and albedos of two media, one in the shadow of the other."""
 
     def ball(name, y, radius, **medium):
         inside = {"type": "heterogeneous", "id": name, **medium}
@@ -230,7 +230,7 @@ def test_volumes_that_are_no_parameters_are_refused_by_name():
 
 @slow
 def test_a_grid_is_fitted():
-    """What absorbs in 2 x 2 columns, seen along them, within 5 standard errors."""
+    """The extinction of 2 x 2 columns, seen along them, within 5 standard errors."""
     columns = np.reshape([0.5, 1, 1.5, 0.8], (1, 2, 2))
     to_world = pj.Transform().translate([0, 0, -3]).matrix
     film = {"type": "hdrfilm", "width": 16, "height": 16, "filter": {"type": "box"}}
@@ -247,7 +247,7 @@ def test_a_grid_is_fitted():
 
 @slow
 def test_a_constant_extinction_fills_the_unit_cube_of_what_is_heterogeneous():
-    """As in Mitsuba. One of four pixels looks through it, for the axis lies on its edge."""
+    """As in Mitsuba. One of four pixels looks through the cube, since the camera's axis lies on its edge."""
     for made in (2.0, {"type": "constvolume", "value": 2.0}):
         image = pj.render(scene({"type": "heterogeneous", "albedo": 0.0, "sigma_t": made}), spp=1)
         np.testing.assert_allclose(np.sort(image[..., 0], None), [np.exp(-2), 1, 1, 1], rtol=1e-5)
@@ -258,7 +258,7 @@ def test_a_constant_extinction_fills_the_unit_cube_of_what_is_heterogeneous():
 
 @slow
 def test_a_grid_of_one_value_is_the_value():
-    """Of the albedo too, and with derivatives of what stays a number."""
+    """Also for the albedo, and for derivatives in parameters that are not grids."""
     even = {"type": "homogeneous", "albedo": 0.6, "sigma_t": 1.2, "scale": 0.9}
     names = ["cube_interior.scale", "sky.radiance"]
     cells = np.full((2, 3, 2), 1.0)
@@ -270,7 +270,7 @@ def test_a_grid_of_one_value_is_the_value():
 
 
 def test_a_grid_that_repeats_is_laid_side_by_side():
-    """At points of its box, turned in space, it interpolates what stands at whole numbers, modulo the size."""
+    """At points of its rotated box it interpolates the values at integer coordinates, modulo the size."""
     data = RNG.random((3, 4, 2, 1))
     made = record(data, TURNED)
     tiled = grids.build([made.repeated(made.box)], np.float32)
@@ -311,7 +311,7 @@ BLEND = """<phase type="blendphase"><float name="weight" value="0.3"/>
     ],
 )
 def test_clouds_agree_with_mitsuba(tmp_path, wrap, values, phase):
-    """Means over 16 seeds, of blocks of 4 x 4 pixels: of 192 numbers none is off by 5 errors (t-test, 1 in 1000)."""
+    """Means over 16 seeds and blocks of 4 x 4 pixels: none of 192 is off by 5 standard errors (t-test, 1 in 1000)."""
     pytest.importorskip("mitsuba")
     write_vol(tmp_path / "sigma.vol", RNG.random((4, 3, 5, 1)) * 3)
     write_vol(tmp_path / "albedo.vol", RNG.random((3, 4, 2, 3)))
@@ -361,7 +361,7 @@ def test_a_saved_scene_has_its_grids_in_files(tmp_path):
 
 
 def test_a_saved_scene_has_the_values_of_its_grids(tmp_path):
-    """Also where the file's box is the grid's, which other values do not move."""
+    """Also where the grid's box is that of the file, which new values do not move."""
     write_vol(tmp_path / "a.vol", RNG.random((2, 3, 4, 1)), np.array([[-1.0, 0, 0], [1, 2, 1]]))
     file = {"type": "gridvolume", "filename": str(tmp_path / "a.vol"), "use_grid_bbox": True}
     made = scene({"type": "heterogeneous", "albedo": volume(RNG.random((2, 1, 2, 3))), "sigma_t": file})

@@ -1,4 +1,4 @@
-"""Radiance in media, and its derivatives, against closed forms and quadrature; and what is hard on numbers."""
+"""Radiance in media and its derivatives, against closed forms and quadrature; numerically hard cases."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ def medium(phase=None, **colours):
 
 
 def slab(inside, thickness=1.0):
-    """Between the planes z = 0 and z = thickness, far wider than what is seen of it."""
+    """Return a slab between the planes z = 0 and z = thickness, far wider than the visible part."""
     to_world = pj.Transform().scale([2, 2, thickness / 2]).translate([0, 0, thickness / 2])
     return {"type": "cube", "id": "slab", "to_world": to_world.matrix, "bsdf": NULL, "interior": inside}
 
 
 def scene(depth=-1, res=2, width=1e-3, integrator="volpath", sensor=(), **things):
-    """Seen from z = -3 along z by parallel rays that are `width` apart from the axis at most."""
+    """Return a scene, seen from z = -3 along z by parallel rays at most `width` away from the axis."""
     to_world = pj.Transform().scale([width, width, 1]).translate([0, 0, -3])
     film = {"type": "hdrfilm", "width": res, "height": res, "filter": {"type": "box"}}
     camera = {"type": "orthographic", "to_world": to_world.matrix, "film": film, **dict(sensor)}
@@ -52,7 +52,7 @@ def test_a_slab_absorbs_as_beer_and_lambert_say(thickness):
     sigma = np.array([0.3, 1.0, 4.0])
     made = scene(sky=SKY, slab=slab(medium(albedo=0.0, sigma_t=tuple(sigma / thickness)), thickness))
     image, J = pj.jacobian(made, ["slab_interior.sigma_t", "slab_interior.scale"], spp=1)
-    # Faces are left clear of rounding, some 1e-6 of the distances in the scene.
+    # Rays leave faces by a margin for rounding, some 1e-6 of the distances in the scene.
     rtol = 1e-5 + 3e-6 / thickness
     expected = np.array([1, 2, 3]) * np.exp(-sigma)
     np.testing.assert_allclose(image, np.broadcast_to(expected, image.shape), rtol=rtol)
@@ -70,7 +70,7 @@ def test_of_media_that_only_absorb_no_scattering_is_compiled():
 
 @slow
 def test_one_that_scatters_draws_what_another_absorbs_too(estimate, agree):
-    """A slab of no albedo beside one that scatters, elsewhere: the same light by chance."""
+    """With a scattering medium elsewhere, a slab of albedo 0 transmits the same light in expectation."""
     other = {"type": "sphere", "center": [9, 0, 0], "bsdf": NULL, "interior": medium()}
     made = scene(sky=SKY, slab=slab(medium(albedo=0.0, sigma_t=(0.3, 1.0, 4.0), scale=0.5)), other=other)
     assert made.media.scatters
@@ -103,13 +103,13 @@ SIGMA, ALBEDO, G = np.array([0.4, 1.0, 2.5]), np.array([0.9, 0.5, 0.2]), 0.6
 
 
 def single_scattering(sigma, albedo, g, count=4000):
-    """Along the axis of a cube [-1, 1]^3 around LIGHT or beside it, by the midpoint rule."""
+    """Integrate along the axis of the cube [-1, 1]^3, with LIGHT inside or outside, by the midpoint rule."""
     z = -1 + (np.arange(count) + 0.5) * 2 / count
     p = np.stack([np.zeros_like(z), np.zeros_like(z), z], -1)
     to_light = LIGHT - p
     distance = np.linalg.norm(to_light, axis=1)
     d = to_light / distance[:, None]
-    leaves = ((np.sign(d) - p) / d).min(1)  # where the way to the light goes out of the cube
+    leaves = ((np.sign(d) - p) / d).min(1)  # distance at which the ray to the light leaves the cube
     cos = d[:, 2]
     phase = (1 - g * g) / (4 * np.pi * (1 + g * g - 2 * g * cos) ** 1.5)
     way = (z + 1 + np.minimum(leaves, distance))[:, None]
@@ -130,7 +130,7 @@ def test_single_scattering_is_that_of_quadrature(lit_cube, estimate, agree):
 
 @slow
 def test_derivatives_of_single_scattering_are_those_of_quadrature(lit_cube, derivatives, agree):
-    """In albedo and extinction, by channel, and in g."""
+    """In albedo and extinction, per channel, and in g."""
     at = {"cube_interior.sigma_t": 0, "cube_interior.albedo": 1, "cube_interior.g": 2}
     _, found = derivatives(lit_cube, list(at), spp=1024, count=8)
     for name, place in at.items():
@@ -157,7 +157,7 @@ def test_the_camera_may_lie_in_a_medium():
 
 @slow
 def test_nested_media_follow_each_other():
-    """A sphere of radius 1/2 in one of radius 1, whose medium is outside of the inner one."""
+    """A sphere of radius 1/2 in one of radius 1, whose medium is the exterior of the inner one."""
     outer, inner = medium(albedo=0.0, sigma_t=0.5), {**medium(albedo=0.0, sigma_t=2.0), "id": "inner"}
     ball = {"type": "sphere", "bsdf": NULL, "interior": {**outer, "id": "outer"}}
     small = {
@@ -173,7 +173,7 @@ def test_nested_media_follow_each_other():
 
 @slow
 def test_what_has_no_medium_outside_leaves_paths_in_none():
-    """As in Mitsuba: the inner sphere says nothing of the medium around it, so behind it there is none."""
+    """As in Mitsuba: the inner sphere has no exterior medium, so behind it paths are in none."""
     ball = {"type": "sphere", "bsdf": NULL, "interior": medium(albedo=0.0, sigma_t=0.5)}
     small = {"type": "sphere", "radius": 0.5, "bsdf": NULL, "interior": medium(albedo=0.0, sigma_t=2.0)}
     image = pj.render(scene(sky=SKY, ball=ball, small=small), spp=1)
@@ -202,7 +202,7 @@ def test_no_number_is_nan_whatever_the_extinction(sigma):
 
 
 def test_weights_of_a_flight_average_to_1(average_to_1):
-    """Of all colours, also of one that the path carries nothing of, at the end of any distance."""
+    """In all channels, also one in which the throughput is 0, for flights of any length."""
     fog = media.Homogeneous.instance("it", sigma_t=np.array([0.1, 1.0, 10.0]), albedo=np.ones(3))
     weights = average_to_1(fog, RAY, jnp.array([0.0, 0.2, 3.0]), 200_000, 1e-6)
     assert weights.max() <= 1 / media.LEAST

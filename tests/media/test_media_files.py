@@ -1,4 +1,4 @@
-"""What scene files may say of media, and what is wrong with them: place, cause, remedy."""
+"""Media in scene files, and errors with place, cause and remedy."""
 
 from __future__ import annotations
 
@@ -130,7 +130,7 @@ def test_what_looks_like_an_oversight_is_told(read, body, says):
 
 @pytest.mark.parametrize("bounded", [True, False])
 def test_light_of_a_sky_does_not_get_through_fog_without_end_which_is_told(file, bounded):
-    """In Mitsuba its light samples are dimmed over a finite way."""
+    """In Mitsuba its light samples are attenuated over a finite distance."""
     inside = '<bsdf type="null"/><ref name="interior" id="fog"/>' if bounded else ""
     body = f"""<medium type="homogeneous" id="fog"/><emitter type="constant" id="sky"/>
         <shape type="sphere"><float name="radius" value="9"/>{inside}</shape>"""

@@ -1,4 +1,4 @@
-"""Phase functions: densities, samples and mean cosines, and those that a user's script registers."""
+"""Phase functions: densities, samples and mean cosines, and kinds registered by a user's script."""
 
 import math
 
@@ -34,7 +34,7 @@ def test_the_mean_cosine_is_g(g):
     u = jnp.asarray(np.random.default_rng(1).random((SAMPLES, 2)), jnp.float32)
     wo = np.asarray(jax.vmap(lambda u: media.HG.sample(Row(table, 0), u))(u), float)
     cos = -wo[:, 2]
-    # 4 standard errors, a false alarm in 16,000; and rounding of what was near -1 or 1.
+    # 4 standard errors, a false alarm in 16,000; and rounding of cosines near -1 or 1.
     assert abs(cos.mean() - g) < 4 * cos.std() / math.sqrt(SAMPLES) + 1e-6
 
 
@@ -47,7 +47,7 @@ def test_a_table_is_drawn_by_its_density(values):
 
 
 def test_tables_of_any_length_stand_beside_each_other():
-    """Each is the straight lines between its values, up to its scale, and has their mean cosine."""
+    """Each interpolates its values linearly, up to scale, and its samples have the mean cosine of that density."""
     made = [media.TabPhase.instance(values=np.array(values, float)) for values in TABLES]
     table = media.TabPhase.build(made, np.float32, (), Parameters(), None)
     cos = np.linspace(-1, 1, 20_001)
@@ -60,7 +60,7 @@ def test_tables_of_any_length_stand_beside_each_other():
         np.testing.assert_allclose(2 * np.pi * found, lines, rtol=1e-4, atol=1e-4 * lines.max())
         sample = jax.jit(jax.vmap(lambda u, row=row: media.TabPhase.sample(Row(table, row), u)))
         drawn = -np.asarray(sample(u), float)[:, 2]
-        # 4.5 standard errors for each of five: a false alarm in 30,000; and the steps of the table of shares.
+        # 4.5 standard errors for each of five, a false alarm in 30,000; and the steps of the cumulative table.
         assert abs(drawn.mean() - np.trapezoid(lines * cos, cos)) < 4.5 * drawn.std() / math.sqrt(SAMPLES) + 1e-5
 
 
