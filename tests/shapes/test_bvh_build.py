@@ -1,4 +1,4 @@
-"""The tree encloses, partitions and finds what brute force finds, whatever the boxes; rules differ in cost only."""
+"""For any boxes the tree encloses and partitions them and finds brute force's hits; rules differ in cost only."""
 import dataclasses
 import time
 
@@ -21,7 +21,7 @@ def random_boxes(n, seed=0, size=0.05):
 
 
 def surface(n):
-    """Boxes of n triangles of a wavy sheet: what a mesh looks like to the builder."""
+    """Return boxes of the 2 (n - 1)^2 triangles of a wavy sheet, as an example of a mesh."""
     u, v = np.meshgrid(np.linspace(0, 1, n), np.linspace(0, 1, n), indexing="ij")
     p = np.stack([u, v, 0.1 * np.sin(9 * u) * np.cos(7 * v)], -1).astype(np.float32)
     tri = np.concatenate([np.stack([p[:-1, :-1], p[1:, :-1], p[:-1, 1:]], 2).reshape(-1, 3, 3),
@@ -30,7 +30,7 @@ def surface(n):
 
 
 def check(tree, lo, hi, leaf_size=8, width=8):
-    """Every invariant that `Tree` states, by walking it."""
+    """Assert every invariant that `Tree` states."""
     p, n, leaves = len(lo), len(tree.child), len(tree.leaf_first)
     assert tree.bounds.shape == (n, 2, 3, 8) and tree.child.shape == (n, 8)
     dtypes = [a.dtype for a in (tree.bounds, tree.child, tree.leaf_first, tree.leaf_count, tree.order)]
@@ -41,7 +41,7 @@ def check(tree, lo, hi, leaf_size=8, width=8):
     assert 1 <= (tree.child != 0).sum(1).min() and (tree.child != 0).sum(1).max() <= width
     assert np.array_equal(np.isnan(tree.bounds), np.broadcast_to((tree.child == 0)[:, None, None], tree.bounds.shape))
     assert tree.leaf_count.min() >= 1 and tree.leaf_count.max() <= leaf_size
-    assert np.array_equal(tree.leaf_first, np.cumsum(tree.leaf_count) - tree.leaf_count)  # so no primitive in two
+    assert np.array_equal(tree.leaf_first, np.cumsum(tree.leaf_count) - tree.leaf_count)  # so no primitive is in two
     assert tree.leaf_count.sum() == p and tree.sah_cost > 0
     leaf = np.repeat(np.arange(leaves), tree.leaf_count)
     assert (np.diff(tree.order)[leaf[1:] == leaf[:-1]] > 0).all()
@@ -70,7 +70,7 @@ def alike(first, *others):
 
 
 def enter(lo, hi, o, d, axis):
-    """Distance at which a ray enters boxes, inf if it misses or the box is NaN; `axis` is that of x, y, z."""
+    """Return where a ray enters boxes: inf if it misses or the box is NaN; `axis` is that of x, y, z."""
     shape = [3 if a == axis % lo.ndim else 1 for a in range(lo.ndim)]
     o, d = o.reshape(shape), d.reshape(shape)
     a, b = (lo - o) / d, (hi - o) / d
@@ -79,7 +79,7 @@ def enter(lo, hi, o, d, axis):
 
 
 def closest_box(tree, lo, hi, o, d):
-    """Walk the tree as the renderer does, nearest octant first. Returns distance, and how many nodes were tested."""
+    """Walk the tree as the renderer does, nearest octant first; return the distance and the number of nodes tested."""
     best, nodes, stack = np.inf, 0, [0]
     octant = sum(int(d[a] < 0) << a for a in range(3))
     while stack:
@@ -194,7 +194,7 @@ def test_splits_sought_in_two_steps_cost_about_as_little_as_all_tried(boxes, mon
     cost = build(*boxes).sah_cost
     monkeypatch.setattr(binary, "PLACES", len(boxes[0]))
     assert cost < 1.02 * build(*boxes).sah_cost
-    monkeypatch.setattr(binary, "PLACES", 2)  # the fewest: halves, and halves of halves
+    monkeypatch.setattr(binary, "PLACES", 2)  # the least: halves, and halves of halves
     check(build(*boxes), *boxes)
 
 
@@ -202,7 +202,7 @@ def test_splits_sought_in_two_steps_cost_about_as_little_as_all_tried(boxes, mon
 def test_the_same_tree_on_any_number_of_cores(rule, monkeypatch):
     monkeypatch.setattr(cores, "SMALL", 0)
     monkeypatch.setattr(binary, "FEW", 100)
-    monkeypatch.setattr(binary, "BATCH", 500)  # so that some nodes are divided among cores, and others dealt to them
+    monkeypatch.setattr(binary, "BATCH", 500)  # some nodes are split among cores, others are assigned to one
     trees = []
     for number in (1, 2, 5):
         monkeypatch.setattr(cores, "cores", lambda number=number: number)

@@ -1,6 +1,6 @@
-"""Surfaces that lie in one another: no light is lost between them, and what is visible is what a gap would show.
+"""Coincident surfaces: no light is lost between them, and the visible one is the same as with a small gap.
 
-A surface of reflectance 1/2 that sees all of a sky of radiance 1 has the radiance 1/2, exactly, by bsdf sampling.
+With bsdf sampling, a surface of reflectance 1/2 under an unoccluded sky of radiance 1 has exactly the radiance 1/2.
 """
 
 import numpy as np
@@ -32,7 +32,7 @@ def turned(angle):
 
 @pytest.fixture
 def obj(tmp_path):
-    """(vertices, faces, inside) -> what stands inside a <shape type="obj"> of flat faces."""
+    """(vertices, faces, inside) -> content of a <shape type="obj"> with flat faces."""
     numbers = iter(range(100))
 
     def write(vertices, faces, inside=GREY):
@@ -73,9 +73,9 @@ PAIRS = {
 
 @pytest.fixture
 def among_others(obj):
-    """(pair, steps) -> its shapes, moved by these steps, and others deep below, where nothing is seen of them.
+    """(pair, steps) -> the shapes of the pair, moved by these steps, and others far below, out of view.
 
-    Of each kind there are four, two of which lie in one another at least: one structure, and one kernel for all pairs.
+    There are four of each kind, at least two of which coincide, so all pairs share one structure and one kernel.
     """
     square = obj(SQUARE, HALVES)
 
@@ -122,7 +122,7 @@ def test_a_sphere_twice_swallows_no_light(make_scene, transform):
 
 @pytest.mark.parametrize("z", [0, 0.01, 0.1, 1])
 def test_faces_that_a_mesh_holds_twice_swallow_no_light(make_scene, obj, z):
-    """With opposite winding, as modellers write what shall be seen from both sides."""
+    """With opposite winding, as modellers write faces that are visible from both sides."""
     doubled = obj(np.add(SQUARE, [0, 0, z]), HALVES + [face[::-1] for face in HALVES])
     assert_half_everywhere(make_scene(shape("obj", "", doubled) + SKY, fov=20, depth=2, res=8))
 
@@ -130,7 +130,7 @@ def test_faces_that_a_mesh_holds_twice_swallow_no_light(make_scene, obj, z):
 @pytest.mark.parametrize("height", [0, -0.01, -1, -20])
 @pytest.mark.parametrize("distance", [1e3, 1e4, 1e5])
 def test_rays_from_an_edge_are_not_stopped_by_the_neighbour(make_scene, obj, distance, height):
-    """Along the diagonal of a square, or the ridge of a roof, of two triangles in planes through the origin."""
+    """The edge is the diagonal of a square or the ridge of a roof: two triangles in planes through the origin."""
     ends = [[-50, -50, 0], [50, -50, height], [50, 50, 0], [-50, 50, height]]
     k = distance / 3**0.5
     fov = float(np.degrees(2 * np.arctan(0.004 * 8 / 2 / distance)))
@@ -151,9 +151,9 @@ KINDS = ["rectangle", "obj"]
 @pytest.mark.parametrize("wall", KINDS)
 @pytest.mark.parametrize("lamp", KINDS)
 def test_a_lamp_in_the_plane_of_a_wall_shines_as_one_before_it(make_scene, obj, lamp, wall, tilt):
-    """Also where the wall stands first in the file; what a gap of 1e-3 changes by itself is 3e-3.
+    """Also where the wall comes first in the file; a gap of 1e-3 itself changes the image by 3e-3.
 
-    Behind the wall, dark, stands one of each kind that the wall is not, and that the lamp is not: they share a kernel.
+    The kinds that wall and lamp do not have stand dark behind the wall, so all cases share a kernel.
     """
 
     def image(gap):
@@ -182,7 +182,7 @@ def test_a_lamp_in_the_plane_of_a_wall_shines_as_one_before_it(make_scene, obj, 
 def test_between_glass_and_what_it_touches_there_is_air(make_scene, obj, glass, below, tilt):
     tops = {"cube": GLASS, "obj": obj(CUBE, SIDES, GLASS)}
     bottoms = {"rectangle": GREY, "obj": obj(SQUARE, HALVES), "cube": GLASS}
-    hidden = '<scale value="0.1"/><translate z="-20"/>'  # behind all: with them all cases share a kernel
+    hidden = '<scale value="0.1"/><translate z="-20"/>'  # behind everything, so that all cases share a kernel
     others = [(kind, tops[kind]) for kind in tops if kind != glass]
     others += [(kind, bottoms[kind]) for kind in bottoms if kind != below]
 
@@ -204,7 +204,7 @@ def test_between_glass_and_what_it_touches_there_is_air(make_scene, obj, glass, 
 
 @pytest.mark.parametrize("tilt", ["", '<rotate x="0.8" y="0.6" angle="10"/>', TILTED])
 def test_a_slab_that_is_a_mesh_has_both_its_faces_at_a_millionth_of_its_size(make_scene, obj, tilt):
-    """The bound on the rounding of a distance stays below; see `test_hard_cases` for cubes, which may be thinner."""
+    """This is above the rounding bound of distances; see `test_hard_cases` for cubes, which may be thinner."""
     lamp = shape("rectangle", '<scale value="5"/><translate z="-6"/>', LAMP)
 
     def image(thickness):
@@ -238,7 +238,7 @@ def test_scenes_in_which_nothing_coincides_hold_nothing_for_it(shipped):
     [
         (rectangle(1), True),
         (rectangle(1 + 1e-12), True),  # as transforms round
-        (rectangle(1 + 2**-21), False),  # four ulps apart: a sheet of its own
+        (rectangle(1 + 2**-21), False),  # four ulps apart: a separate sheet
         (rectangle(1, x=2), True),  # side by side, they share an edge
         (rectangle(1, x=2.1), False),
     ],
@@ -257,7 +257,7 @@ def test_copies_get_a_margin_wherever_they_stand_among_thousands():
 
 @pytest.mark.parametrize("planes", [1, 70])
 def test_of_a_large_mesh_the_triangles_in_a_plane_are_found(planes, monkeypatch):
-    """Hills around a level field, on which a rectangle lies, turned as a whole; other rectangles cut through them."""
+    """Hills around a level field with a rectangle on it, all rotated; other rectangles cut through them."""
     rng = np.random.default_rng(planes)
     turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
     side = int(np.sqrt(cores.SMALL / 2)) + 2
@@ -288,7 +288,7 @@ def test_of_a_large_mesh_the_triangles_in_a_plane_are_found(planes, monkeypatch)
 
 @pytest.mark.parametrize("count, distance", [(0, 1), (1, 1), (2, 0), (300, 1e-9), (300, 0.2)])
 def test_close_pairs_are_those_of_all_pairs(count, distance):
-    """Of points on a lattice, some of them twice, some nearly so."""
+    """For points on a lattice, some of which coincide exactly or nearly."""
     generator = np.random.default_rng(1)
     points = generator.integers(0, 4, (count, 3)) + generator.choice([0, 1e-10, 0.1], (count, 1))
     between = np.linalg.norm(points[:, None] - points, axis=-1)

@@ -1,4 +1,4 @@
-"""Cylinders: rays hit what float64 says they hit, points and normals lie on them, and light is drawn by its density."""
+"""Cylinders: hits agree with float64, points and normals lie on the surface, and light samples have their density."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def seen(shapes, o, d):
 
 
 def reference(shapes, o, d):
-    """Distances (N, P) in float64, and whether rounding of coordinates of size 1 may decide."""
+    """Return distances (N, P) in float64, and whether rounding of coordinates of size 1 may decide."""
     t, unsure = [], []
     for shape in shapes:
         to_local = np.linalg.inv(shape.to_world)
@@ -104,7 +104,7 @@ def test_rays_hit_as_float64_says(count, uneven):
     assert clear.mean() > 0.8 and (t.min(1) < np.inf).sum() > 500
     np.testing.assert_allclose(np.asarray(hit.t)[clear], t.min(1)[clear], rtol=1e-4, atol=1e-5)
     met = clear & (t.min(1) < np.inf)
-    # Where two are met at once either may be told.
+    # Where two are hit at the same distance either may be reported.
     told = np.asarray(hit.primitive)[met]
     assert (t[met, told] <= t[met].min(1) * (1 + 1e-4) + 1e-5).all()
 
@@ -122,7 +122,7 @@ def test_points_and_normals_lie_on_cylinders_of_every_size_and_place(scale, shif
     assert len(met) > 300
     to_world = np.array([shape.to_world for shape in shapes])[np.asarray(hit.primitive)[met]]
     to_local = np.linalg.inv(to_world)
-    rounding = 1e-5 * (1 + shift / scale)  # relative to the cylinder, of coordinates of the size of the shift
+    rounding = 1e-5 * (1 + shift / scale)  # relative to the cylinder; coordinates are as large as the shift
     p = np.float64(surface.p)[met]
     local = np.einsum("nij,nj->ni", to_local[:, :3, :3], p) + to_local[:, :3, 3]
     np.testing.assert_allclose(np.hypot(*local[:, :2].T), 1, atol=20 * rounding)
@@ -174,7 +174,7 @@ def test_disks_close_a_cylinder_without_a_gap():
         caps.append(Disk(m @ np.diag([1, 1, 0.1, 1])))
     shapes = scene_of(tube, *caps).geometry
     o = np.float32((tube.to_world @ [0.1, 0.2, 0.5, 1])[:3])
-    # Towards the rims, to within rounding of them.
+    # Rays towards the rims, to within rounding.
     angle = rng.uniform(0, 2 * np.pi, 50_000)
     near = rng.uniform(-3e-7, 3e-7, (2, 50_000))
     radius = 1 + near[0]
@@ -223,7 +223,7 @@ def test_light_is_drawn_with_the_density_that_is_told(uneven):
         return drawn, hit, geometry.lamp_density(scene.geometry, lamps, jnp.int32(0), ray, hit, surface)
 
     drawn, hit, density = jax.tree.map(np.asarray, draw(u))
-    front = (drawn.n * drawn.d).sum(1) < -0.1  # where it is seen edge-on, rounding moves what is hit
+    front = (drawn.n * drawn.d).sum(1) < -0.1  # where it is seen edge-on, rounding changes the hit
     assert front.mean() > 0.3
     np.testing.assert_allclose(hit.t[front], drawn.distance[front], rtol=1e-3)
     np.testing.assert_allclose(density[front], drawn.pdf[front], rtol=2e-2)
@@ -233,7 +233,7 @@ def test_light_is_drawn_with_the_density_that_is_told(uneven):
     local = np.stack([np.cos(angle), np.sin(angle), z, np.ones_like(z)], -1).reshape(-1, 4)
     m = shapes[0].to_world
     p = (local @ m.T)[:, :3]
-    # Normal times area: of an edge around, and of the axis.
+    # Normal times area: the cross product of the derivative around and the axis.
     n = np.cross(local[:, :1] * m[:3, 1] - local[:, 1:2] * m[:3, 0], m[:3, 2])
     to_p = p - np.float64(ref)
     squared = (to_p**2).sum(1)
@@ -242,7 +242,7 @@ def test_light_is_drawn_with_the_density_that_is_told(uneven):
     np.testing.assert_allclose(scene.emitters[0].lamps.area, np.linalg.norm(n, axis=1).mean() * 2 * np.pi, rtol=1e-5)
     facing = ((drawn.n * drawn.d).sum(1) < 0) & (drawn.pdf > 0)
     values = np.where(facing, 1 / np.where(facing, drawn.pdf, 1), 0).astype(float)
-    # One in 15,000 that a right sampler fails.
+    # A correct sampler fails once in 15,000.
     assert abs(values.mean() - expected) < 4 * values.std() / np.sqrt(len(values))
 
 
@@ -251,7 +251,7 @@ def test_the_inner_wall_is_drawn_only_where_the_outer_one_does_not_hide_it(uneve
     shapes = cylinders(1, seed=2, uneven=uneven)
     scene = scene_of(*shapes, light=Area.instance("l", radiance=np.ones(3)), flip=True)
     lamps, m = scene.emitters[0].lamps, shapes[0].to_world
-    # Around it, above its end, and inside.
+    # Beside it, beyond its end, and inside.
     refs = np.float32([[0.5, 2.0, 0.3], (m @ [0.4, 0.2, 2.5, 1])[:3], (m @ [0.4, 0.2, 0.5, 1])[:3]])
     u = jnp.asarray(np.random.default_rng(0).random((4000, 2)), jnp.float32)
 
@@ -289,7 +289,7 @@ def test_strategies_agree_on_a_cylinder_that_shines_inwards(make_scene, estimate
 
 @pytest.mark.slow
 def test_a_closed_cylinder_that_shines_inside_has_the_radiance_of_the_geometric_series(write_scene):
-    """L = Le / (1 - rho) everywhere, by patches, whose areas are those of the surface."""
+    """L = Le / (1 - rho) everywhere, by patches whose areas add up to that of the surface."""
     inside = """<emitter type="area"><rgb name="radiance" value="1"/></emitter>
     <bsdf type="diffuse"><rgb name="reflectance" value="0.5"/></bsdf></shape>"""
     top = '<transform name="to_world"><rotate x="1" angle="180"/><translate z="1"/></transform>'

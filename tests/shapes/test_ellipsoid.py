@@ -1,4 +1,4 @@
-"""Ellipsoids: rays hit what float64 says they hit, points and normals lie on them, and so do derivatives."""
+"""Ellipsoids: hits agree with float64, and points, normals and derivatives are those of the surface."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def seen(shapes, o, d, exclude):
 
 
 def reference(shapes, o, d):
-    """Distances (N, P) in float64, and whether rounding of coordinates of size 1 may decide."""
+    """Return distances (N, P) in float64, and whether rounding of coordinates of size 1 may decide."""
     t, unsure = [], []
     for shape in shapes:
         to_local = np.linalg.inv(shape.to_world)
@@ -116,7 +116,7 @@ def test_a_ray_that_leaves_an_ellipsoid_meets_its_other_side_alone():
 
 
 def test_derivatives_are_those_of_the_surface(x64):
-    """Central differences in float64, of the point, the normal and uv in the ray's origin."""
+    """Central differences in float64 of the point, the normal and uv in the ray's origin."""
     with x64():
         shapes = scene_of(ellipsoids(2, seed=3), dtype=jnp.float64).geometry
         o, d = (np.float64(x) for x in rays(300, seed=2))
@@ -127,7 +127,7 @@ def test_derivatives_are_those_of_the_surface(x64):
             return jnp.concatenate([surface.p, surface.n, surface.uv])
 
         hit, surface = seen(shapes, o, d, np.full(len(o), -1, np.int32))
-        # Where it is seen edge-on second derivatives have no bound.
+        # Where the surface is seen edge-on, second derivatives are unbounded.
         clear = (np.asarray(hit.primitive) >= 0) & (np.abs((np.asarray(surface.n) * d).sum(1)) > 0.2)
         args = (x[clear] for x in (o, d, np.asarray(hit.t), np.asarray(hit.primitive)))
         o, d, t, primitive = args
@@ -144,7 +144,7 @@ def test_derivatives_are_those_of_the_surface(x64):
 
 
 def test_two_in_one_place_are_left_together():
-    """Also where one is turned in its own space, which does not change it."""
+    """Also where one is rotated in its local space, which does not change its surface."""
     (one,) = ellipsoids(1)
     turned = Ellipsoid(one.to_world @ Transform().rotate([0.6, 0, 0.8], 40).matrix)
     assert scene_of([one, *ellipsoids(1, seed=9)]).geometry.tables[0].margins is None
@@ -152,7 +152,7 @@ def test_two_in_one_place_are_left_together():
 
 
 def test_a_furnace_holds_an_ellipsoid_and_patches_do_not():
-    """White and lit from all sides, it cannot be told from the sky, within rounding: nothing is lost or met twice."""
+    """White and lit from all sides, it equals the sky up to rounding: no light is lost, and no surface is met twice."""
     ball = {"type": "sphere", "bsdf": {"type": "diffuse", "reflectance": 1.0}}
     shown = {"type": "instance", "to_world": Transform().rotate([0, 0, 1], 30).scale([1, 0.4, 0.7])}
     scene = pj.load_dict(

@@ -1,4 +1,4 @@
-"""Rays hit what float64 brute force says they hit: every shape, every scale, with trees and without."""
+"""Hits agree with float64 brute force, for every shape and scale, with trees and without."""
 
 from dataclasses import replace
 
@@ -66,19 +66,19 @@ def _occluded(shapes, *rays):
     return native_map(lambda x, shapes: geometry.occluded(shapes, Ray(*x[0]), x[1]), (rays, targets), shapes)
 
 
-# Rays of a call, and of a tree the least numbers of nodes, leaves, primitives and levels: scenes of one kind then share
-# a kernel, and compiling is what takes time.
+# Rays per call, and least numbers of nodes, leaves, primitives and levels of a tree: with them scenes of one kind share
+# a kernel, since compilation takes most of the time.
 RAYS, NODES, LEAVES, PRIMITIVES, DEPTH = 4096, 512, 2048, 2048, 8
 
 
 def longer(x, least):
-    """x (N, ...) with rows of zeros behind it, which nothing refers to, up to a power of 2."""
+    """Pad x (N, ...) with unreferenced rows of zeros, up to a power of 2."""
     size = max(least, 1 << (len(x) - 1).bit_length())
     return np.pad(np.asarray(x), [(0, size - len(x)), *[(0, 0)] * (x.ndim - 1)])
 
 
 def roomy(shapes):
-    """The same shapes, with room for more in what lies in a tree, and for more primitives behind all others."""
+    """Return the same shapes with padded trees, and with padding behind the last primitives."""
     tables = []
     for table in shapes.tables:
         if getattr(table, "tree", None) is not None:
@@ -96,7 +96,7 @@ def roomy(shapes):
 
 
 def asked(query, shapes, *rays):
-    """What a query says of each ray, NumPy arrays; the last call is filled up with rays that are asked already."""
+    """Return the answer of a query for each ray, as NumPy arrays; the last call is filled up with repeated rays."""
     shapes, count = roomy(shapes), len(rays[0])
     number = np.resize(np.arange(count), -(-count // RAYS) * RAYS).reshape(-1, RAYS)
     parts = [query(shapes, *(jnp.asarray(x[some]) for x in rays)) for some in number]
@@ -110,7 +110,7 @@ def packed(shapes, o, d, t_max, exclude):
 
 
 def closest(shapes, o, d, t_max=np.inf, exclude=-1):
-    """Hit of each ray, NumPy arrays."""
+    """Return the hit of each ray, as NumPy arrays."""
     return asked(_closest, shapes, *packed(shapes, o, d, t_max, exclude))
 
 
@@ -130,7 +130,7 @@ def random_rays(n, seed=0, reach=1.0, dtype=np.float32):
     return o, unit(rng.uniform(-reach, reach, (n, 3)) - o, dtype)
 
 
-# ---- the reference: float64, brute force, which knows where rounding may decide -----------------------------------
+# ---- the reference: float64 brute force, which marks where rounding may decide -------------------------------------
 
 
 class Candidates:
@@ -157,8 +157,8 @@ def of_triangles(vertices, o, d, rounding):
         lateral = rounding * reach / np.maximum(cos, 1e-300)
         bary = np.stack([b0, b1, b2])
         edges = np.stack([np.linalg.norm(e, axis=-1) + 0 * t for e in (c - b, e2, e1)])
-        width = lateral * edges / area2  # of the border in barycentrics
-        # The distance is a mean of the vertices' by barycentrics, which are the less certain the thinner the needle.
+        width = lateral * edges / area2  # of the border, in barycentrics
+        # The distance is a barycentric mean over the vertices; barycentrics of thinner needles are less certain.
         error = lateral + np.minimum(rounding * reach**2 / area2 / cos, 1) * edges.max(0)
         finite, inside = np.isfinite(t), (bary > 0).all(0)
         possible = finite & (bary >= -width).all(0) & (t > -lateral)
@@ -199,7 +199,7 @@ def of_spheres(balls, o, d, rounding):
     with np.errstate(invalid="ignore"):
         half = np.sqrt((radius**2 - closest**2) / dd)
         near, far = b - half, b + half
-        # Where the ray meets the surface at an angle, its error along the ray grows.
+        # The error along the ray grows where the ray meets the surface obliquely.
         error = lateral * radius / np.maximum(half, 1e-300)
         t = np.where(near > 0, near, np.where(far > 0, far, np.inf))
         start = (np.abs(near) <= error) | (np.abs(far) <= error)
@@ -209,7 +209,7 @@ def of_spheres(balls, o, d, rounding):
 
 
 def reference(shapes, o, d, rounding=ROUNDING):
-    """Candidates over all primitives, in their numbering, from the very numbers that the scene holds."""
+    """Return candidates of all primitives, by their indices, from the stored values of the scene."""
     o, d = np.asarray(o, np.float64), np.asarray(d, np.float64)
     parts = []
     for table in shapes.tables:
@@ -223,7 +223,7 @@ def reference(shapes, o, d, rounding=ROUNDING):
 
 
 def assert_same_hits(shapes, o, d, rounding=ROUNDING, clear=0.9, exclude=None):
-    """Rays agree with brute force wherever rounding does not decide, which are at least `clear` of them."""
+    """Assert that rays agree with brute force where rounding cannot decide, for at least the share `clear` of them."""
     hit = closest(shapes, o, d, exclude=-1 if exclude is None else exclude)
     truth = reference(shapes, o, d, rounding)
     rays = np.arange(len(o))
@@ -233,7 +233,7 @@ def assert_same_hits(shapes, o, d, rounding=ROUNDING, clear=0.9, exclude=None):
     t = truth.t[rays, first]
     finite = np.isfinite(t)
     tolerance = np.where(finite, truth.error[rays, first] + 4 * rounding * np.where(finite, t, 0), 0)
-    # Unsure of something in front, or of the hit itself.
+    # Rounding decides about no primitive.
     sure = ~truth.unsure.any(1)
     assert sure.mean() >= clear, sure.mean()
     assert not np.isnan(hit.t).any()
@@ -317,7 +317,7 @@ def test_negative_zeros_in_the_direction_change_nothing(name):
 
 
 def grid(n, height=1.0):
-    """n x n squares of two triangles each over [-1, 1]^2, facing down; flat boxes that share planes."""
+    """Return n x n squares of two triangles each over [-1, 1]^2, facing down; their flat boxes share planes."""
     g = np.linspace(-1, 1, n + 1)
     vertices = np.stack(np.meshgrid(g, g, [height], indexing="ij"), -1).reshape(-1, 3)
     i, j = (x.ravel() for x in np.meshgrid(np.arange(n), np.arange(n), indexing="ij"))
@@ -328,7 +328,7 @@ def grid(n, height=1.0):
 @pytest.mark.parametrize("sign", [0.0, -0.0])
 @pytest.mark.parametrize("tiles", ["triangles", "rectangles"])
 def test_axis_rays_that_start_on_slab_planes_hit(tiles, sign):
-    """Origins exactly over the borders of boxes, where a distance is 0 times infinity."""
+    """Origins are exactly over the borders of boxes, where a distance is 0 times infinity."""
     n = 16
     vertices, faces = grid(n)
     if tiles == "triangles":
@@ -344,7 +344,7 @@ def test_axis_rays_that_start_on_slab_planes_hit(tiles, sign):
 
 
 def test_rays_that_start_on_faces_of_boxes_hit_as_brute_force_says():
-    """Origins on the very planes of the root's box, in all directions."""
+    """Origins are exactly on the planes of the root's box, with rays in all directions."""
     shapes = scene_of(mesh(*icosphere()))
     o, d = random_rays(1000)
     rays, axis = np.arange(1000), np.arange(1000) % 3
@@ -365,10 +365,10 @@ def test_needles_and_tiny_triangles_are_hit_as_in_float64():
         stored = np.asarray(shapes.tables[0].vertices, np.float64)
         weights = rng.dirichlet([2, 2, 2], (20, len(stored)))
         target = (weights[..., None] * stored).sum(-2).reshape(-1, 3)
-        # From close by, so that float32 origins and directions can aim at 1e-6 at all.
+        # From nearby, so that float32 origins and directions can aim at 1e-6.
         o = np.float32(target + unit(rng.normal(size=target.shape)) * 0.05)
         assert_same_hits(shapes, o, unit(target - o), clear=0.3)
-        # And in passing: nothing is hit beside them.
+        # Random rays: nothing is hit beside the triangles.
         assert_same_hits(shapes, *random_rays(4000), clear=0.9)
 
 
@@ -383,8 +383,8 @@ def test_rays_in_the_plane_of_a_triangle_do_not_hit_beside_it():
     hit = closest(shapes, o, d)
     found = np.isfinite(hit.t)
     p = (o[found] + hit.t[found, None] * d[found] - 0.1) @ rotation
-    # Whether an edge-on ray hits is open; but a hit must lie on the triangle. All three edge functions are noise here,
-    # and noise may pass for a hit now and then.
+    # An edge-on ray may hit or miss, but a hit must lie on the triangle. All three edge functions are noise here, which
+    # rarely passes for a hit.
     beside = (p[:, 0] < -1e-3) | (p[:, 1] < -1e-3) | (p[:, 0] + p[:, 1] > 1.001)
     assert beside.sum() < 0.01 * len(o), f"{beside.sum()} of {len(o)}"
 
@@ -400,7 +400,7 @@ def test_of_coincident_faces_the_lowest_primitive_is_hit(name, copies):
         "disk": Disk(affine(np.eye(3), [0, 0, 1])),
         "sphere": sphere([0, 0, 1], 0.5),
     }[name]
-    # Others around, so that the copies are spread over several leaves of the tree.
+    # Another mesh, so that the copies are spread over several leaves of the tree.
     others = [Mesh(one.vertices + [5, 0, 0], one.faces, None, None)] if name == "triangle" else []
     shapes = scene_of(*[one] * copies, *others)
     rng = np.random.default_rng(7)
@@ -416,7 +416,7 @@ def test_of_coincident_kinds_the_lowest_primitive_is_hit():
     shapes = scene_of(mesh([[-9, -9, 1], [9, -9, 1], [0, 9, 1]]), Disk(flat), Rectangle(flat))
     o = np.zeros((1, 3))
     hit = closest(shapes, o, [[0, 0, 1.0]])
-    assert hit.primitive == 0 and hit.shape == 2  # the rectangle: spheres, rectangles, disks, triangles
+    assert hit.primitive == 0 and hit.shape == 2  # the rectangle; order: spheres, rectangles, disks, triangles
 
 
 def test_layers_close_behind_each_other_are_kept_in_order():
@@ -433,7 +433,7 @@ def test_layers_close_behind_each_other_are_kept_in_order():
 
 
 def test_huge_spheres_stay_in_place():
-    """The nine-sphere box: walls of radius 1e5 around [-50, 50]^3, hits to the last bits of a radius."""
+    """The nine-sphere box: walls of radius 1e5 around [-50, 50]^3, with hits exact to the last bits of a radius."""
     walls = [sphere(np.eye(3)[a] * s * (1e5 + 50), 1e5) for a in range(3) for s in (-1, 1)]
     shapes = scene_of(*walls, sphere([20, -30, 10], 16.5), sphere([-20, -30, -10], 16.5))
     o, d = random_rays(4000, reach=45)
@@ -483,7 +483,7 @@ def test_a_ray_leaving_a_sphere_meets_only_its_far_side():
     for i, hit in enumerate(alone):
         cos = np.sum(n[row == i] * d[row == i], 1)
         inwards = cos < -1e-2
-        # The start lies on the sphere to 1e-7 of the coordinates only.
+        # The start lies on the sphere only to 1e-7 of the coordinates.
         np.testing.assert_allclose(hit.t[inwards], -2 * balls[i, 3] * cos[inwards], rtol=1e-5, atol=3e-5)
         assert np.isinf(hit.t[cos > 1e-3]).all()
 
@@ -499,7 +499,7 @@ def test_occluded_is_a_closest_hit_before_the_end(name):
     np.testing.assert_array_equal(blocked, t < t_max)
     assert 0.1 < blocked.mean() < 0.9
     np.testing.assert_array_equal(closest(shapes, o, d, t_max).t, np.where(t <= t_max, t, np.inf))
-    # Up to the hit itself, which counts for closest_hit only.
+    # A hit exactly at the end counts for closest_hit only.
     end = np.where(np.isfinite(t), t, np.float32(1))
     assert not occluded(shapes, o, d, end).any()
     np.testing.assert_array_equal(closest(shapes, o, d, end).t, t)
@@ -564,7 +564,7 @@ def cube_mesh(n):
     both_faces = np.concatenate([faces, faces + len(vertices)])
     sides = [np.roll(both, k, axis=1) for k in range(3)]
     faces = np.concatenate([both_faces + k * len(both) for k in range(3)])
-    # Weld what the sides share, or turning it could round them apart.
+    # Weld shared vertices, since a rotation could round copies apart.
     vertices, number = np.unique(np.round(np.concatenate(sides), 9), axis=0, return_inverse=True)
     return vertices, number.reshape(-1)[faces]
 
@@ -584,10 +584,10 @@ CLOSED = {
 
 
 def rays_at_edges(vertices, faces, n, seed):
-    """From inside, aimed at vertices and at points of edges, as exactly as float32 allows."""
+    """Return rays from inside, aimed at vertices and at points of edges as exactly as float32 allows."""
     rng = np.random.default_rng(seed)
     center = vertices.mean(0)
-    # In a ball that lies well inside each of the meshes.
+    # Origins are in a ball well inside each of the meshes.
     reach = 0.5 * np.linalg.norm(vertices - center, axis=1).min() * rng.random((n, 1)) ** (1 / 3)
     o = np.float32(center + unit(rng.normal(size=(n, 3))) * reach)
     face, k = faces[rng.integers(len(faces), size=n)], rng.integers(3, size=n)
@@ -631,7 +631,7 @@ def test_a_box_of_rectangles_does_not_leak():
 @pytest.mark.parametrize("side", [-1, 1])
 @pytest.mark.parametrize("sign", [-1, 1])
 def test_rays_in_the_plane_of_a_face_hit_the_cube_where_they_meet_that_face(axis, side, sign):
-    """A slab that the ray lies in the border of has one distance 0 / 0, and the other slabs decide alone."""
+    """Where a ray lies in the border of a slab, one distance is 0 / 0, and the other slabs alone decide."""
     o = np.roll([[side, -5, -5], [side, -5, -5], [side, -5, 0]], axis, axis=1) * 1.0
     d = np.roll([[0, 0.8, 0.2], [0, 0.2, 0.8], [0, 1, 0]], axis, axis=1) * 1.0
     o, d = (np.where(np.arange(3) == axis, x, sign * x) for x in (o, d))
@@ -683,18 +683,18 @@ def test_surface_points_lie_on_their_primitive_within_rounding(scale, shift):
     exact = np.cross(a, b) / np.linalg.norm(np.cross(a, b), axis=1, keepdims=True)
     n = np.where(rectangle[:, None], exact[of_frame], normal[of_tri])
     off = np.abs(np.sum((s.p - corner) * n, 1))
-    # Rectangles have no margin; their points are sums of three, each rounded.
+    # Rectangles have no margin; their points are sums of three rounded terms.
     reach = np.sum(np.abs(frame).sum(1)[of_frame] * np.abs(n), 1)
     bound = np.where(rectangle, 4 * np.finfo(np.float32).eps * reach, s.margin)
     assert (off[ok] <= bound[ok]).all(), np.max(off[ok] / bound[ok])
     np.testing.assert_allclose(np.abs(np.sum(s.n * n, 1))[ok], 1, atol=1e-6)
-    # And near the point that the distance says; edge-on, both are uncertain along the ray.
+    # Points are also near o + t d; edge-on, both are uncertain along the ray.
     clear = ok & (np.abs(np.sum(n * d, 1)) > 0.05)
     np.testing.assert_allclose(s.p[clear], (o + hit.t[:, None] * d)[clear], atol=2e-5 * scale + 3e-7 * shift * scale)
 
 
 def test_tiny_triangles_have_a_unit_normal():
-    """Sides of 1e-6 in a scene of 1e-3, thin ones too: their cross product squared underflows."""
+    """Sides of 1e-9 in a scene of 1e-3, some of thin triangles: their squared cross product underflows."""
     rng = np.random.default_rng(4)
     side = rng.normal(size=(30, 3, 3)) * 1e-9
     side[:10, 2] = side[:10, 1] * 0.5 + rng.normal(size=(10, 3)) * 1e-12
@@ -758,7 +758,7 @@ def _bounce(shapes, *rays):
 
 
 def test_spawned_rays_stay_inside_a_closed_mesh():
-    """From edges of the wall, inwards, down to 3 degrees above it: nothing leaks out through the neighbour."""
+    """From edges of the wall, inwards, down to 18 degrees above it: nothing leaks out through the neighbour."""
     vertices, faces = icosphere()
     for scale, shift in ((1.0, 0.0), (1.0, 1e4), (1e5, 0.0)):
         moved = np.float32(vertices * scale + shift * scale).astype(float)

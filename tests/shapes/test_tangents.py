@@ -1,4 +1,4 @@
-"""Where a bsdf asks for it, a surface tells the way in which u grows; where none does, nothing is compiled for it."""
+"""Surfaces have a tangent, along which u grows, where a bsdf needs it; otherwise none is compiled."""
 
 import math
 
@@ -21,7 +21,7 @@ from pathjax.shapes.ellipsoid import Ellipsoid
 
 
 class Brushed(BSDF):
-    """White where it is seen along the tangent rather than across, else black."""
+    """White where it is seen along the tangent rather than across it, else black."""
 
     smooth = anisotropic = True
 
