@@ -1,4 +1,4 @@
-"""Frames are orthonormal everywhere; what may divide by zero is finite there, derivatives too."""
+"""Frames are orthonormal everywhere; functions that could divide by zero and their derivatives are finite there."""
 
 from contextlib import nullcontext
 
@@ -88,7 +88,7 @@ def test_offset_point_moves_to_the_side_of_the_direction():
 
     step = np.asarray(jax.jit(jax.vmap(moved))(n, d, p, margin), np.float64) - np.asarray(p, np.float64)
     along, side = np.sum(step * n, 1), np.sum(np.asarray(d, np.float64) * n, 1)
-    # The sum is rounded at |p| = 100: 4e-6 each axis.
+    # The sum is rounded at |p| = 100: 4e-6 per axis.
     np.testing.assert_allclose(along * np.sign(side), 1e-3, atol=2e-5)
 
 

@@ -1,4 +1,4 @@
-"""The numbers of a path: a lattice for each pixel and seed, independent of all others, and hashes."""
+"""Uniform numbers of a path: a lattice for each pixel and seed, independent of all others, and hashes."""
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +15,7 @@ FALSE_ALARM = 1e-4
 
 
 def sidak(p_values):
-    """The smallest p of independent tests, as one p."""
+    """Return the p-value of the smallest p of independent tests."""
     p = np.min(p_values)
     return -np.expm1(np.size(p_values) * np.log1p(-p))
 
@@ -31,7 +31,7 @@ def _lattice(seeds, pixels, samples):
 
 
 def lattice(seeds, pixels, samples):
-    """(K, N, DIMENSIONS): K streams, N samples."""
+    """Return points (K, N, DIMENSIONS) of K streams and N samples."""
     points = _lattice(*(np.asarray(x, np.uint32) for x in (seeds, pixels, samples)))
     return np.asarray(points, np.float64).reshape(len(pixels), len(samples), DIMENSIONS)
 
@@ -46,7 +46,7 @@ def hashed(stream, samples, first=0):
 
 
 def assert_stratified(points):
-    """In every dimension each interval of length 1/N holds one of the N points (..., N, D)."""
+    """Assert that in every dimension each interval of length 1/N holds one of the N points (..., N, D)."""
     count = points.shape[-2]
     cells = np.sort((points * count).astype(int), axis=-2)
     np.testing.assert_array_equal(cells, np.broadcast_to(np.arange(count)[:, None], cells.shape))
@@ -59,7 +59,7 @@ def test_each_dimension_is_stratified_for_every_stream(count):
 
 @pytest.mark.parametrize("name", ["independent", "subpixel"])
 def test_points_of_classic_path_tracers_are_uniform_and_independent(name):
-    """Each dimension with the next, and, but for the film, with itself four samples later."""
+    """Of the next dimension, and, except on the film, of the same dimension four samples later."""
     n = 1 << 16
 
     def one(sample):
@@ -103,8 +103,8 @@ def test_points_are_a_lattice_under_a_shift(count):
 
 
 def pairs_in_terms():
-    """Pairs of dimensions that the estimator multiplies: a term sees the film, the bsdf samples of the vertices before,
-    and one light sample, or one more bsdf sample."""
+    """Yield the pairs of dimensions that the estimator multiplies: a term depends on the film, the bsdf samples of the
+    vertices before, and one light sample or one more bsdf sample."""
     vertex, column = np.divmod(np.arange(DIMENSIONS), sampler.DIMENSIONS)
     is_light = (vertex > 0) & (column < 2)
     for i, j in zip(*np.triu_indices(DIMENSIONS, 1), strict=True):
@@ -114,9 +114,9 @@ def pairs_in_terms():
 
 
 def test_pairs_of_dimensions_are_stratified_jointly():
-    """The variance of x y (centred) over shifts, against that of independent numbers, in all pairs that meet.
+    """The variance of x y (centred) over shifts, against that of independent numbers, in all pairs of a term.
 
-    Of few points, some pairs are worse than independent ones: there are fewer rules than pairs. Most are not.
+    With few points, some pairs are worse than independent ones, since there are fewer rules than pairs; most are not.
     """
 
     def ratios(count):
@@ -129,9 +129,9 @@ def test_pairs_of_dimensions_are_stratified_jointly():
 
 
 def error_of_terms(generators, count):
-    """Squared shift-averaged errors of the terms up to vertex 6, added, each with weights 1/2 by vertex.
+    """Return the sum of the squared shift-averaged errors of the terms up to vertex 6, with weights 1/2 per vertex.
 
-    For functions whose Fourier coefficients fall like 1 / h, as they do across edges (Dick, Kuo and Sloan 2013).
+    This is for functions whose Fourier coefficients fall like 1 / h, as across edges (Dick, Kuo and Sloan 2013).
     """
     x = np.arange(count)[:, None, None] * generators % count / count
     factors = 6 * (x * x - x + 1 / 6)
@@ -147,8 +147,8 @@ def error_of_terms(generators, count):
 
 @pytest.mark.parametrize("count", [64, 256, 1024, 4096, 1 << 14])
 def test_generators_serve_the_terms_of_the_estimator(count):
-    """Under weights other than those they were chosen by, better than nine in ten of random ones. (16 points have but
-    four rules, up to signs, so chance finds the best of those as well.)
+    """With other weights than they were chosen by, they beat nine in ten random generators. (16 points have only four
+    rules, up to signs, so random generators find the best rule too.)
     """
     rng = np.random.default_rng(count)
     others = [error_of_terms(2 * rng.integers(0, 1 << 19, sampler._GENERATORS.shape) + 1, count) for _ in range(100)]
@@ -163,7 +163,7 @@ def test_numbers_lie_below_one_and_are_multiples_of_2_to_the_minus_24():
 
 
 def correlation_p(a, b):
-    """p of no correlation, for K independent pairs of N independent numbers: z = r sqrt(N)."""
+    """Return p of no correlation, for K independent pairs of N independent numbers: z = r sqrt(N)."""
     z = np.mean((a - a.mean(-1, keepdims=True)) * (b - b.mean(-1, keepdims=True)), -1) * np.sqrt(a.shape[-1])
     return 2 * stats.norm.sf(np.abs(z) / (a.std(-1) * b.std(-1)))
 
@@ -208,7 +208,7 @@ def test_hashed_is_uniform_in_every_dimension_and_pair():
             cell = (x[:, i] * 16).astype(int) * 16 + (x[:, j] * 16).astype(int)
             p.append(stats.chisquare(np.bincount(cell, minlength=256)).pvalue)
     assert sidak(p) > FALSE_ALARM
-    # Too even is no better.
+    # Counts that are too even are wrong as well.
     assert np.max(p) < 1 - FALSE_ALARM / len(p)
 
 

@@ -1,4 +1,4 @@
-"""Every map of uniform numbers has the density that stands beside it, and stays finite at the ends of [0, 1)."""
+"""Every map of uniform numbers has its stated density, and is finite at the ends of [0, 1)."""
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +16,7 @@ N = 400_000
 
 
 def uniform(*shape, seed=1):
-    """Odd multiples of 2^-24 would fall on no cell border; multiples of 2^-24 in [0, 1), as the sampler gives."""
+    """Return multiples of 2^-24 in [0, 1), also 0; the sampler's odd multiples would avoid all cell borders."""
     return jnp.asarray(np.random.default_rng(seed).integers(0, 1 << 24, shape) * 2.0**-24, jnp.float32)
 
 
@@ -33,7 +33,7 @@ def assert_density(counts, probabilities):
 
 
 def sphere_cells(w, z_edges, phi_cells=16):
-    """Counts of directions over cells of z and azimuth."""
+    """Count directions in cells of z and azimuth."""
     phi = np.arctan2(w[:, 1], w[:, 0]) / (2 * np.pi) % 1
     return np.histogram2d(w[:, 2], phi, [z_edges, np.linspace(0, 1, phi_cells + 1)])[0]
 
@@ -76,7 +76,7 @@ def test_sphere_is_uniform():
 @pytest.mark.parametrize("one_minus_cos", [1e-6, 0.1, 1.0])
 def test_cone_is_uniform(one_minus_cos):
     w = mapped(lambda u: warp.square_to_cone(u, one_minus_cos), uniform(N, 2))
-    # 1 - z from x and y: z itself has no digits left in a narrow cone.
+    # 1 - z comes from x and y, since z has no digits left in a narrow cone.
     squared = w[:, 0] ** 2 + w[:, 1] ** 2
     h = squared / (1 + np.sqrt(np.maximum(1 - squared, 0)))
     # The last ulps of the rim may fall outside.
