@@ -1,4 +1,4 @@
-"""Programs on disk: which is found, which cannot be, and how many stay."""
+"""Programs on disk: which are found, which cannot be, and how many are kept."""
 
 import os
 from dataclasses import dataclass, replace

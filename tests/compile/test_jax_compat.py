@@ -1,4 +1,4 @@
-"""What differs between JAX's versions, or is not as it seems there."""
+"""Behaviour of JAX that differs between versions or is surprising."""
 
 from dataclasses import dataclass, field, make_dataclass
 
@@ -27,7 +27,7 @@ def test_fields_of_a_dataclass_are_children_but_the_static_ones():
 
 
 def test_each_class_of_the_same_fields_gets_a_kernel_of_its_own():
-    """A hundred, as tables of hashes take two for one only where some bits of their hashes agree."""
+    """A hundred classes, since a hash table confuses two only where some bits of their hashes agree."""
 
     @jax.jit
     def number_of(x):

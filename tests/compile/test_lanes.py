@@ -1,4 +1,4 @@
-"""`lanes` against `jax.vmap`: the same results from programs of every structure that kernels are made of."""
+"""`lanes` against `jax.vmap`: the same results for programs of every structure that occurs in kernels."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ def test_branches(vectors, rows):
 
 
 def test_branches_of_much_work_are_run_for_the_lanes_that_take_them():
-    """In runs of `runs.WIDTH` lanes: one branch is taken by most of them, one by few and one by none."""
+    """In runs of `runs.WIDTH` lanes: most lanes take one branch, few take another, and none takes the third."""
 
     def much(scale, n):
         def work(x, k, table):
@@ -132,7 +132,7 @@ def test_loops_run_until_their_last_lane_is_done(rows):
 
 @pytest.mark.parametrize("kept", [0, 1, 2])
 def test_a_lane_that_is_done_stays_so_where_the_test_is_a_carried_value_itself(rows, kept):
-    """It would begin again: in the lanes that go on, and so in its own, the number turns to 0 again and again."""
+    """If its carry were updated further, it would start again: the test is false at one trip in 7 only."""
 
     def f(n, table):
         def step(state):
@@ -188,7 +188,7 @@ def test_one_lane_after_another(vectors, rows):
 
 
 def test_only_lanes_in_a_branch_or_a_loop_have_their_turn():
-    """Half of the items enter the branch, a third of those make a trip of the loop in it."""
+    """Half of the items enter the branch; a third of those make one trip of its loop."""
     seen = []
 
     def count(k):
@@ -211,7 +211,7 @@ def test_only_lanes_in_a_branch_or_a_loop_have_their_turn():
 
 
 def test_what_other_lanes_lack_keeps_no_loop_from_its_end():
-    """A step that only lanes in the branch have; in the others it is 0, with which their loop would not end."""
+    """Only lanes in the branch compute the step; in the others it is 0, with which their loop would never end."""
 
     def f(n, table):
         step = one_by_one(lambda: 1 + n * n)
@@ -229,7 +229,7 @@ def test_values_computed_once_and_calls(vectors):
 
 
 def test_a_value_computed_once_is_not_computed_again():
-    """XLA computes it again for each consumer otherwise; and what keeps it from that copies no column."""
+    """Otherwise XLA computes it again for each consumer. The barrier that prevents this copies no column."""
 
     def f(how, x):
         y = how(lax.population_count(x))
@@ -246,7 +246,7 @@ def test_a_value_computed_once_is_not_computed_again():
 
 
 def tangents_of(f, tangents):
-    """Function of (a, b, table) to f and its derivatives in the numbers that it takes first, at 0."""
+    """Return a function of (a, b, table): f and its derivatives in the entries of f's first argument, at 0."""
 
     def of(a, b, table):
         def push(t):
@@ -258,7 +258,7 @@ def tangents_of(f, tangents):
 
 
 def test_derivatives_of_several_numbers_at_once(vectors):
-    """Through branches, loops, calls, tables and products of matrices, some of which do not depend on a number."""
+    """Through branches, loops, calls, tables and matrix products, some of which do not depend on a given scalar."""
 
     def f(x, a, b, table):
         branch = lax.cond(a[0] > 0, lambda x: x[0] * b + x[1], lambda x: jnp.exp(x[2] * a), x)
@@ -271,7 +271,7 @@ def test_derivatives_of_several_numbers_at_once(vectors):
 
 
 def test_what_does_not_depend_on_a_number_costs_its_tangent_nothing(vectors):
-    """Each of these functions depends on one number, so the four tangents cost what one does."""
+    """Each of these functions depends on one scalar, so the four tangents cost as much as one."""
 
     def f(x, a, b, table):
         return [jnp.sin(a * x[k] + b) * jnp.exp(a * (b + k)) for k in range(4)]
@@ -281,7 +281,7 @@ def test_what_does_not_depend_on_a_number_costs_its_tangent_nothing(vectors):
         program = jax.make_jaxpr(lanes(lambda x, table: of(*x, table), WIDTH))(tuple(vectors), TABLE)
         return str(program).count(" = mul ")
 
-    # Of a tangent: times a, the cosine and the exponential, 3 components each.
+    # Each tangent costs three products (with a, the cosine and the exponential) of 3 components.
     assert products(jnp.eye) - products(lambda n: basis(n, jnp.float32)) == 3 * 4 * 3 * 3
 
 
@@ -323,7 +323,7 @@ def twice_product(x, y):
     return 2 * x * y
 
 
-# Of the shape of their operand, some of them, and yet not component by component.
+# Not componentwise, although some results have the shape of their operand.
 OTHERS = {
     "sort": jnp.sort,
     "argsort": jnp.argsort,
@@ -387,7 +387,7 @@ def test_derivatives_are_taken_before(vectors):
 
 
 def test_numbers_of_lanes_that_are_done_do_no_harm():
-    """A lane whose state overflows after its end must not keep the others from theirs, nor hang the loop."""
+    """A lane whose state overflows after its end must neither stop the other lanes nor hang the loop."""
 
     def f(n, table):
         def step(state):
@@ -405,7 +405,7 @@ def test_numbers_of_lanes_that_are_done_do_no_harm():
 
 @pytest.mark.parametrize("count", [1, WIDTH - 1, WIDTH, 4 * WIDTH + 3])
 def test_a_lane_that_leaves_the_own_loop_of_an_item_takes_the_next(count):
-    """Items of 0 to 40 trips, with work before and after the loop, and results that all share or that are empty."""
+    """Items of 0 to 39 trips, with work before and after the loop; one result is shared by all items, one is empty."""
 
     def f(n, start, table):
         row = lax.dynamic_index_in_dim(table, n % 4, keepdims=False)[0] + start
@@ -423,7 +423,7 @@ def test_a_lane_that_leaves_the_own_loop_of_an_item_takes_the_next(count):
 
 
 def test_what_a_persistent_loop_begins_with_unset_is_not_written():
-    """An item's own loop keeps what the last one left in its lane, and reads nothing of it: it begins with a store."""
+    """The lane still holds the last item's value, which is not read: the item's loop stores before it reads."""
 
     def f(n, start, table):
         def step(state):
@@ -436,7 +436,7 @@ def test_what_a_persistent_loop_begins_with_unset_is_not_written():
     trips = rng.integers(1, 9, 4 * WIDTH + 3).astype(np.int32)
     agrees(f, trips, rng.normal(size=(len(trips), 3)).astype(np.float32))
 
-    # A body that does read it, of one lane, counts the trips of all items.
+    # A body that does read it, in a single lane, counts the trips of all items.
     def trips_so_far(n):
         first = jnp.int32(0), unset(jnp.int32(0))
         return persistent_loop(lambda s: s[0] < n, lambda s: (s[0] + 1, s[1] + 1), first)[1]
@@ -471,7 +471,7 @@ def test_two_persistent_loops_are_refused():
 
 
 def test_derivatives_of_a_persistent_loop():
-    """Of some of what it carries, several at a time; lanes leave it by the values."""
+    """Derivatives in some of the carried values, several at once; lanes leave the loop by the primal values."""
 
     def f(n, x, table):
         def power(x):
@@ -492,7 +492,7 @@ def test_any_number_of_items_in_any_number_of_lanes(count, width):
 
 
 def test_items_are_worked_on_without_waiting_for_the_slowest():
-    """Trips of the loop over all items: as many as the longest item takes, not the longest of each group."""
+    """Lanes take the next item instead of waiting for the longest item of their group."""
     trips = np.ones(64 * WIDTH, np.int32)
     trips[::WIDTH] = 100  # one in every group
     seen = []
@@ -508,12 +508,12 @@ def test_items_are_worked_on_without_waiting_for_the_slowest():
         return persistent_loop(lambda k: k < n, step, jnp.int32(0))
 
     np.testing.assert_array_equal(lanes(f, WIDTH)(jnp.asarray(trips), jnp.asarray(TABLE)), trips)
-    ideal = trips.sum()  # the calls, one for each lane and trip, of lanes that never wait
+    ideal = trips.sum()  # one call per lane and trip, if lanes never wait
     assert ideal <= len(seen) < 1.2 * ideal + 100 * WIDTH
 
 
 def test_what_lanes_make_of_an_equation_stands_where_it_stands(vectors):
-    """In profiles, dumps and errors the code of one item is named, not the interpreter alone."""
+    """Profiles, dumps and errors name the code of one item, not the interpreter alone."""
 
     def tripled(v):
         return 3 * v

@@ -18,7 +18,7 @@ PAGE = (FOLDER / "README.md").read_text(encoding="utf-8")
 
 @pytest.fixture(scope="module")
 def page():
-    """What the page's code defines."""
+    """Names that the page's code defines."""
     names = {}
     exec("".join(re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)), names)
     return names
@@ -32,7 +32,7 @@ def test_the_function_gives_what_vmap_gives(page):
 
 def test_the_program_is_as_shown(page):
     (shown,) = re.findall(r"```\n(\{ lambda.*?)```", PAGE, re.DOTALL)
-    casts = ("convert_element_type",)  # those between strong and weak types do nothing
+    casts = ("convert_element_type",)  # casts between strong and weak types have no effect
 
     def of(jaxpr):
         for eqn in jaxpr.eqns:

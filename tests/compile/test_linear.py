@@ -1,4 +1,4 @@
-"""A linear function with a transpose of its own, under JAX's transformations."""
+"""A linear function with its own transpose, under JAX's transformations."""
 
 import jax
 import jax.numpy as jnp

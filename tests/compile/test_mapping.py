@@ -13,7 +13,7 @@ from pathjax.compile.jax_compat import ClosedJaxpr, program_of
 
 
 def collatz(n):
-    """Steps to 1: real control flow, of another length for every item."""
+    """Return the steps to 1, by real control flow of a different length for every item."""
 
     def step(state):
         n, steps = state
@@ -62,7 +62,7 @@ def test_order_is_kept_for_every_number_of_devices():
 
 
 def test_chunks_of_the_vectorised_form_cover_all_items(monkeypatch):
-    """Chunks that do not divide the number of items, as an accelerator would have them."""
+    """The chunks do not divide the number of items, as on an accelerator."""
     monkeypatch.setattr(vectorised, "MOST_LANES_OF_CPU", 7)
     xs = jnp.arange(1, 101, dtype=jnp.int32)
     np.testing.assert_array_equal(
@@ -72,7 +72,7 @@ def test_chunks_of_the_vectorised_form_cover_all_items(monkeypatch):
 
 @pytest.mark.parametrize("lanes", [1, 8, 40])
 def test_lanes_of_the_vectorised_form_that_are_done_take_other_items(monkeypatch, lanes):
-    """Also items that end at once; and hardly a trip is made beyond those that all lanes are busy in."""
+    """Some items end at once. There are hardly more trips than with all lanes busy."""
     monkeypatch.setattr(vectorised, "MOST_LANES_OF_CPU", lanes)
     steps = np.random.default_rng(0).geometric(0.02, 300).astype(np.int32) - 1
     table, made = jnp.arange(5.0), []
@@ -102,7 +102,7 @@ def test_live_values_are_those_that_something_still_reads():
         return (z * z)[:1]
 
     program, _ = program_of(f, jnp.zeros(4, jnp.float32), jnp.zeros(1000, jnp.float32))
-    # x, y, what y is made of; of a table that is shared, nothing.
+    # x, y and the operands of y count; a shared table does not.
     of_item = ClosedJaxpr(program.jaxpr.replace(invars=program.jaxpr.invars[::-1]), ())
     assert 32 <= vectorised.live_bytes(of_item, 1) <= 52
     assert vectorised.live_bytes(program, 1) >= 4000
@@ -110,7 +110,7 @@ def test_live_values_are_those_that_something_still_reads():
 
 @pytest.mark.parametrize("form", ["lanes", "vmap"])
 def test_items_keep_rows_of_their_own(form):
-    """Of an accelerator each item alone."""
+    """In the form for accelerators each item is the only lane."""
 
     def f(x, number, scale, memory):
         def add(memory, here, values):
@@ -140,7 +140,7 @@ def test_items_keep_rows_of_their_own(form):
 
 
 def test_rows_are_read_of_items_in_any_number_of_parts(monkeypatch):
-    """Of several devices each has its own; so they are under `jax.vmap`, and what is read is on one device."""
+    """Each device has its own rows, under `jax.vmap` too; `here` moves them to one device."""
 
     def f(x, number, memory):
         def put(memory, here, numbers):
@@ -181,7 +181,7 @@ def test_map_passes_tangents():
 
 
 def test_lanes_of_the_vectorised_form_share_one_table():
-    """A conditional whose lanes differ, within a loop, gives no lane a copy of what it looks up."""
+    """A conditional on which lanes differ, inside a loop, must not copy the looked-up table for each lane."""
     lanes, rows = 64, 1000
 
     def f(x, table):
@@ -201,7 +201,7 @@ def test_lanes_of_the_vectorised_form_share_one_table():
 
 @pytest.mark.parametrize("differing", [False, True])
 def test_branches_of_the_vectorised_form(differing):
-    """Where all lanes take one branch, and where they differ; results of several shapes, one of them of no entries."""
+    """All lanes take one branch, or lanes differ; results have several shapes, one of them without entries."""
 
     def f(x, which):
         def branch(k):
@@ -214,11 +214,11 @@ def test_branches_of_the_vectorised_form(differing):
         np.testing.assert_array_equal(a, b)
 
 
-# ---- what items add to memory that they share -----------------------------------------------------------------------
+# ---- items that add to shared memory --------------------------------------------------------------------------------
 
 
 def histogram(steps, numbers, table):
-    """Each item adds 1 / (k + 1) to the entry `number` after each of its steps k."""
+    """Add 1 / (k + 1) to the entry `numbers[k % 5]` after each step k of an item."""
 
     def add(table, here, values):
         k, number = values
@@ -237,7 +237,7 @@ def histogram(steps, numbers, table):
 
 @pytest.mark.parametrize(("count", "form"), [(3, "lanes"), (1500, "lanes"), (1500, "vmap")])
 def test_items_share_memory(monkeypatch, count, form):
-    """Of every number of devices bitwise the same; lanes without an item add nothing."""
+    """Results are bitwise the same on every number of devices; lanes without an item add nothing."""
     monkeypatch.setattr(mapping, "ITEMS_OF_A_PART", 400)
     numbers = np.array([0, 3, 3, 1, 2], np.int32)
     steps = np.random.default_rng(0).integers(0, 9, count).astype(np.int32)
@@ -261,7 +261,7 @@ def test_one_item_alone_is_the_only_lane():
 
 
 def test_products_of_the_vectorised_form_are_not_rounded_to_fewer_bits():
-    """As accelerators do unless told otherwise; a CPU never does, so the program must say it."""
+    """Accelerators round unless told otherwise; a CPU never does, so the test reads the program."""
     xs, m = jnp.ones((5, 3)), jnp.eye(3)
     program = jax.jit(lambda xs, m: native_map(lambda x, m: m @ x, xs, m, form="vmap", devices=1)).lower(xs, m)
     (product,) = [line for line in program.as_text().splitlines() if "dot_general" in line]

@@ -1,4 +1,4 @@
-"""What code says to lanes under JAX's transformations, outside of lanes and within."""
+"""Primitives for lanes (`compute_once`, `one_by_one`, ...) under JAX's transformations, outside and inside lanes."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def once(x, n):
 
 @one_by_one
 def search(x, n):
-    """Nonlinear in x, linear nowhere; with a loop of fixed length, so that it has every derivative."""
+    """Nowhere linear in x; the loop has a fixed length, so that every kind of derivative exists."""
     return {"y": lax.fori_loop(0, 3, lambda i, y: y * x + n, jnp.sin(x)), "n": n + 1}
 
 
@@ -33,7 +33,7 @@ X, N = jnp.array([0.3, -1.2, 2.0]), jnp.int32(2)
 
 @pytest.fixture(params=PAIRS)
 def pair(request):
-    """The function that says it, and the same one without."""
+    """The function with the primitive, and the same function without it."""
     return PAIRS[request.param]
 
 
@@ -43,7 +43,7 @@ def same(found, expected):
 
 
 def of_x(f):
-    """Its real result as a function of x."""
+    """Return f's floating-point result as a function of x."""
 
     def result(x):
         y = f(x, N)
@@ -83,7 +83,7 @@ def test_derivatives_within_lanes(pair):
 
 
 def test_what_has_no_tangent_gets_none():
-    """Or kernels of derivatives would carry zeros along."""
+    """Otherwise derivative kernels would carry zeros along."""
     program = jax.make_jaxpr(lambda t: jax.jvp(lambda x: compute_once((x, X))[0], (X,), (t,)))(X)
     tangents = [e for e in program.eqns if e.primitive.name == "compute_once"][-1]
     assert len(tangents.invars) == 1
@@ -119,7 +119,7 @@ def test_a_persistent_loop_is_a_loop():
 
 
 def collatz(n, scale):
-    """Steps from n > 0 to 1, scaled; visits are those up. A search with none but its numbers, of any length."""
+    """Return the scaled number of steps from n > 0 to 1: a search of scalars, of any length. Visits are steps up."""
 
     def begin():
         return 2 * n, jnp.int32(-1)
@@ -146,13 +146,13 @@ STEPS = np.array(list(map(collatz_steps, NUMBERS)), np.float32)
 
 @pytest.mark.parametrize("width", [2, 8, 64])
 def test_interleaved_searches_of_lanes_end_each_with_its_own_result(width):
-    """Fewer lanes than slots, and more."""
+    """With fewer lanes than slots, and with more."""
     found = jax.jit(lanes(lambda n, scale: collatz(n, scale)["steps"], width))(NUMBERS, 0.5)
     np.testing.assert_array_equal(found, STEPS / 2)
 
 
 def test_a_search_may_hold_numbers_of_any_type_and_arrays():
-    """Digits of n in base 3, with signs that alternate: the last two, and which there are."""
+    """Base-3 digits of n with alternating signs: the last two, and which digits occur."""
 
     def digits(n):
         sign = jnp.where(n % 2 == 1, jnp.float32(1), -1)

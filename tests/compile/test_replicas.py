@@ -1,4 +1,4 @@
-"""Large arrays on all devices: the same memory, for as long as the array lives, and in every kernel that all run."""
+"""Large arrays on all devices: the same memory, freed with the array, in every kernel of all devices."""
 
 import gc
 import weakref

@@ -1,4 +1,4 @@
-"""Calls of one kernel beside each other."""
+"""Concurrent calls of one kernel."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ def test_concurrent_calls_overlap_and_keep_their_order():
     together = threading.Barrier(calls_at_once())
 
     def square(x):
-        together.wait(timeout=20)  # fails unless all threads are at it
+        together.wait(timeout=20)  # fails unless all threads call at once
         time.sleep(0.01 * (x % 2))
         return x * x
 

@@ -1,4 +1,4 @@
-"""Everything public in the form for accelerators, which a CPU takes where native loops are off."""
+"""All public functions in the form for accelerators, which a CPU takes where native loops are off."""
 
 from __future__ import annotations
 
@@ -92,14 +92,14 @@ results |= {
 
 @pytest.fixture
 def both_forms(root, tmp_path):
-    """(script) -> what it saves in lanes, and in the form for accelerators; and files that asked for a kernel."""
+    """(script) -> its results in lanes and in the form for accelerators, and the files that requested a kernel."""
 
     def both(script):
         results = []
         for native in "10":
             out = tmp_path / f"{native}.npz"
             environment = {**os.environ, "PATHJAX_NATIVE_LOOPS": native, "PYTHONPATH": str(root)}
-            environment.pop("XLA_FLAGS", None)  # of this process, which has native loops
+            environment.pop("XLA_FLAGS", None)  # set by this process, which has native loops
             command = [sys.executable, "-c", BEGIN + script + END, str(root), str(out)]
             subprocess.run(command, check=True, env=environment, cwd=tmp_path)
             results.append(dict(np.load(out)))
@@ -111,7 +111,7 @@ def both_forms(root, tmp_path):
 
 
 def assert_alike(lanes, vmap):
-    """Where rounding tips a decision a path goes another way, so a few numbers may differ at all."""
+    """Where rounding tips a decision a path takes another course, so a few values may differ completely."""
     assert lanes.keys() == vmap.keys() and lanes
     for key, value in lanes.items():
         largest = np.abs(value[np.isfinite(value)]).max(initial=0)

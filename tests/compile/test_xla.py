@@ -1,4 +1,4 @@
-"""How XLA is set up on import."""
+"""The setup of XLA on import."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ OPTION = "xla_cpu_small_while_loop_byte_threshold"
 
 @pytest.fixture(scope="module")
 def python(root):
-    """(code, **environment) -> what it prints as JSON on its last line, and its stderr; in a process of its own."""
+    """(code, **environment) -> the JSON on the last line of its output, and its stderr, from a separate process."""
 
     def run(code, **environment):
         ours = "XLA_", "JAX_", "PATHJAX_", "PJRT_"
@@ -40,7 +40,7 @@ print(json.dumps([os.environ.get("XLA_FLAGS", ""), jax.local_device_count(), pat
 
 @pytest.fixture(scope="module")
 def untouched(python):
-    """Flags, number of devices, whether loops are native, and stderr, where the user has set nothing."""
+    """Flags, device count, whether loops are native, and stderr, where the user has set nothing."""
     values, err = python(FLAGS_AND_DEVICES)
     return *values, err
 
@@ -55,7 +55,7 @@ def test_import_turns_native_loops_on_with_a_device_per_core(untouched):
 
 
 def test_users_flags_are_kept(python, untouched):
-    """Those that pathjax does not know, and those that it sets too; the others it adds."""
+    """Both the flags that pathjax does not know and those that it would set; pathjax adds its other flags."""
     users = "--xla_cpu_enable_fast_math=false --xla_cpu_prefer_vector_width=128 --xla_backend_optimization_level=3"
     if "terminate_timeout" in xla._PATIENCE_FLAGS:  # jaxlib 0.7 has no such flag
         users += " --xla_cpu_collective_call_terminate_timeout_seconds=50"
@@ -88,7 +88,7 @@ def test_users_number_of_devices_is_kept(python, code, environment):
 
 
 def test_import_after_jax_is_in_time_and_setting_up_again_changes_nothing(python):
-    """In time, that is before JAX's backend starts."""
+    """In time: before JAX's backend starts."""
     again = "import jax\nimport pathjax.compile; pathjax.compile.setup()"
     (flags, _, native), err = python(again + FLAGS_AND_DEVICES)
     assert flags.count(OPTION) == 1
@@ -101,7 +101,7 @@ STARTED = "import jax; jax.devices()\n"
 
 @pytest.mark.parametrize("number", [{}, {"JAX_NUM_CPU_DEVICES": "2"}])
 def test_import_after_the_backend_warns_once_with_the_remedy(python, number):
-    """Once, even if it is set up again."""
+    """Only once, even if pathjax is set up again."""
     again = "import pathjax; pathjax.compile.setup()"
     (flags, _, native), err = python(STARTED + again + FLAGS_AND_DEVICES, **number)
     assert err.count("UserWarning") == 1
@@ -125,7 +125,7 @@ print(json.dumps([pathjax.compile.native(), image.tolist()]))
 """
 
 
-@pytest.mark.slow  # what opts out is compared with native loops, image and derivatives, in test_vectorised.py
+@pytest.mark.slow  # test_vectorised.py compares image and derivatives of the opted-out form with native loops
 @pytest.mark.parametrize("opted_out", [True, False])
 def test_renders_are_right_without_native_loops(python, root, opted_out):
     """Opted out, or imported too late."""
@@ -139,7 +139,7 @@ def test_renders_are_right_without_native_loops(python, root, opted_out):
 
 
 def test_parts_of_a_kernel_may_end_long_after_each_other(untouched):
-    """XLA takes such a time for a hanging program's, and aborts; of jaxlib 0.7 nobody can ask for more."""
+    """XLA takes such a delay for a hang and aborts; jaxlib 0.7 has no flag to raise the limit."""
     flags = untouched[0]
     if "terminate_timeout" not in xla._PATIENCE_FLAGS:
         pytest.skip("this jaxlib has no such flag")
@@ -197,8 +197,8 @@ print(json.dumps(len(jax.devices())))
 
 
 def test_many_operations_may_wait_for_a_kernel_on_several_devices(python):
-    """XLA holds those beyond 32 in the threads that the kernel needs. Some jaxlib then wait for ever in one of some ten
-    of these rounds; XLA ends that after its limit on the time, here 20 seconds.
+    """XLA holds operations beyond 32 in the threads that the kernel needs. Some versions of jaxlib then hang in about
+    one of ten of these rounds, until XLA's time limit ends them, here after 20 seconds.
     """
     limits = "".join(f" --xla_cpu_collective_call_{what}_timeout_seconds=10" for what in ("warn_stuck", "terminate"))
     python(AHEAD, JAX_NUM_CPU_DEVICES="2", XLA_FLAGS=limits if xla._PATIENCE_FLAGS else "")
@@ -218,13 +218,13 @@ print(json.dumps([seconds, sorted(heavy & (set(sys.modules) - before))]))
 
 
 def test_import_is_light(python, tmp_path):
-    """Within 0.3 s of CPU time of `import jax`: once of three times, as other work on the machine only ever adds.
+    """The import takes at most 0.3 s of CPU time beyond `import jax`, in one of a few tries: other work only ever adds.
 
-    Neither it nor the command `render` imports what it needs for some uses alone.
-    With the bytecode that Python keeps of what is installed, which some environments turn off.
+    Neither the import nor the command `render` imports modules that only some uses need.
+    The test uses the bytecode cache, as installed packages do; some environments turn it off.
     """
     bytecode = {"PYTHONDONTWRITEBYTECODE": "", "PYTHONPYCACHEPREFIX": str(tmp_path)}
-    for _ in range(4):  # the first one writes the bytecode
+    for _ in range(4):  # the first try writes the bytecode
         (seconds, heavy), _ = python(IMPORTS, **bytecode)
         assert heavy == []
         if seconds < 0.3:
@@ -234,7 +234,7 @@ def test_import_is_light(python, tmp_path):
 
 @pytest.mark.parametrize("before", ["enable", "disable"])
 def test_import_starts_no_backend_and_leaves_the_collector_as_it_was(python, before):
-    """The collector is off meanwhile."""
+    """The collector is off during the import."""
     code = f"import gc\ngc.{before}()\nimport pathjax\nfrom jax._src import xla_bridge\n"
     (collects, started), _ = python(code + "print(json.dumps([gc.isenabled(), xla_bridge.backends_are_initialized()]))")
     assert collects is (before == "enable") and started is False
