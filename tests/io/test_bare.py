@@ -1,4 +1,4 @@
-"""Bare meshes become scenes: seen whole, lit, and in their own colours."""
+"""Bare meshes become scenes that show them whole, lit, and in their own colours."""
 
 from dataclasses import replace
 
@@ -22,7 +22,7 @@ def ball(tmp_path):
     return write
 
 
-# A mesh without normals has a kernel of its own, and no other place in view.
+# A mesh without normals (STL) has another kernel but the same place in view, so it is slow.
 @pytest.mark.parametrize(
     ("kind", "size"), [("obj", 1e-4), ("ply", 1), ("PLY", 1e4), pytest.param("stl", 1, marks=pytest.mark.slow)]
 )
@@ -31,11 +31,11 @@ def test_a_mesh_is_in_view_as_a_whole_whatever_its_size(ball, kind, size):
     mesh.apply_translation([5 * size, -2 * size, size])
     scene = pj.load_scene(ball(kind, mesh), res=32)
     seen = np.asarray(pj.render_aovs(scene, ["depth"], spp=4)["depth"]).reshape(24, 32)
-    # Samples count in pixels around their own too, where they show less than half of it.
+    # The filter spreads samples to the pixels around their own, where they count less than half.
     hit = seen > seen.max() / 2
     assert hit[12, 16]
     assert not (hit[0].any() or hit[-1].any() or hit[:, 0].any() or hit[:, -1].any())
-    # The sphere in the sphere around its box fills 1/sqrt(3) of the height.
+    # The bounding sphere of the ball's box fills the height, and the ball 1/sqrt(3) of it.
     assert 0.5 < hit.any(axis=1).mean() < 0.72
 
 
@@ -49,7 +49,7 @@ def test_colours_of_vertices_are_its_own(ball):
     mesh.visual.vertex_colors = [51, 102, 204, 255]
     scene = pj.load_scene(ball("ply", mesh), res=16)
     image = np.asarray(pj.render(scene, spp=16))
-    # In a furnace what is convex shows its albedo, up to the noise of the filter's weights.
+    # In a furnace a convex object shows its albedo, up to the noise of the filter's weights.
     assert image[6, 8] == pytest.approx([0.2, 0.4, 0.8], rel=1e-2)
     assert image[0, 0] == pytest.approx([1, 1, 1], rel=1e-2)
 

@@ -1,4 +1,4 @@
-"""Whatever bytes a file holds, a loader returns or raises InputError; nothing else escapes, and nothing hangs."""
+"""For any bytes in a file, a loader returns or raises InputError; nothing else escapes, and nothing hangs."""
 
 import re
 import zlib
@@ -97,7 +97,7 @@ SERIALIZED = b"\x1c\x04\x03\x00" + zlib.compress(
     np.array([0x1000, 3, 0, 1, 0], "<u4").tobytes()
     + np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0)], "<f4").tobytes()
     + np.arange(3, dtype="<u4").tobytes(),
-    level=0,  # so that damage comes to the numbers themselves
+    level=0,  # so that damage reaches the values themselves
 )
 MESHES = {
     "obj": ("obj", OBJ.encode(), 1),

@@ -1,4 +1,4 @@
-"""glTF becomes the scene that it describes: materials, textures, cameras and lights; what is left out is told."""
+"""glTF files become the scenes that they describe (materials, textures, cameras, lights); notes list omissions."""
 
 import io
 import json
@@ -24,7 +24,7 @@ PIXELS = np.random.default_rng(1).integers(0, 256, (4, 6, 4)).astype(np.uint8)
 
 
 class Gltf:
-    """A square in the xy plane, of one material."""
+    """A glTF file of a square in the xy plane with one material."""
 
     def __init__(self, material=(), **header):
         self.data = b""
@@ -51,7 +51,7 @@ class Gltf:
         return len(self.header["accessors"]) - 1
 
     def texture(self, pixels=PIXELS, **more):
-        """Its info."""
+        """Add a texture and return its textureInfo."""
         encoded = io.BytesIO()
         Image.fromarray(pixels).save(encoded, "PNG")
         self.header["images"].append({"bufferView": self.view(encoded.getvalue()), "mimeType": "image/png"})
@@ -183,7 +183,7 @@ def test_transmission_has_textures_and_lacks_metal(material):
 
 @pytest.mark.parametrize(("through", "expected"), [(1, 0.96), (0, 0)])
 def test_a_lamp_shines_through_a_sheet_that_lets_it(write, through, expected):
-    """Straight on, but for what glass reflects along its normal, 4 %; the lamp behind it is the only light."""
+    """At normal incidence, where glass reflects 4 %; the lamp behind the sheet is the only light."""
     sheet = Gltf({"pbrMetallicRoughness": {"metallicFactor": 0, "roughnessFactor": 0.0}})
     lamp = {"emissiveFactor": [1, 1, 1], "pbrMetallicRoughness": {"baseColorFactor": [0, 0, 0, 1]}}
     sheet.header["materials"][0]["extensions"] = {"KHR_materials_transmission": {"transmissionFactor": through}}
@@ -192,7 +192,7 @@ def test_a_lamp_shines_through_a_sheet_that_lets_it(write, through, expected):
     sheet.node(mesh=1, translation=[0, 0, -0.5], scale=[3, 3, 1])
     image = pj.render(pj.load_scene(write(sheet), res=33), 64)
     height, width, _ = image.shape
-    # The directions are some degrees off the normal, and facets of the least roughness hardly spread them.
+    # Directions are a few degrees off the normal, and the least roughness hardly spreads them.
     np.testing.assert_allclose(image[height // 2, width // 2], expected, atol=0.02)
 
 
@@ -239,7 +239,7 @@ def test_settings_of_textures(material):
     file.header["materials"] = [{"pbrMetallicRoughness": {"baseColorTexture": info}}]
     texture = material(file)[0]["bsdf"]["base_color"]
     assert (texture["wrap_mode"], texture["filter_type"]) == ("clamp", "nearest")
-    # Scaled, then turned counterclockwise as one sees it, v being down, then shifted.
+    # Scaled, then turned counterclockwise as seen, with v pointing down, then shifted.
     np.testing.assert_allclose(texture["to_uv"] @ [1, 0, 0], [0.25, 0.5 - 2, 0], atol=1e-12)
     np.testing.assert_allclose(texture["to_uv"] @ [0, 1, 0], [0.25 + 3, 0.5, 0], atol=1e-12)
 
@@ -360,7 +360,7 @@ def test_the_film_has_the_cameras_shape_and_what_is_lacking_is_added(write):
 
 
 def everything(alpha="MASK"):
-    """A square of all textures, in front of one that glows, with a camera and lights."""
+    """Return a file of a square with all textures in front of a glowing one, with a camera and lights."""
     file = Gltf(cameras=[CAMERA], extensions={"KHR_lights_punctual": {"lights": LIGHTS}})
     bumps = np.full((4, 4, 3), (128, 128, 255), np.uint8)
     bumps[1:3, 1:3] = (90, 190, 220)
@@ -386,7 +386,7 @@ def test_a_file_is_a_scene_that_can_be_saved(write, tmp_path):
 
 @pytest.mark.slow
 def test_normals_point_up_and_right_where_maps_say_so(write):
-    """As green and red above a half do; lit from where, the surface is brighter."""
+    """Green and red above a half tilt the normal up and right: light from there makes the surface brighter."""
 
     def seen(pixel, axis):
         file = Gltf(cameras=[CAMERA], extensions={"KHR_lights_punctual": {"lights": [LIGHTS[1]]}})
@@ -416,15 +416,15 @@ def test_what_was_read_is_not_overwritten(tmp_path):
 
 @pytest.mark.slow
 def test_mitsuba_renders_what_is_saved(write, tmp_path, mitsuba, estimate, agree):
-    # Opaque: to Mitsuba's shadow rays what is masked is, and lights without size are found by no others.
+    # Opaque, as masked surfaces are to Mitsuba's shadow rays, and only shadow rays find lights without size.
     scene = pj.load_scene(write(everything("OPAQUE")), res=32)
     pj.save_scene(scene, tmp_path / "saved.xml")
     theirs = mitsuba(tmp_path / "saved.xml", 64, 12)
-    # The filter shares samples among pixels, so their mean tells less than its variance says.
+    # The filter shares samples between pixels, so their mean varies more than the pixels' variances suggest.
     agree(estimate(scene, spp=64, count=12), theirs, whole=False, rounding=1e-3)
 
 
-# ---- what is left out, and refused ----------------------------------------------------------------------------------
+# ---- omissions and errors -------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

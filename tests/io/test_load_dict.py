@@ -1,4 +1,4 @@
-"""Dictionaries give the scenes that files of the same content give, and mistakes are told by their keys."""
+"""Dictionaries give the same scenes as files of the same content, and errors name the key."""
 
 import copy
 import re
@@ -311,7 +311,7 @@ VALUES += [
 
 
 def places(value, path=()):
-    """Paths to what a dictionary holds, which may be itself."""
+    """Yield the paths to the entries of a dictionary, which may contain itself."""
     for key, each in value.items() if isinstance(value, dict) and len(path) < 8 else ():
         yield (*path, key)
         yield from places(each, (*path, key))
@@ -354,7 +354,7 @@ def test_the_unchanged_dictionary_loads():
 
 @pytest.fixture
 def mitsubas_mesh(root):
-    """(file, what else of the shape) -> an object of Mitsuba."""
+    """(file, **other fields of the shape) -> an object of Mitsuba."""
     mi = pytest.importorskip("mitsuba")
     mi.set_variant("scalar_rgb")
 
@@ -368,7 +368,7 @@ def mitsubas_mesh(root):
 @pytest.mark.parametrize("how", [{}, {"face_normals": True}, {"flip_normals": True}], ids=str)
 @pytest.mark.parametrize("file", ["ball_smooth.ply", "tinted.ply", "saddle.obj"])
 def test_a_mesh_of_mitsuba_is_that_of_the_file(mitsubas_mesh, root, file, how):
-    """With normals, texture coordinates and colours; Mitsuba keeps float32."""
+    """Including normals, texture coordinates and colours; Mitsuba stores float32."""
     it = mitsubas_mesh(file, **how)
     path = {"type": file.rpartition(".")[2], "filename": f"{root}/tests/scenes/meshes/{file}"}
     (expected,) = load_dict(scene(it=path | how)).shapes
@@ -390,7 +390,7 @@ def test_the_colours_of_a_mesh_of_mitsuba_are_read_back(mitsubas_mesh):
     known = pj.parameters(pj.load_dict(scene(it=mitsubas_mesh(bsdf=red, emitter=lamp))))
     np.testing.assert_allclose(known["it.reflectance"], [0.7, 0.2, 0.1])
     np.testing.assert_allclose(known["it.radiance"], [3, 2, 1])
-    # What stands beside it is taken instead; nothing need be readable then.
+    # A bsdf given beside the mesh replaces the mesh's own, which then need not be readable.
     made = {"type": "mesh", "mesh": mitsubas_mesh(bsdf={"type": "plastic"}), "bsdf": {"type": "diffuse", "id": "own"}}
     assert "own.reflectance" in pj.parameters(pj.load_dict(scene(it=made)))
     made["bsdf"] = {"type": "ref", "id": "clay"}
@@ -431,7 +431,7 @@ def test_to_uv_is_the_transform_of_mitsuba_of_two_dimensions_or_three(kind):
 
 
 def test_points_and_colours_of_mitsuba_are_taken():
-    """Whose points have an attribute `matrix` too, which is no matrix."""
+    """Mitsuba's points have an attribute `matrix` too, which is no matrix."""
     mi = pytest.importorskip("mitsuba")
     mi.set_variant("scalar_rgb")
     bsdf = {"type": "diffuse", "reflectance": mi.ScalarColor3f(0.1, 0.2, 0.3)}

@@ -1,4 +1,4 @@
-"""A scene file becomes a scene of the precision, the hierarchies and the parameters that were asked for."""
+"""A scene file becomes a scene of the requested precision, hierarchies and parameters."""
 
 import jax
 import jax.numpy as jnp
@@ -47,7 +47,7 @@ SECOND = """<sensor type="perspective" id="near"><float name="fov" value="20"/>
 
 
 def test_a_scene_is_seen_by_each_sensor_of_its_file(write_scene, tmp_path):
-    """As if it had been loaded with that one, at its present parameters, and it shares all else."""
+    """As if it had been loaded with that sensor, but with the present parameters; all else is shared."""
     file = write_scene(MESH + SECOND)
     scene = pj.with_parameters(pj.load_scene(file), {"wall.reflectance": 0.25})
     assert scene.sensors == ("0", "near")

@@ -1,4 +1,4 @@
-"""Scene files: what they mean, and what is refused. Numbers that Mitsuba defines are compared with Mitsuba itself."""
+"""Scene files: their meaning, and what is refused. Values that Mitsuba defines are compared with Mitsuba itself."""
 
 import itertools
 import math
@@ -25,7 +25,7 @@ PATH = '<integrator type="path"/>'
 
 @pytest.fixture
 def read(tmp_path):
-    """Load a scene: the sensor on line 1, `body` from line 2 on."""
+    """(body, sensor, **parameters) -> Description; the sensor is on line 1 of the file, `body` starts on line 2."""
 
     def read(body: str, sensor: str = SENSOR, **parameters) -> d.Description:
         path = tmp_path / "scene.xml"
@@ -37,7 +37,7 @@ def read(tmp_path):
 
 @pytest.fixture
 def refused(read):
-    """The message with which a scene is refused; it must name `line`."""
+    """(body, line, **keywords) -> the error message, which must name the line."""
 
     def refused(body: str, line: int = 2, **keywords) -> str:
         with pytest.raises(InputError) as caught:
@@ -148,7 +148,7 @@ def test_included_files_are_found_beside_the_scene_beside_the_includer_and_in_pa
     ],
 )
 def test_objects_of_files_that_are_included_anywhere_stand_there(read, tmp_path, body):
-    """As in Mitsuba, which leaves out numbers of a file that are in none of its objects."""
+    """As in Mitsuba, which ignores the values of an included file that belong to none of its objects."""
     red = '<bsdf type="diffuse" id="red"><rgb name="reflectance" value="$red, 0, 0"/></bsdf>'
     (tmp_path / "part.xml").write_text(
         f'<scene version="3.0.0"><default name="red" value="0.9"/>{red}<float name="radius" value="9"/></scene>'
@@ -386,7 +386,7 @@ def test_a_mesh_without_any_area_is_left_out_with_its_light_and_noted(read, tmp_
     (tmp_path / "line.obj").write_text("v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\nf 3 2 1\n")
     file, light = '<string name="filename" value="line.obj"/>', '<emitter type="area"/>'
     scene = read(shape(file, "obj", 'id="crack"') + shape() + "\n" + shape(file + light, "obj") + shape(light))
-    assert [s.name for s in scene.shapes] == ["shape0", "shape2"]  # the names of the others are what they were
+    assert [s.name for s in scene.shapes] == ["shape0", "shape2"]  # the other shapes keep their names
     assert [s.emitter is None for s in scene.shapes] == [True, False]
     left_out = [note for note in scene.notes if "is left out, as no triangle has an area" in note]
     assert ["scene.xml:2: " in note and "light" not in note for note in left_out] == [True, False]
@@ -511,7 +511,7 @@ def picture(tmp_path):
 
 
 def evaluated(mitsuba, body, uv):
-    """Mitsuba's reflectance of the first shape's bsdf at uv."""
+    """Return Mitsuba's reflectance of the first shape's bsdf at uv."""
     si = mitsuba.SurfaceInteraction3f()
     si.uv, si.wi = uv, [0, 0, 1]
     scene = mitsuba.load_string(f'<scene version="3.0.0">{body}</scene>')
@@ -552,7 +552,7 @@ def test_a_texture_that_is_referenced_twice_is_read_once(read, picture):
 
 
 def test_a_board_that_stands_for_a_number_and_for_a_colour_is_refused(read):
-    """It is two boards, and the names of its parameters would mean one."""
+    """It would be two boards, and the names of its parameters are those of one."""
     board = '<texture type="checkerboard" id="board"/>'
     twice = with_bsdf("plastic", '<ref name="diffuse_reflectance" id="board"/>')
     both = twice + with_bsdf("mask", '<ref name="opacity" id="board"/><bsdf type="diffuse"/>')
@@ -595,7 +595,7 @@ def test_images_below_0_are_no_reflectance(refused, tmp_path, inside):
 
 
 def test_images_above_1_are_kept_with_a_note_as_mitsuba_keeps_them(read, tmp_path):
-    """As a parameter they may stay what they are. What is a share of something has no such values."""
+    """As parameters they may be set again. Values that are shares, such as an opacity, may not exceed 1."""
     bright = np.full((2, 2), 1.5, np.float32)
     write_exr(tmp_path / "bright.exr", {"R": bright, "G": bright, "B": bright}, {})
     texture = '<texture name="{}" type="bitmap"><string name="filename" value="bright.exr"/></texture>'
@@ -674,7 +674,7 @@ def test_defaults_of_sensor_film_and_integrator_are_mitsubas(read, mitsuba):
     assert (camera.near_clip, camera.far_clip) == pytest.approx((params["near_clip"], params["far_clip"]))
     assert str(sensor.film().rfilter()) == f"GaussianFilter[stddev={scene.view.film.filter.stddev:.2f}, radius=2.00]"
     assert scene.view.film.filter == Gaussian(0.5, 2)
-    # 50 mm on 36 x 24 mm film, measured along the diagonal; Mitsuba keeps what that makes along x
+    # 50 mm on 36 x 24 mm film, measured along the diagonal; Mitsuba stores the resulting angle along x
     assert scene.view.camera.fov_axis == "diagonal"
     x_fov = 2 * math.degrees(math.atan(math.tan(math.radians(scene.view.camera.fov / 2)) * 4 / 5))
     assert x_fov == pytest.approx(params["x_fov"], rel=1e-5)
@@ -776,7 +776,7 @@ def test_top_level_elements_that_are_not_modelled_are_refused(refused, body, wor
 
 
 def test_a_scene_without_sensor_is_seen_by_one_that_frames_it(tmp_path):
-    """Also where it was written again."""
+    """The same holds after the scene is saved and loaded."""
     place = '<transform name="to_world"><scale value="3"/><translate x="40" z="7"/></transform>'
     body = shape(place, "cube") + '<emitter type="constant"/>'
     (tmp_path / "scene.xml").write_text(f'<scene version="3.0.0">{body}</scene>')
@@ -830,7 +830,7 @@ DECLARED = "scene [\n<!ELEMENT a ANY><!ATTLIST a b ']>'>\n]"
 
 @pytest.mark.parametrize("kind", ["scene", 'scene SYSTEM "a>.dtd"', 'scene PUBLIC "-//[" "b"', DECLARED])
 def test_a_document_type_is_skipped(tmp_path, kind):
-    """As in Mitsuba; lines stay where they are."""
+    """As in Mitsuba; line numbers stay right."""
     text = f'<?xml version="1.0"?>\n<!-- a -->\n<!DOCTYPE {kind}>\n<scene version="3.0.0">{SENSOR}\n<shape/></scene>'
     (tmp_path / "scene.xml").write_text(text)
     line = text[: text.index("<shape")].count("\n") + 1
@@ -842,7 +842,7 @@ def test_a_document_type_is_skipped(tmp_path, kind):
 
 @pytest.mark.parametrize("version", ["2.0.0", "3.99.1", "4.0.0", "10.2.0"])
 def test_newer_versions_are_read_as_they_stand(tmp_path, version):
-    """As in Mitsuba: the rules for old files are for 0 and 1, and 10 is neither."""
+    """As in Mitsuba: the rules for old files apply to major versions 0 and 1, and 10 is neither."""
     (tmp_path / "scene.xml").write_text(f'<scene version="{version}">{SENSOR}{shape()}</scene>')
     assert len(load(tmp_path / "scene.xml").shapes) == 1
 
@@ -966,7 +966,7 @@ def given(name: str) -> str:
 
 
 def loaded(read, place: str, inside: str) -> d.Description:
-    """A scene with something inside of a place, which may be the sensor."""
+    """Return a scene with `inside` put into the element `place`, which may be the sensor."""
     made = place.format(inside)
     return read("", sensor=made) if made.startswith("<sensor") else read(made)
 
@@ -986,7 +986,7 @@ def test_what_has_no_effect_is_taken_and_noted(read, picture, place, names):
 def test_mitsuba_takes_what_has_no_effect(mitsuba, picture, tmp_path, place, names):
     inside = "".join(map(given, names))
     body = place.format(inside).replace("picture.png", str(tmp_path / "picture.png"))
-    mitsuba.load_string(f'<scene version="3.0.0">{body}</scene>')  # which raises where a parameter is unknown
+    mitsuba.load_string(f'<scene version="3.0.0">{body}</scene>')  # raises where a parameter is unknown
 
 
 @pytest.mark.parametrize(

@@ -27,7 +27,7 @@ def same(one, other):
 
 
 def moved(scene):
-    """The scene with another value of each parameter."""
+    """Return the scene with every parameter changed."""
     about = scene.about.parameters
     inside = {name: np.clip(value * 0.75 + 0.1, *about[name].bounds) for name, value in pj.parameters(scene).items()}
     # Texels are written as float32.
@@ -47,7 +47,7 @@ def again(tmp_path):
 
 
 def dictionary():
-    """What cannot come from a file of Mitsuba: arrays."""
+    """Return a scene with arrays, which Mitsuba's files cannot hold."""
     random = np.random.default_rng(1)
     wall = {"type": "rectangle", "to_world": pj.Transform().translate([0, 0, -1]).scale(2)}
     ball = trimesh.creation.icosphere(2, 0.6)
@@ -109,7 +109,7 @@ def test_arrays_come_back_from_files_beside(again, tmp_path):
 
 
 def test_float64_comes_back(again, x64):
-    """But for a last bit of normals, which are made unit vectors anew."""
+    """Normals may differ in the last bit, since they are normalised again."""
     with x64():
         scene = moved(pj.load_dict(dictionary(), dtype=jnp.float64))
         trees = [replace(each, about=None) for each in (scene, again(scene, dtype=jnp.float64))]
@@ -132,7 +132,7 @@ def test_a_kind_of_a_user_comes_back(again, monkeypatch, make_scene):
 
         @classmethod
         def read(cls, loader, fields, name):
-            """By a name that stands for a colour."""
+            """Accept a name that stands for a colour."""
             made = super().read(loader, fields, name)
             if fields.string("cloth", "none") == "wool":
                 if made.values["tint"] is not None:

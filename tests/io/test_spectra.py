@@ -1,4 +1,4 @@
-"""Spectra of scene files become the linear RGB that Mitsuba's RGB mode has for them."""
+"""Spectra in scene files become the same linear RGB as in Mitsuba's RGB mode."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ import pathjax as pj
 from pathjax.description import spectra
 from pathjax.errors import InputError
 
-# Parameters by how a spectrum is converted: a reflectance is bounded, what metals have is not, and a light is not lit.
+# One parameter per way to convert a spectrum: reflectances are bounded, the IORs of metals are not, radiances are not
+# seen under an illuminant.
 PLACES = {
     "reflectance": '<shape type="sphere"><bsdf type="diffuse" id="it">{}</bsdf></shape>',
     "eta": '<shape type="sphere"><bsdf type="conductor" id="it">{}<float name="k" value="1"/></bsdf></shape>',
@@ -42,7 +43,7 @@ BRIGHT = ['<spectrum name="NAME" value="400:2, 700:2"/>', '<spectrum name="NAME"
 
 @pytest.fixture
 def colour(write_scene, tmp_path):
-    """(a spectrum, the parameter that it sets) -> (3,), and notes."""
+    """(spectrum, name of the parameter that it sets) -> (3,) colour, and notes."""
     (tmp_path / "lamp.spd").write_text("# of a lamp\n400 0.1\n\n 500  0.25 \n600\t0.3\n700 0.5\n")
 
     def colour(spectrum, name):
@@ -54,7 +55,7 @@ def colour(write_scene, tmp_path):
     return colour
 
 
-@pytest.mark.filterwarnings("ignore::pathjax.errors.InputWarning")  # of a spectrum that is invisible
+@pytest.mark.filterwarnings("ignore::pathjax.errors.InputWarning")  # for a spectrum that is invisible
 @pytest.mark.parametrize("name", PLACES)
 def test_spectra_are_converted_as_mitsubas(colour, name, tmp_path):
     mi = pytest.importorskip("mitsuba")
@@ -77,7 +78,7 @@ def test_spectra_are_converted_as_mitsubas(colour, name, tmp_path):
 
 
 def test_textures_of_one_colour_may_stand_elsewhere_and_in_dictionaries():
-    """By reference, in the place of a number, and as Mitsuba's dictionaries name them."""
+    """By reference, in place of a scalar, and as Mitsuba's dictionaries name them."""
     raw = {"type": "rawconstant", "value": [0.1, 0.2, 0.3]}
     scene = {
         "type": "scene",

@@ -1,4 +1,4 @@
-"""What the tests of mesh files share: a file is written and loaded, and its surface measured."""
+"""Fixtures for mesh files: write a file, load it, and measure its surface."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,7 +25,7 @@ class Loaded:
 
     @property
     def area_vectors(self) -> np.ndarray:
-        """(F, 3) normals as long as the areas; winding gives their sign."""
+        """(F, 3) normals whose lengths are the areas; the winding gives the sign."""
         a, b, c = np.moveaxis(self.corners, 1, 0)
         return np.cross(b - a, c - a) / 2
 
@@ -35,12 +35,12 @@ class Loaded:
 
     @property
     def volume(self) -> float:
-        """What a closed surface encloses; positive where it is wound to have its outside outside."""
+        """Volume inside a closed surface; positive if the surface is wound outwards."""
         return np.linalg.det(self.corners).sum() / 6
 
     @property
     def uv_areas(self) -> np.ndarray:
-        """(F,) with sign."""
+        """(F,) signed areas."""
         (a, b, c) = np.moveaxis(self.mesh.uv[self.mesh.faces], 1, 0)
         (x, y), (z, w) = (b - a).T, (c - a).T
         return (x * w - y * z) / 2
@@ -66,7 +66,7 @@ def load(write):
 
 @pytest.fixture
 def refused(write):
-    """The message."""
+    """(kind, content) -> the error message, which must name the file."""
 
     def refused(kind: str, content: str | bytes) -> str:
         with pytest.raises(InputError) as caught:

@@ -1,4 +1,4 @@
-"""glTF: the triangles are where nodes and accessors put them; what would change them and is not read is refused."""
+"""glTF: triangles lie where nodes and accessors put them; unsupported features that would change them are refused."""
 
 import base64
 import json
@@ -16,7 +16,7 @@ CODES = {"i1": 5120, "u1": 5121, "<i2": 5122, "<u2": 5123, "<u4": 5125, "<f4": 5
 
 
 class Gltf:
-    """A file in the making, of one square under one node."""
+    """Builder of a file with one square under one node."""
 
     def __init__(self, node=(), mode=None):
         self.data = b""
@@ -35,7 +35,7 @@ class Gltf:
         self.accessor(np.array(FACES), "<u2")
 
     def view(self, values, dtype, stride=None, before=0):
-        """Of a bufferView in which each row is followed by rubbish up to `stride` bytes, the number."""
+        """Append a bufferView, each row padded with rubbish to `stride` bytes, and return its index."""
         rows = np.asarray(values, dtype).reshape(len(values), -1)
         rows = rows.view("u1").reshape(len(values), -1)
         if stride:
@@ -75,7 +75,7 @@ class Gltf:
 
 
 def assert_square(loaded, size=1.0, tolerance=1e-6):
-    """All of it, the right way up, each corner with its normal and uv."""
+    """Assert that the whole square is there, facing up, each corner with its normal and uv."""
     assert loaded.area == pytest.approx(size, rel=tolerance)
     assert loaded.area_vectors.sum(axis=0) == pytest.approx([0, 0, size], abs=tolerance)
     place = np.round(loaded.mesh.vertices[:, :2]).astype(int) @ [1, 2]
@@ -84,7 +84,7 @@ def assert_square(loaded, size=1.0, tolerance=1e-6):
 
 
 def test_sparse_accessors_replace_values(load):
-    """The same square, of which the file stores one corner, one uv and one index apart from the others."""
+    """The same square, with one corner, two uvs and one index stored apart from the others."""
     file = Gltf()
     wrong = POSITIONS.copy()
     wrong[3] = 9, 9, 9
@@ -108,7 +108,7 @@ def test_buffers_beside_the_file_may_have_any_name(load, tmp_path, name):
     (tmp_path / name).write_bytes(file.data)
     quoted = "".join(c if c.isascii() and c.isalnum() else "".join(f"%{b:02X}" for b in c.encode()) for c in name)
     assert_square(load("gltf", file.gltf(quoted)))
-    assert_square(load("gltf", file.gltf(name)))  # as programs write it that do not know of the encoding
+    assert_square(load("gltf", file.gltf(name)))  # as written by programs that do not quote names
 
 
 @pytest.mark.parametrize("start", ["data:application/gltf-buffer;base64,", "data:;base64,", "DATA:a/b;c=d;base64,"])
@@ -129,7 +129,7 @@ def test_strided_and_shifted_views(load):
 
 @pytest.mark.parametrize("dtype", ["i1", "u1", "<i2", "<u2"])
 def test_normalised_integers(load, dtype):
-    """Of KHR_mesh_quantization; the most negative integer is -1 too."""
+    """With KHR_mesh_quantization; the most negative integer is -1 too."""
     most = np.iinfo(dtype).max
     file = Gltf()
     file.header["extensionsRequired"] = ["KHR_mesh_quantization"]
@@ -198,7 +198,7 @@ def test_nodes_scale_then_turn_then_move(load, node):
 
 
 def test_mirroring_nodes_keep_the_outside_outside(load):
-    """Also where two mirrors undo each other, and where the square has no normals to tell."""
+    """Also where two mirrors cancel each other, and where the square has no normals."""
     for scales in ([[-1, 1, 1]], [[-1, 1, 1], [1, -1, 1]], [[-1, -1, 1]]):
         file = Gltf()
         file.header["nodes"] = [{"children": [k + 1], "scale": scale} for k, scale in enumerate(scales)] + [{"mesh": 0}]
@@ -211,7 +211,7 @@ def test_mirroring_nodes_keep_the_outside_outside(load):
 
 
 def test_flattened_nodes(load):
-    """A node that is scaled to nothing hides what is in it; one that is flattened has no inverse, but normals."""
+    """A node scaled to nothing hides its content; a flattened one has no inverse, but still has normals."""
     file = Gltf({"scale": [1, 1, 0]})
     loaded = load("glb", file.glb())
     np.testing.assert_allclose(loaded.mesh.normals, [[0, 0, 1]] * 4, atol=1e-7)
@@ -270,7 +270,7 @@ def test_bytes_behind_the_length_that_a_glb_states_are_not_its_own(load):
 
 
 def changed(**entries):
-    """The square's file with a change to its header, or to the primitive of its mesh."""
+    """Return the square's file with a change to its header, or to the primitive of its mesh."""
     file = Gltf()
     for name, value in entries.items():
         (file.primitive if name in ("indices", "mode", "targets", "attributes") else file.header)[name] = value

@@ -1,4 +1,4 @@
-"""Meshes: positions, normals and uv agree with Mitsuba's loader; what no triangle can be made of is refused."""
+"""Meshes: positions, normals and uv agree with Mitsuba's loader; files that give no triangles are refused."""
 
 import struct
 from pathlib import Path
@@ -37,7 +37,7 @@ CASES = [(kind, text) for kind, texts in (("obj", OBJ), ("ply", PLY)) for text i
 
 
 def mitsuba_mesh(path, kind, to_world, inside=""):
-    """Corner by corner: (F, 3, 3) positions, (F, 3, 3) normals or None, (F, 3, 2) uv or None."""
+    """Return per corner: (F, 3, 3) positions, (F, 3, 3) normals or None, (F, 3, 2) uv or None."""
     mi = pytest.importorskip("mitsuba")
     mi.set_variant("scalar_rgb")
     mi.set_log_level(mi.LogLevel.Error)
@@ -54,7 +54,7 @@ def mitsuba_mesh(path, kind, to_world, inside=""):
 
 
 def solid(corners):
-    """(F,) bool: no sliver, whose area hangs on the last bit of its coordinates."""
+    """Return (F,) bool: False for slivers, whose areas depend on the last bit of their coordinates."""
     a, b, c = np.moveaxis(corners.astype(float), 1, 0)
     return np.linalg.norm(np.cross(b - a, c - a), axis=1) > 1e-7
 
@@ -67,7 +67,7 @@ def assert_agrees(path, kind, to_world, face_normals):
     positions, normals, uv = (None if values is None else values[theirs] for values in (positions, normals, uv))
     faces = ours.faces[solid(ours.vertices[ours.faces])]
     if not np.allclose(ours.vertices[faces], positions, atol=1e-5):
-        faces = faces[:, ::-1]  # normals of the file under a mirror: ours reverses the winding, to agree with them
+        faces = faces[:, ::-1]  # under a mirror, ours reverses the winding to agree with the file's normals
         assert np.linalg.det(to_world[:3, :3]) < 0
     np.testing.assert_allclose(ours.vertices[faces], positions, atol=1e-5)
     assert (ours.normals is None) == (normals is None)
@@ -177,7 +177,7 @@ def test_sheets_with_a_face_for_each_side_have_the_normals_of_their_faces(write,
 
 @pytest.mark.parametrize("size", ["1e-200", "1e200", "1e-30", "1e30"])
 def test_normals_of_any_length_are_made_unit(write, size):
-    """Or are none, where the square of their length is out of range."""
+    """Normals whose squared length is out of range count as missing."""
     text = OBJ["no normals"].replace("f 1 2 3", f"vn 0 0 {size}\nf 1//1 2//1 3//1")
     mesh, _ = load(write("obj", text), "obj", IDENTITY)
     np.testing.assert_allclose(mesh.normals[mesh.faces[0]], [[0, 0, 1]] * 3, atol=1e-12)

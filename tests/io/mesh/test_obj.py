@@ -1,4 +1,4 @@
-"""OBJ: what the lines say is read, however they are written; one that says something else is refused by its number."""
+"""OBJ: lines are read in every way to write them; a line with other content is refused by its number."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""PLY: every layout that a header can describe is read as it says; what is none is refused."""
+"""PLY: every layout that a header can describe is read; other files are refused."""
 
 import struct
 
@@ -15,7 +15,7 @@ ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 
 
 def ply(form, elements, end="\n", comments=()):
-    """A file of elements: (name, [(property name, its type or (type of the length, type))], rows)."""
+    """Return a file of elements: (name, [(property name, its type or (type of the length, type))], rows)."""
     header, rows, data = ["ply", f"format {form} 1.0", *comments], [], b""
     for name, properties, values in elements:
         header.append(f"element {name} {len(values)}")
@@ -100,7 +100,7 @@ def test_normals_and_uv_of_uneven_faces_stay_with_their_vertices(load, form, uv)
     ids=["one", "ended by -1", "two", "joined by repeated vertices"],
 )
 def test_triangle_strips(load, form, strips, area):
-    """Every second triangle is wound the other way, counted from the strip's begin."""
+    """Every second triangle is wound the other way, counted from the start of the strip."""
     points = [(x, y, 0) for x in range(4) for y in (0, 1)]
     elements = [("vertex", [(axis, "float") for axis in "xyz"], points)]
     elements += [("tristrips", [("vertex_indices", ("int", "int"))], [(strip,) for strip in strips])]
@@ -120,7 +120,7 @@ def test_line_ends_and_names_in_other_encodings(load, end):
 
 
 def test_numbers_of_a_text_are_rounded_to_their_type(load):
-    """So that text and binary files of one mesh are the same mesh."""
+    """So text and binary files of one mesh give the same mesh."""
     third = [(x / 3, y / 3, z) for x, y, z in POINTS]
     faces = ("face", [("vertex_indices", ("uchar", "int"))], [([0, 1, 2],)])
     kinds = [(axis, "float") for axis in "xyz"]

@@ -1,4 +1,4 @@
-"""Polygons are covered once by their triangles, with their winding and uv, and meet their neighbours' vertices."""
+"""Triangles cover their polygon once, with its winding and uv, and meet the vertices of its neighbours."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ def shoelace(points):
 
 
 def text(kind, polygons, planes=None):
-    """A file of polygons (n, 2), of which x and y are uv too, each in a plane given by origin, u and v (3, 3)."""
+    """Return a file of polygons (n, 2), whose x and y are also uv, each in a plane given by origin, u and v (3, 3)."""
     planes = planes or [np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0)], float)] * len(polygons)
     points = np.concatenate([p[0] + polygon @ p[1:] for polygon, p in zip(polygons, planes, strict=True)])
     uv = np.concatenate(polygons)
@@ -38,7 +38,7 @@ def text(kind, polygons, planes=None):
 
 
 def assert_covered(loaded, area_vector, uv_area):
-    """Once: the areas, all towards one side, add up to the polygon's; so do those of uv."""
+    """Assert that the areas, all facing the same way, add up to the polygon's; likewise those of uv."""
     np.testing.assert_allclose(loaded.area_vectors.sum(axis=0), area_vector, atol=1e-9)
     assert loaded.area == pytest.approx(np.linalg.norm(area_vector), rel=1e-9)
     areas = loaded.uv_areas
@@ -73,7 +73,7 @@ def test_polygons_in_slanted_planes_far_from_the_origin_are_covered(load, kind):
 
 
 def star(rng, n):
-    """A polygon whose corners lie around the origin in order, at random distances; on a grid, for exact sums."""
+    """Return a polygon with corners in order around the origin at random distances; on a grid, for exact sums."""
     angle = np.sort(rng.uniform(0, 2 * np.pi, n)) + np.arange(n)  # spread, or the origin might lie outside
     angle *= 2 * np.pi / (2 * np.pi + n)
     return np.round(rng.uniform(0.2, 1, n)[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1) * 4096) / 4096
@@ -124,7 +124,7 @@ def test_polygons_that_cross_themselves_are_noted_and_leave_others_alone(load, p
 
 
 def test_polygons_that_cross_themselves_by_a_hair_are_covered_but_for_a_hair(load):
-    """As where a hole is cut open by two edges that are one but for the rounding of the text."""
+    """As where a hole is cut open by two edges that differ only by the rounding of the text."""
     frame = FRAME.copy()
     frame[4] += 1e-4, -1e-4
     frame[5] -= 1e-4, -1e-4

@@ -1,4 +1,4 @@
-"""Serialized meshes: both versions, single and double precision, several in a file; what is none is refused."""
+"""Serialized meshes: both versions, single and double precision, several in a file; other files are refused."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ NORMALS = np.array([(0, 0, 1), (0, 0.6, 0.8), (0, 0, 1), (0, 0, 1)])
 UV = np.array([(0, 0), (1, 0), (1, 0.75), (0, 1)])
 COLORS = np.arange(12).reshape(4, 3) / 12
 SINGLE, DOUBLE = 0x1000, 0x2000
-# Bits of the flags, and what they announce, in the order of the file.
+# Flag bits and the data that they announce, in the order of the file.
 OPTIONAL = {0x0001: NORMALS, 0x0002: UV, 0x0008: COLORS}
 VERSIONS = pytest.mark.parametrize("version", [3, 4])
 
@@ -76,7 +76,7 @@ def test_a_mesh_that_is_not_there_is_refused(write, version):
 @VERSIONS
 def test_a_file_that_is_cut_off_is_refused_wherever_it_ends(refused, version):
     data = stream(version, DOUBLE | 3)
-    for end in range(len(data) - 8):  # the last bytes are a mark and a checksum of what is there already
+    for end in range(len(data) - 8):  # the last bytes are a mark and a checksum
         message = refused("serialized", data[:end])
         assert "ends before" in message or "no mesh at byte 0" in message
 

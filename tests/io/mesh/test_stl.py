@@ -1,4 +1,4 @@
-"""STL: binary and text, told apart by what they hold, not by their first word."""
+"""STL: binary and text, told apart by their content, not by the first word."""
 
 import numpy as np
 import pytest
