@@ -1,4 +1,4 @@
-"""What tests of the command line share: running it, in this process or in one of its own."""
+"""Fixtures that run the command line, in this process or in a separate one."""
 
 import os
 import subprocess
@@ -11,13 +11,13 @@ from pathjax import cli
 
 @pytest.fixture(scope="session")
 def environment(root):
-    """Variables with which another process finds this pathjax, installed or not."""
+    """Environment variables with which another process imports this pathjax, installed or not."""
     return os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, [str(root), os.environ.get("PYTHONPATH")]))}
 
 
 @pytest.fixture
 def run(root, tmp_path, monkeypatch, capfd):
-    """(arguments) -> exit status, stdout, stderr, of `pathjax` in this process, in the checkout."""
+    """(arguments) -> exit status, stdout, stderr of `pathjax`, run in this process and in the checkout."""
     monkeypatch.chdir(root)
 
     def run(*arguments):

@@ -1,4 +1,4 @@
-"""Batches: scenes of one structure share a kernel, and nothing of a batch is lost, done twice or half done."""
+"""Batches: scenes of one structure share a kernel, and no job is lost, done twice or half done."""
 
 import errno
 import itertools
@@ -45,7 +45,7 @@ FLOOR = """<shape type="rectangle"><transform name="to_world"><rotate x="1" angl
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """Scenes that differ in their numbers of triangles and texels."""
+    """Scenes that differ in their triangle and texel counts."""
     folder = tmp_path_factory.mktemp("scenes")
     rng = np.random.default_rng(0)
     for number, divisions in enumerate((1, 2, 3, 4)):
@@ -69,7 +69,7 @@ def some_jobs(count=4):
 
 
 def key(scene):
-    """What a kernel is compiled for."""
+    """Return all that a kernel is compiled for: the tree structure, shapes and dtypes."""
     scene = nameless(scene)
     return jax.tree.structure(scene), [(x.shape, x.dtype) for x in jax.tree.leaves(scene)]
 
@@ -81,7 +81,7 @@ def test_scenes_of_one_structure_are_padded_to_the_same_arrays(folder):
 
 
 def test_images_are_those_of_single_renders_and_one_kernel_makes_them(folder, tmp_path, monkeypatch):
-    """To the bit: what scenes are padded with adds nothing."""
+    """To the bit: the padding of scenes contributes nothing."""
     jobs = some_jobs()
     jobs[1] |= {"set": {"floor.reflectance": [0.1, 0.2, 0.3]}, "parameters": {"fov": 30}, "seed": 5}
     jobs[2] |= {"output": "deep/er/2.exr"}
@@ -97,7 +97,7 @@ def test_images_are_those_of_single_renders_and_one_kernel_makes_them(folder, tm
 
 
 def things(kind, count, folder):
-    """Bodies of scenes of one structure that differ in their numbers; and what makes them so."""
+    """Return the body of a scene with `count` objects of a kind; bodies of one kind have one structure."""
     diffuse = '<bsdf type="diffuse" id="{}"/>'
     ball = '<shape type="ply"><string name="filename" value="2.ply"/>{}{}</shape>'
     place = '<transform name="to_world"><scale value="0.3"/><translate x="{}"/></transform>'
@@ -122,7 +122,7 @@ def things(kind, count, folder):
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["meshes and lights", "instances", "bsdfs", "grids"])
 def test_images_of_every_structure_are_those_of_single_renders(folder, tmp_path, kind, run):
-    """To the bit, of the command line too; numbers of things differ, and the kernel does not."""
+    """To the bit, on the command line too. The scenes differ in their counts, but share a kernel."""
     for place, count in enumerate((6, 7)):
         text = SCENE.format(mesh=f"{place}.ply", image=f"{place}.exr", more=things(kind, count, folder))
         text = text.replace('"path"', '"volpath"') if kind == "grids" else text

@@ -1,4 +1,4 @@
-"""Several processes that share one render: the bits of one process, and an end when one of them is lost."""
+"""Several processes that share one render give the bits of one process, and end when one of them is lost."""
 
 import json
 import os
@@ -14,7 +14,7 @@ import pytest
 from pathjax.images import read_rgb
 
 SCENE = "scenes/cornell_box.xml"
-# The longest that survivors may take.
+# Seconds within which the surviving processes must end.
 PATIENCE = 15
 
 
@@ -35,7 +35,7 @@ def test_wrong_numbers_are_refused(refused, tmp_path, arguments, says):
 def together(root, environment, tmp_path):
     """(processes, *arguments) -> running processes of one command.
 
-    devices: of each, or a tuple; each: further arguments, with the number of the process for {}.
+    devices: the device count of each, or a tuple of counts; each: further arguments, with the process index for {}.
     """
     running = []
 
@@ -74,7 +74,7 @@ def outcome(processes):
 @pytest.mark.slow
 @pytest.mark.parametrize(("film", "others"), [("box", [2, 3]), ("gaussian", [2])])
 def test_images_are_those_of_one_process(together, tmp_path, root, film, others):
-    """Of one with two devices. Under a wide filter three devices sum up in another order."""
+    """The one process has two devices. With a wide filter three devices would sum in another order."""
     scene = tmp_path / "box.xml"
     scene.write_text((root / SCENE).read_text().replace('type="box"', f'type="{film}"'))
     images = []
@@ -162,7 +162,7 @@ def test_a_scene_and_a_target_that_the_first_process_alone_sees_are_sent(togethe
 
 @pytest.mark.slow
 def test_a_cluster_is_found(together, tmp_path, root, monkeypatch):
-    """As SLURM tells its processes who they are."""
+    """Processes learn their indices as under SLURM."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         monkeypatch.setenv("JAX_COORDINATOR_PORT", str(free.getsockname()[1]))
@@ -195,7 +195,7 @@ def test_fits_are_those_of_one_process(together, tmp_path, run):
 
 @pytest.mark.slow
 def test_a_bench_is_shared_and_goes_on_where_the_first_process_stopped(together, tmp_path):
-    """All processes agree on what is left, although the first alone has the report."""
+    """All processes agree on the remaining work, although only the first one has the report."""
     report = tmp_path / "report"
     options = "-D", "res=12", "--spp", "1,4", "--reference-spp", 8, "--repeat", 2, "--json"
     alone = outcome(together(1, SCENE, *options, devices=2, command="bench"))

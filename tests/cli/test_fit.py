@@ -1,4 +1,4 @@
-"""`pathjax fit`: its table, its files, and what it refuses."""
+"""`pathjax fit`: its table, its files, and its refusals."""
 
 import io
 import json
@@ -13,12 +13,12 @@ from pathjax.images import read_exr, write_exr, write_png
 
 FURNACE = "scenes/furnace.xml"
 SMALL = ("-D", "res=8")
-# A byte that no UTF-8 holds, as Python has it in arguments and names of files.
+# A byte that UTF-8 never contains, as Python represents it in arguments and file names.
 BYTE = "\udcff"
 
 
 def write_target(path, **changes):
-    """The furnace's image, of another albedo than its file's."""
+    """Write the furnace's image, with another albedo than its file's, and return the path."""
     scene = pj.with_parameters(pj.load_scene(FURNACE, res=8), {"wall.reflectance": [0.3, 0.5, 0.7], **changes})
     image = np.asarray(pj.render(scene, 256, seed=1))
     if path.suffix == ".exr":
@@ -48,7 +48,7 @@ def test_fit_prints_a_table_and_writes_its_files(run, tmp_path, kind):
 
 
 def test_a_fit_keeps_its_values_whatever_happens_to_its_files(run, root, target, tmp_path, monkeypatch):
-    """The names hold what markup, terminals and UTF-8 do not take; the folder is gone when the fit ends."""
+    """The names contain characters that markup, terminals and UTF-8 lack; the folder is gone when the fit ends."""
     scene, there = tmp_path / f"{BYTE}.xml", tmp_path / "there"
     scene.write_text((root / FURNACE).read_text().replace('"wall"', '"weiß[/b]"'), encoding="utf-8")
     there.mkdir()
@@ -143,7 +143,7 @@ def test_a_fitted_texture_becomes_an_image_beside_its_report(run, root, tmp_path
 
 @pytest.mark.slow
 def test_a_fitted_map_of_roughness_becomes_an_image_of_one_channel(run, tmp_path):
-    """Three texels in a row are no colour; and neighbours are smoothed, as those of colours are."""
+    """Three texels in a row are not taken for a colour, and neighbours are smoothed as those of colours are."""
     texels = np.array([[0.2, 0.3, 0.4], [0.3, 0.4, 0.5]], np.float32)
     write_exr(tmp_path / "alpha.exr", dict.fromkeys("RGB", texels), {})
     image = '<string name="filename" value="alpha.exr"/><boolean name="raw" value="true"/>'

@@ -1,4 +1,4 @@
-"""`pathjax info`: what a scene holds, its parameters and its tail."""
+"""`pathjax info`: the contents of a scene, its parameters and its tail."""
 
 import json
 

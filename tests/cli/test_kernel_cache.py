@@ -8,18 +8,18 @@ import trimesh
 
 from pathjax.images import read_exr
 
-# A scene of what XLA compiles soonest, with edges in view, so that its images have noise.
+# A scene that XLA compiles fast, with edges in view so that its images have noise.
 SCENE = """<scene version="3.0.0"><sensor type="perspective"><transform name="to_world">
     <lookat origin="0,1,4" target="0,0,0" up="0,1,0"/></transform><film type="hdrfilm"><rfilter type="box"/>
     <integer name="width" value="8"/><integer name="height" value="8"/></film></sensor>
     <emitter type="constant"/>{}</scene>"""
 PIPES = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-# A byte that no UTF-8 holds, as Python has it in arguments and names of files.
+# A byte that UTF-8 never contains, as Python represents it in arguments and file names.
 BYTE = "\udcff"
 
 
-# The same command line; then says how many programs were wanted of JAX's cache, how many it held, and how often the
-# kernel of the image was traced.
+# The same command line; then prints how many programs were requested from JAX's cache, how many it held, and how often
+# the image's kernel was traced.
 COUNTED = """
 import sys
 from pathjax import cli
@@ -36,7 +36,7 @@ sys.exit(status)
 
 @pytest.fixture
 def counted(root, environment, tmp_path):
-    """(*options, scene, **environment) -> a process that renders a plate, or a scene, to a file, and that file."""
+    """(*options, scene, **environment) -> a process that renders the scene, or a plate, to a file, and that file."""
     numbers = iter(range(100))
     plate = tmp_path / "plate.xml"
     plate.write_text(SCENE.format('<shape type="rectangle"/>'))
@@ -53,9 +53,9 @@ def counted(root, environment, tmp_path):
 
 
 def end(started):
-    """Programs wanted of JAX's cache, those found, traces of the kernel of the image, and this one's bytes.
+    """Return how many programs were requested from JAX's cache and found, kernel traces, and bytes of the red channel.
 
-    Nothing may be said on stderr.
+    Nothing may be printed on stderr.
     """
     process, output = started
     out, err = process.communicate(timeout=120)
@@ -73,7 +73,7 @@ linux = pytest.mark.skipif(sys.platform != "linux", reason="kernels are kept on 
 
 @linux
 def test_scenes_of_one_structure_find_the_kernel_of_another(counted, tmp_path):
-    """With other numbers of triangles and bsdfs."""
+    """The scenes differ in their triangle and bsdf counts."""
     thing = '<shape type="ply"><string name="filename" value="{}.ply"/><bsdf type="diffuse"/></shape>'
     told = []
     for place, count in enumerate((3, 4)):
@@ -102,7 +102,7 @@ def test_the_second_run_compiles_nothing_and_gives_the_same_image(counted, tmp_p
     without = end(counted(PATHJAX_CACHE=0, XDG_CACHE_HOME=tmp_path / "none"))
     assert image == first[3] == other[3] == without[3]
     assert without[1] == 0 < without[2] and not (tmp_path / "none").exists()
-    # What cannot be read is made anew.
+    # An unreadable program is compiled again.
     (program,) = cache.rglob("*.program")
     program.write_bytes(b"nothing of XLA's")
     again, last = (end(counted(XDG_CACHE_HOME=cache)) for _ in range(2))
@@ -134,7 +134,7 @@ def test_a_full_cache_disk_stops_no_render_and_keeps_no_halves(counted, tmp_path
     import resource
 
     cache, limits = tmp_path / "cache", resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 15, limits[1]))  # of the child; its kernel is larger
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 15, limits[1]))  # inherited by the child, whose kernel is larger
     try:
         started = counted("--aov", "depth", XDG_CACHE_HOME=cache)
     finally:

@@ -1,4 +1,4 @@
-"""What was computed is kept: on full disks, where folders are gone, under any name and after any signal."""
+"""Results are kept: on full disks, when folders are gone, under any name and after any signal."""
 
 import errno
 import io
@@ -26,13 +26,13 @@ SMALL = ("-D", "res=8")
 sends_signals = pytest.mark.skipif(sys.platform == "win32", reason="sends SIGINT")
 
 
-# A byte that no UTF-8 holds, as Python has it in arguments and names of files.
+# A byte that UTF-8 never contains, as Python represents it in arguments and file names.
 BYTE = "\udcff"
 
 
 @pytest.fixture
 def meanwhile(monkeypatch):
-    """(what happens after the last sample, before anything is written)."""
+    """(act) -> None: `act` is called after the last sample, before anything is written."""
 
     def install(act, plain=until.Render.run):
         def run(*arguments, **keywords):
@@ -46,7 +46,7 @@ def meanwhile(monkeypatch):
 
 
 def fill_disk(path):
-    """What is written beside `path`, to be renamed, goes to a full disk."""
+    """Send the file that is written beside `path`, before it is renamed, to a full disk."""
     (path.parent / f".{path.name}.{os.getpid()}.part").symlink_to("/dev/full")
 
 
@@ -110,7 +110,7 @@ def test_a_full_disk_under_the_checkpoint_costs_no_image(run, tmp_path, monkeypa
 
 
 def test_names_that_are_not_utf8(run, root, write_scene, tmp_path):
-    """Of the scene, its folder, texture and meshes, the image and the checkpoint."""
+    """Names of the scene, its folder, texture and meshes, the image and the checkpoint."""
     folder = tmp_path / f"d{BYTE}"
     folder.mkdir()
     write_png(folder / f"t{BYTE}.png", np.full((2, 2, 3), 0.5))
@@ -182,7 +182,7 @@ def test_bounces_that_fail_cost_no_image(run, tmp_path, monkeypatch, error, says
 
 @sends_signals
 def test_signals_that_come_after_the_image_is_rendered_cost_the_bounces_alone(run, tmp_path, monkeypatch):
-    """One while the bounces are rendered, and two more while the image is written."""
+    """One signal while the bounces are rendered, and two more while the image is written."""
     numbers = [signal.SIGINT, signal.SIGTERM]
     earlier = [signal.signal(number, signal.default_int_handler) for number in numbers]
     rendering, written = [], threading.Event()

@@ -1,4 +1,4 @@
-"""The command line in processes of its own: as a module, and interrupted."""
+"""The command line in separate processes: as a module, and interrupted."""
 
 import json
 import signal
@@ -41,8 +41,8 @@ def first_line_with(stream, text):
     raise AssertionError(f"{text!r} did not come")
 
 
-# Says when a mesh begins to load, when the first call of the kernel begins, when some calls are done, and when bounces
-# begin, so that the signal comes at a known time; then runs the same command line.
+# Prints when a mesh begins to load, when the first call of the kernel begins, when some calls are done, and when
+# bounces begin, so that the signal comes at a known time; otherwise it is the same command line.
 TELLTALE = """
 import sys
 from pathjax import cli
@@ -79,9 +79,9 @@ sys.exit(cli.main(sys.argv[1:]))
 
 @pytest.fixture
 def interrupt(root, environment):
-    """(arguments, event of TELLTALE, seconds to wait after) -> status, stdout, stderr, seconds from the signal on.
+    """(arguments, event of TELLTALE, seconds to wait after it) -> status, stdout, stderr, seconds since the signal.
 
-    The quickest of three tries, as other work on the machine only ever adds; one that is soon enough is the last.
+    The quickest of three tries, since other work on the machine only adds time; a try within SOON is the last.
     """
 
     def interrupt(arguments, event, seconds):
@@ -92,7 +92,7 @@ def interrupt(root, environment):
 
     def once(arguments, event, seconds):
         command = [sys.executable, "-c", TELLTALE, *map(str, arguments)]
-        kept = str(int(event == "kernel ran"))  # else what compiles is soon over
+        kept = str(int(event == "kernel ran"))  # with the cache, compilation ends too soon
         compiling = environment | {"JAX_ENABLE_COMPILATION_CACHE": kept}
         with subprocess.Popen(command, cwd=root, env=compiling, **PIPES) as started:
             try:
@@ -108,7 +108,7 @@ def interrupt(root, environment):
     return interrupt
 
 
-# Ctrl-C is to be heard within a second; half a second more for a busy machine to write and leave.
+# Ctrl-C must take effect within a second; half a second more lets a busy machine write and exit.
 SOON = 1.5
 
 

@@ -1,4 +1,4 @@
-"""Commands and files that are wrong are refused with one message, before anything is written."""
+"""Wrong commands and files are refused with one message, before anything is written."""
 
 import os
 

@@ -129,7 +129,7 @@ def test_an_error_that_cannot_be_told_is_a_failure(run, tmp_path, radiance, says
 
 @pytest.mark.parametrize("radiance", ["1e-20", "1e20", "2.2e25"])
 def test_error_is_reached_in_any_unit_of_radiance(run, tmp_path, radiance):
-    """As many samples as at 1; bright lamps ended with 16 and an error of 0."""
+    """As many samples as for radiance 1; bright lamps once ended with 16 samples and an error of 0."""
     arguments = ("render", FURNACE, *SMALL, "-o", tmp_path / "a.exr", "--aov", "error", "--error", 0.01, "--json")
     one = json.loads(run(*arguments)[1])
     status, out, _ = run(*arguments, "--set", f"glow.radiance={radiance}")
