@@ -1,4 +1,4 @@
-"""Comparing images: closed forms, the false-alarm rate of z-scores, exit statuses, and what is refused."""
+"""Comparing images: closed forms, the false-alarm rate of z-scores, exit statuses, and errors."""
 
 import json
 import math
@@ -78,7 +78,7 @@ def test_level_of_nothing_is_not_known(value):
 
 @pytest.mark.parametrize("unit", [1e-25, 1e-10, 0.1, 1, 1e10, 1e25])
 def test_relative_error_knows_no_unit(unit):
-    """A tenth too bright everywhere, where one half of the image is black."""
+    """The image is 10 % too bright everywhere, and half of the reference is black."""
     reference = np.zeros((4, 4, 3))
     reference[2:] = unit
     expected = 0.1 / math.sqrt(2 * 1.01)
@@ -104,7 +104,7 @@ def test_flip_meets_black_references_and_negative_values():
 
 @pytest.mark.parametrize("power", [-80, -66, -30])
 def test_flip_of_high_dynamic_range_knows_no_unit(power):
-    """FLIP's own program takes what is darker than 2e-7 for black."""
+    """FLIP's own program takes values below 2e-7 for black."""
     pytest.importorskip("flip_evaluator")
     rng = np.random.default_rng(0)
     reference = rng.lognormal(size=GREY.shape).astype(np.float32)

@@ -1,4 +1,4 @@
-"""Images: what is written is read back, files appear whole or not at all, broken ones are refused."""
+"""Image files are read back as written, appear whole or not at all, and are refused if broken."""
 
 import os
 import struct
@@ -154,7 +154,7 @@ def png(width, height, bits, color, rows, interlaced=False, chunks=b""):
 
 
 def hdr(line="# a remark", size="-Y 1 +X 2", form="rgbe", rows=bytes((200, 100, 50, 129, 0, 0, 0, 0))):
-    """Rows as they were before they were compressed, which narrow images still have."""
+    """Return a file with uncompressed rows, which narrow images still have."""
     return f"#?RADIANCE\n{line}\nFORMAT=32-bit_rle_{form}\n\n{size}\n".encode() + rows
 
 
@@ -321,7 +321,7 @@ def test_xyz_becomes_rgb_by_the_matrix_of_mitsuba(tmp_path, rgb, names):
     header = {"chromaticities": (1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 1 / 3, 1 / 3)} if names == "RGB" else {}
     exr(tmp_path / "a.exr", named(xyz, names) | {"A": rgb[..., 0]}, header)
     read = read_rgb(tmp_path / "a.exr")
-    np.testing.assert_allclose(read, rgb, atol=7 * 3e-6)  # six digits of a matrix of numbers up to 3
+    np.testing.assert_allclose(read, rgb, atol=7 * 3e-6)  # the matrix has entries up to 3, given to six digits
     assert read.min() >= 0  # a fit refuses negative light, and there was none
     exr(tmp_path / "half.exr", named(xyz.astype(np.float16), names), header)
     read = read_rgb(tmp_path / "half.exr")
@@ -384,7 +384,7 @@ def test_every_compression_is_read(tmp_path, compression):
     y, x = np.mgrid[0:40, 0:70]
     smooth = np.stack([1 + np.sin(x / 9), 1 + np.cos(y / 7), 1 + np.sin((x + y) / 11)], -1).astype(np.float16)
     exr(tmp_path / "a.exr", planes(smooth), {"compression": getattr(OpenEXR, f"{compression}_COMPRESSION")})
-    # B44 keeps six bits of a difference in a block of 4 x 4, DWA errs by what is not seen; the others lose nothing.
+    # B44 keeps six bits of a difference in a block of 4 x 4, the errors of DWA are invisible; the others are lossless.
     lossy = compression.startswith(("B44", "DWA"))
     np.testing.assert_allclose(read_rgb(tmp_path / "a.exr"), smooth.astype(np.float32), atol=0.05 if lossy else 0)
 
@@ -545,7 +545,7 @@ def test_one_render_of_mitsuba_is_one_image_in_all_its_pixel_formats(tmp_path, m
     rgb = mitsuba_render(mitsuba, tmp_path / "rgb.exr", pixel_format="rgb")
     other = mitsuba_render(mitsuba, tmp_path / "a.exr", pixel_format=pixels, component_format=component)
     comparison = compare(str(other), str(rgb))
-    # Half precision rounds to 2^-11, and the matrix makes at most 5 times that of it.
+    # Half precision rounds to 2^-11, which the matrix amplifies at most 5 times.
     assert comparison.rel_mse < ((5 * 2.0**-11) ** 2 if component == "float16" else 1e-11)
     assert comparison.image.max() > 0.1 and comparison.image.min() >= 0
     assert comparison.hdr
@@ -565,7 +565,7 @@ def test_renders_of_mitsuba_with_other_channels_are_read(tmp_path, mitsuba):
 
 
 def test_primaries_alpha_and_curves_are_those_of_mitsubas_textures(tmp_path, mitsuba, rgb):
-    """Constant images of each kind, as Mitsuba's bitmap texture sees them."""
+    """Constant images of each kind agree with Mitsuba's bitmap texture."""
     color = np.broadcast_to(np.float32([0.2, 0.3, 0.1]), (4, 4, 3))
     half = {"A": np.full((4, 4), 0.5, np.float32)}
     files = [
@@ -604,7 +604,7 @@ ADAM7 = [(0, 0, 8, 8), (0, 4, 8, 8), (4, 0, 8, 4), (0, 2, 4, 4), (2, 0, 4, 2), (
 
 
 def packed(pixels, bits):
-    """Rows of (h, w, channels) as PNG stores them, none filtered."""
+    """Return rows of (h, w, channels) as PNG stores them, unfiltered."""
     rows = b""
     for row in pixels.reshape(len(pixels), -1):
         samples = "".join(f"{sample:0{bits}b}" for sample in row)
