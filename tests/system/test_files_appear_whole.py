@@ -1,4 +1,4 @@
-"""Files appear whole or not at all; what cannot be written is known before the work where it can be."""
+"""Files appear whole or not at all; errors that can be known before the work are reported before it."""
 
 import os
 
@@ -10,7 +10,7 @@ from pathjax.images import read_exr, write_exr, write_png
 from pathjax.system.files import check_writable, encodable, write_text
 
 PIXELS = {name: np.full((4, 4), 0.5, np.float32) for name in "RGB"}
-# A byte that no UTF-8 holds, as Python has it in names of files.
+# A byte that UTF-8 never contains, as Python represents it in file names.
 BYTE = "\udcff"
 
 

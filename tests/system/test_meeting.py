@@ -1,4 +1,4 @@
-"""Processes that meet before they work together, here as threads: what keeps them apart is told to each of them."""
+"""Processes that connect before they work together, here as threads: each of them learns what prevents it."""
 
 import json
 import os
@@ -27,7 +27,7 @@ def soon_late(monkeypatch):
 
 
 def meeting(address, numbers, *, count=None, facts=None, seconds=10):
-    """What each process is told, or the numbers of those that it is connected with then. facts: of each."""
+    """Return each process's error message, or the indices of the processes connected to it. facts: one each."""
     count, facts = count or len(numbers), facts or [{}] * len(numbers)
 
     def one(number, facts):
@@ -45,7 +45,7 @@ def meeting(address, numbers, *, count=None, facts=None, seconds=10):
 
 @contextmanager
 def came(address, number, *, count):
-    """A process that the first one has seen."""
+    """Connect a process that the first one acknowledges."""
     host, port = address.split(":")
     until = time.monotonic() + 10
     while True:
@@ -78,7 +78,7 @@ def test_some_do_not_come(address):
 
 
 def test_one_who_came_and_ended_is_told_at_once(address):
-    """Before all have come: to those who are there, without waiting for those who are not."""
+    """Before all have come, the present processes are told, without waiting for the others."""
     host, port = address.split(":")
     with ThreadPoolExecutor(1) as thread:
         others = thread.submit(meeting, address, [0, 3], count=4, seconds=60)
@@ -98,7 +98,7 @@ def test_the_first_one_ended(address):
 
 
 def test_another_program_is_at_the_address(address):
-    """One that says nothing of use is asked again, as it may make room for the first process."""
+    """After a useless answer a process asks again, since the program may make room for the first process."""
     host, port = address.split(":")
     with socket.create_server((host, int(port))) as server, ThreadPoolExecutor(1) as thread:
         other = thread.submit(meeting, address, [1], count=2, seconds=1)
@@ -106,7 +106,7 @@ def test_another_program_is_at_the_address(address):
         with suppress(TimeoutError):
             while True:
                 call, _ = server.accept()
-                call.recv(1000)  # else it is told of a reset
+                call.recv(1000)  # otherwise the process sees a reset connection
                 call.sendall(b"SSH-2.0\r\n")
                 call.close()
         assert "another program, or has met all others already" in other.result()[0]
@@ -122,7 +122,7 @@ def test_who_waits_long_is_told_for_whom(address, monkeypatch, capsys):
 
 @pytest.mark.skipif(sys.platform == "win32", reason="counts files")
 def test_a_process_with_many_open_files_meets_others(address):
-    """As the first one of a thousand has."""
+    """The first of a thousand processes has that many."""
     import resource
 
     limits = resource.getrlimit(resource.RLIMIT_NOFILE)

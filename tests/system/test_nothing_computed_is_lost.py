@@ -1,4 +1,4 @@
-"""What was computed is handed over, whatever fails: another place for files, escapes for letters, a message."""
+"""Results are delivered whatever fails: files in another place, escapes for letters, a message."""
 
 import io
 import os
@@ -15,7 +15,7 @@ from pathjax.system.output import Output
 
 @pytest.fixture
 def folders(tmp_path, monkeypatch):
-    """Where the file was asked for, the current folder, and that for temporary files."""
+    """The requested folder of the file, the current folder, and the folder for temporary files."""
     folders = [tmp_path / name for name in ("asked", "here", "temporary")]
     for folder in folders:
         folder.mkdir()
@@ -25,7 +25,7 @@ def folders(tmp_path, monkeypatch):
 
 
 def writer(*full):
-    """A `write` for which the given folders, and those in them, are full."""
+    """Return a `write` that finds the given folders, and folders in them, full."""
 
     def write(path):
         if any(folder in path.parents for folder in full):
@@ -51,7 +51,7 @@ def test_else_it_goes_to_the_current_folder_under_a_new_name(folders, capsys):
     reason = f"pathjax: {asked}/a.txt: cannot be written: No space left on device"
     assert capsys.readouterr().err == f"{reason}; {here}/a-2.txt was written instead\n"
     assert (here / "a.txt").read_text() == "old"
-    # The same file, written again, takes its own place; and the one asked for, once it is there.
+    # The same file, written again, replaces the earlier one, or goes to the requested place once that works.
     assert output.file(asked / "a.txt", writer(asked)) == here / "a-2.txt"
     assert output.file(asked / "a.txt", writer()) == asked / "a.txt"
 
@@ -95,7 +95,7 @@ def test_text_is_escaped_for_a_terminal_that_lacks_letters(monkeypatch):
 
 # ---- the process's own streams --------------------------------------------------------------------------------------
 
-# The program's start, and what commands do then: a file, a result, a message.
+# Starts the program and does what commands do: write a file, print a result, and print a message.
 SCRIPT = """
 import sys
 from pathjax import __main__ as program

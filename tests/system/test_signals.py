@@ -1,4 +1,4 @@
-"""Signals that ask the program to end wait for work that is being finished; and the tests themselves hear them."""
+"""Signals to end the program wait for work that is being finished; the tests receive the signals that they send."""
 
 import os
 import signal
@@ -88,7 +88,7 @@ def test_the_result_of_a_call_and_its_error_arrive():
     assert leave(2) == 2
 
 
-# Waits for a call that takes a minute, and leaves as if it had failed.
+# Waits for a call that takes a minute, and exits as if it had failed.
 STUCK = """
 import time
 from pathjax.system.interrupts import leave, wait_for
@@ -112,13 +112,13 @@ def test_a_signal_ends_the_waiting_and_the_program_though_the_call_goes_on(root)
 # ---- the tests themselves -------------------------------------------------------------------------------------------
 
 SENT = signal.SIGINT, signal.SIGTERM
-# Prints which of them a process would not hear.
+# Prints the signals that a process would not receive.
 DEAF = f"""
 import signal
 print([n for n in {[int(number) for number in SENT]}
        if signal.getsignal(n) == signal.SIG_IGN or n in signal.pthread_sigmask(signal.SIG_BLOCK, ())])
 """
-# Starts a command that is as deaf as what some shells, and programs that start tests, put in the background.
+# Starts a command with these signals ignored or blocked, as some shells and test runners start background processes.
 BACKGROUND = f"""
 import os, signal, sys
 for number in {[int(number) for number in SENT]}:

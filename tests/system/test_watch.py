@@ -1,4 +1,4 @@
-"""Processes that watch each other, here as threads: all learn which one is lost, and what should end is no loss."""
+"""Processes that watch each other, here as threads: all learn which one is lost; a regular end is no loss."""
 
 import queue
 import socket
@@ -12,7 +12,7 @@ from pathjax.system.watch import Relay, Watch
 
 @pytest.fixture
 def star(monkeypatch):
-    """(number) -> watches by process, what each of them is told, and of the others than 0 their ends of connections."""
+    """(count) -> watches by process, each one's queue of messages, and the connection ends of all but process 0."""
     monkeypatch.setattr(watch, "BEAT", 0.02)
     watches, ends = [], []
 
@@ -55,7 +55,7 @@ def test_one_that_is_silent_is_lost(star, monkeypatch):
 
 
 def test_those_that_end_as_they_should_are_not_lost(star):
-    """Not even one that waits for another, which has ended before it has heard of the end."""
+    """Nor is one that waits for another which has ended before it heard of the end."""
     watches, told, ends = star(3)
     for each in watches:
         each.end()
