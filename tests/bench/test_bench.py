@@ -1,4 +1,4 @@
-"""`pathjax bench`: the figures are those of the images, and come as a table, as JSON and as plots."""
+"""`pathjax bench`: its figures are those of the images; it writes a table, JSON and plots."""
 
 import importlib.util
 import json
@@ -52,7 +52,7 @@ def floor(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def folder(floor, tmp_path_factory):
-    """A report of everything but Mitsuba."""
+    """A report of all measurements but Mitsuba's."""
     folder = tmp_path_factory.mktemp("bench") / "report"
     run(floor, *SMALL, "-o", str(folder))
     return folder
@@ -92,7 +92,7 @@ def test_sampler_beside_independent_numbers(scene, floor):
     for row in sampler["rows"]:
         assert row["independent_rel_mse"] == pytest.approx(sampler["single_rel_mse"] / row["spp"])
         assert row["ratio"] == pytest.approx(row["independent_rel_mse"] / row["rel_mse"])
-    # The mean of images of one sample has the error that the table says.
+    # The mean of one-sample images has the error that the table gives.
     small = pathjax.load_scene(floor, res=16)
     truth = pathjax.render(small, 4096, 1 << 10)
     singles = np.stack([pathjax.render(small, 1, 2000 + k) for k in range(512)])
@@ -111,7 +111,7 @@ def test_precision_and_memory(scene):
 
 
 def test_derivatives(scene, folder):
-    """In two reflectances and a radiance, whatever else is a parameter."""
+    """Derivatives in two reflectances and a radiance (9 scalars), whatever the other parameters."""
     derivatives = scene["derivatives"]
     assert derivatives["numbers"] == 9 and derivatives["spp"] == 32
     assert all(len(each) == 2 and min(each) > 0 for each in derivatives["cpu_seconds"].values())
@@ -189,7 +189,7 @@ def test_an_interrupt_keeps_the_scenes_that_are_done(scene, floor, tmp_path, cap
 
 @pytest.fixture
 def measured(scene, monkeypatch):
-    """(what measuring each scene does before its figures are there, None: nothing)."""
+    """(*acts) -> None: measuring a scene first calls its act, unless that is None."""
 
     def install(*happen):
         happen = iter(happen)
@@ -263,7 +263,7 @@ def test_a_missing_peer_is_told_before_anything_is_measured(capsys, monkeypatch)
 
 
 def test_the_best_sampler_is_named_and_one_that_fails_is_told(tmp_path, capsys, monkeypatch):
-    """A peer that renders as pathjax does, with one sampler in no time and another not at all."""
+    """The peer renders as pathjax does, but takes no time with one sampler and fails with another."""
     scene = pathjax.load_scene(FURNACE, res=16)
 
     def call(peer, request):

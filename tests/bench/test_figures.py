@@ -43,7 +43,7 @@ def test_the_error_of_the_reference_is_known_and_subtracted():
 
 
 def test_moments_of_renders_have_the_digits_of_float64():
-    """Images that differ by two ulps of float32, as of a scene of little noise."""
+    """Images that differ by up to two float32 ulps, as of a scene with little noise."""
     images = [jnp.full((2, 2, 3), 1 + k * 2**-23, jnp.float32) for k in (0, 1, 2)]
     mean, variance, count = figures.moments(images)
     assert mean.dtype == variance.dtype == np.float64 and count == 3

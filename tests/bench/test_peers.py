@@ -1,4 +1,4 @@
-"""The peers run in processes of their own and answer in the documented form; every scene shipped loads in Mitsuba."""
+"""Peers run in separate processes and answer in the documented form; every shipped scene loads in Mitsuba."""
 
 import importlib.util
 import json
@@ -21,7 +21,7 @@ needs_embree = pytest.mark.skipif(not importlib.util.find_spec("embreex"), reaso
 
 
 def peer(request, tmp_path):
-    """The peer run by path, as its own documentation has it."""
+    """Run the peer by its path, as its documentation says."""
     file = tmp_path / "request.json"
     file.write_text(json.dumps(request))
     return subprocess.run([sys.executable, mitsuba3.__file__, str(file)], capture_output=True, text=True)
@@ -54,7 +54,7 @@ def test_report_and_arrays(tmp_path):
     with np.load(tmp_path / "out.npz") as arrays:
         assert arrays["images_0"].shape == (3, 8, 8, 3)
         assert arrays["images_0"].dtype == np.float32
-        assert not np.array_equal(arrays["images_0"][0], arrays["images_0"][1])  # seeds are heard
+        assert not np.array_equal(arrays["images_0"][0], arrays["images_0"][1])  # seeds have an effect
         # the closed form of furnace.xml; pixels are independent, so the mean over them has a known error
         rho = np.array([0.2, 0.5, 0.8])
         images = arrays["images_1"].astype(float)
@@ -62,7 +62,7 @@ def test_report_and_arrays(tmp_path):
         z = (images.mean((0, 1, 2)) - (1 - rho**3) / (1 - rho)) / error
         assert np.all(np.abs(z) < 5)
     stratified = report["runs"][0]
-    assert stratified["spp"] == 16  # rounded up, and told
+    assert stratified["spp"] == 16  # rounded up, and reported
     assert len(stratified["seconds"]) == len(stratified["cpu_seconds"]) == 3
 
 

@@ -1,4 +1,4 @@
-"""The twelve scenes: made alike everywhere, loaded by both programs, and of one image in both."""
+"""The twelve scenes are the same wherever they are made; both programs load them and render the same images."""
 
 import json
 import sys
@@ -20,7 +20,7 @@ MADE = "blob", "million", "sky", "lights", "rough", "caustics", "window"
 
 @pytest.fixture
 def small(monkeypatch):
-    """The twelve with 1280 triangles for 1.3 million."""
+    """The twelve scenes with 1280 triangles instead of 1.3 million."""
     monkeypatch.setattr(twelve, "blob", lambda folder: twelve_blob(folder, 3))
     monkeypatch.setattr(twelve, "million", lambda folder: twelve_million(folder, 3))
 
@@ -85,7 +85,7 @@ def test_where_the_shipped_scenes_are_missing_the_remedy_is_told(tmp_path, monke
         twelve.twelve(tmp_path)
 
 
-# ---- what they come to ---------------------------------------------------------------------------------------------
+# ---- the summary ---------------------------------------------------------------------------------------------------
 
 
 def measured(file, seconds, error, peer_seconds, peer_error):
@@ -196,7 +196,7 @@ def made(tmp_path_factory):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", MADE)
 def test_a_made_scene_shows_the_same_in_mitsuba(name, made, estimate, estimate_type, agree):
-    """Neither black nor without a number, and one image in both programs."""
+    """The image is finite, not black, and the same in both programs."""
     pytest.importorskip("mitsuba")
     res, spp, count = 24, 256, 12
     run = {"sampler": "independent", "spp": spp, "seeds": list(range(1, count + 1))}
@@ -208,6 +208,6 @@ def test_a_made_scene_shows_the_same_in_mitsuba(name, made, estimate, estimate_t
     images = arrays["images_0"].astype(float)
     theirs = estimate_type(images.mean(0), images.var(0, ddof=1) / count, count)
     ours = estimate(pj.load_scene(made / f"{name}.xml", res=res), spp=spp, count=count)
-    assert (ours.mean > 0).any(-1).mean() > 0.5  # there is darkness around a box
+    assert (ours.mean > 0).any(-1).mean() > 0.5  # it is dark around a box
     # Two float32 programs: edges and contacts of small triangles move by some 1e-3.
     agree(ours, theirs, rounding=3e-3)

@@ -1,4 +1,4 @@
-"""The counting walk finds what brute force finds, and counts what the renderer's traversal and the SAH cost tell."""
+"""The counting walk finds the hits of brute force; its counts agree with the renderer's traversal and the SAH cost."""
 
 from dataclasses import replace
 
@@ -33,7 +33,7 @@ def unit(x):
 
 
 def random_rays(count, seed):
-    """From in and around the unit cube; some along the axes."""
+    """Return rays from in and around the unit cube, a tenth of them along the axes."""
     rng = np.random.default_rng(seed)
     d = unit(rng.normal(size=(count, 3)))
     d[::10] = np.eye(3)[rng.integers(3, size=len(d[::10]))] * rng.choice([-1, 1], (len(d[::10]), 1))
@@ -53,7 +53,7 @@ def test_hits_are_those_of_brute_force(rule, count, size):
 
 
 def test_counts_of_a_tree_that_is_known():
-    """Two leaves of 8 side by side: a ray meets one of them, or both, or none."""
+    """Two leaves of 8 side by side; rays meet one of them, both, or none."""
     one = np.float32([[0, 0, 0], [1, 0, 0], [0, 1, 0]])
     vertices = np.concatenate([one + np.float32([x, 0, 0.1 * k]) for x in (0, 4) for k in range(8)]).reshape(-1, 3, 3)
     tree = tree_of(vertices)
@@ -70,14 +70,14 @@ def test_counts_of_a_tree_that_is_known():
 
 @pytest.mark.parametrize("rule", RULES)
 def test_lines_meet_as_many_nodes_and_leaves_as_the_sah_cost_says(rule):
-    """Uniform random lines through the root's box, nothing to hit; a z-test with a false alarm rate of 1e-4."""
+    """Uniform random lines through the root's box that hit nothing; a z-test with a false-alarm rate of 1e-4."""
     vertices = triangles(2000, 0.03, seed=3)
     tree = tree_of(vertices, rule)
     rng, count = np.random.default_rng(4), 40_000
     lo, hi = np.nanmin(tree.bounds[0, 0], -1).astype(float), np.nanmax(tree.bounds[0, 1], -1).astype(float)
     extent = hi - lo
     areas = np.prod(extent) / extent
-    # From points on the box, by the cosine to its normal.
+    # From uniform points on the box, with cosine-distributed directions about its normal.
     axis, side = rng.choice(3, count, p=areas / areas.sum()), rng.integers(2, size=count)
     o = lo + extent * rng.random((count, 3))
     o[np.arange(count), axis] = np.where(side, hi[axis], lo[axis])
@@ -92,7 +92,7 @@ def test_lines_meet_as_many_nodes_and_leaves_as_the_sah_cost_says(rule):
 
 @pytest.mark.parametrize("rule", RULES)
 def test_leaves_and_triangles_are_those_of_the_renderers_traversal(root, rule):
-    """Of float32 rays, which may graze a box otherwise than in float64: one in a thousand."""
+    """One in a thousand float32 rays may graze a box differently than in float64."""
     scene = build(mitsuba_xml.load(root / "scenes" / "mesh.xml", res=8), split_rule=rule)
     table, built = scene.geometry.tables[-1], scene.about.trees["triangle"]
     rng = np.random.default_rng(5)
@@ -127,7 +127,7 @@ def test_leaves_and_triangles_are_those_of_the_renderers_traversal(root, rule):
 
 
 def in_arrays_of_one_size(scenes):
-    """Scenes that differ in the tree of their one mesh alone, with room behind nodes and leaves, to share kernels."""
+    """Yield scenes that differ only in the tree of their one mesh, padded to the same array sizes to share kernels."""
     tables = [scene.geometry.tables[0] for scene in scenes]
     nodes, leaves = (max(map(len, arrays)) for arrays in ([t.tree.nodes for t in tables], [t.leaves for t in tables]))
     depth = max(table.tree.depth for table in tables)
