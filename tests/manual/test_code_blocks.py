@@ -1,8 +1,8 @@
-"""Every code block of the README and the manual runs as it is written, page by page, in the order of the page.
+"""Every code block of the README and the manual runs as written, page by page, in the order of the page.
 
 The blocks of a page share a folder, which holds `scenes/`, and the Python names. Blocks of
 - `python` are executed;
-- `console` are commands, after `$`, and what they print, where `...` stands for what may differ; `echo $?` shows the
+- `console` are commands, after `$`, and their output, where `...` stands for parts that may differ; `echo $?` shows the
   exit status of a command that fails;
 - `xml` are files, named by the comment in their first line.
 """
@@ -24,7 +24,7 @@ BLOCK = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 @pytest.fixture
 def folder(root, tmp_path, monkeypatch):
-    """The current folder, as a reader's in the checkout, but empty."""
+    """The current folder: empty but for `scenes/`, as a reader would see the checkout."""
     (tmp_path / "scenes").symlink_to(root / "scenes")
     monkeypatch.chdir(tmp_path)
     for room in (bsdfs, textures, emitters):
@@ -36,7 +36,7 @@ def folder(root, tmp_path, monkeypatch):
 
 @pytest.fixture
 def run(capfd):
-    """(command line) -> exit status, and what it prints on stdout, or else on stderr."""
+    """(command line) -> exit status, and its output on stdout, or else on stderr."""
 
     def run(command):
         program, *arguments = shlex.split(command)
@@ -53,7 +53,7 @@ def run(capfd):
 
 
 def session(text):
-    """Pairs of a command and the lines that it shows."""
+    """Yield pairs of a command and the output that is shown."""
     assert text.startswith("$ "), text
     for entry in re.split(r"^\$ ", text, flags=re.MULTILINE)[1:]:
         command, _, shown = entry.partition("\n")
@@ -92,13 +92,13 @@ def test_code_blocks_run(page, folder, run):
 
 
 def test_every_fence_is_a_block(page):
-    """One that is indented, or never closed, would not be run."""
+    """An indented or unclosed fence would not be run."""
     text = page.read_text(encoding="utf-8")
     assert text.count("```") == 2 * len(BLOCK.findall(text))
 
 
 def test_the_command_lines_of_the_readme(root, folder, run):
-    """Indented lines: .ci/run runs what they install and test with, and here runs what they render."""
+    """Indented lines: .ci/run runs the installation and the tests, and this test the render."""
     lines = re.findall(r"^    (\S.*)$", BLOCK.sub("", (root / "README.md").read_text()), re.MULTILINE)
     render, test = (line.split(" && ") for line in lines)
     for steps, what in ((render, "."), (test, "-e '.[test]'")):

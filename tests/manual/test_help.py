@@ -43,7 +43,7 @@ def test_a_terminal_shows_the_page_rendered(root):
     try:
         while part := os.read(ours, 1 << 16):
             shown += part
-    except OSError:  # Linux says so where the other side is closed
+    except OSError:  # raised by Linux when the other side is closed
         pass
     os.close(ours)
     assert process.wait() == 0

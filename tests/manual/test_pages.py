@@ -20,14 +20,14 @@ CODE = re.compile(r"```.*?```|`[^`\n]+`", re.DOTALL)
 
 
 def table(root, name):
-    """The first two cells of each row of the tables of a page."""
+    """Return the first two cells of each row of the tables of a page."""
     text = (root / "pathjax" / "manual" / f"{name}.md").read_text(encoding="utf-8")
     return re.findall(r"^\| (`.*?) \| (.*?) \|", text, re.MULTILINE)
 
 
 @pytest.fixture
 def usage(capsys):
-    """(command) -> what its `--help` prints."""
+    """(command) -> the output of its `--help`."""
 
     def usage(*command):
         with pytest.raises(SystemExit):
@@ -58,7 +58,7 @@ def test_public_names_are_described(all_text):
 
 
 def test_commands_and_options_are_described(root, usage):
-    """By the page of commands, which says of which command an option is."""
+    """The page of commands describes them and says to which command an option belongs."""
     described = table(root, "commands")
     commands = re.findall(r"^    (\w+) ", usage(), re.MULTILINE)
     assert "render" in commands
@@ -69,9 +69,9 @@ def test_commands_and_options_are_described(root, usage):
         assert options == set(re.findall(r"(?<=`)--?[A-Za-z][\w-]*", " ".join(listed))), command
 
 
-# ---- the page of scenes, held against what the loader says -------------------------------------------------------
+# ---- the page of scenes against the loader -----------------------------------------------------------------------
 
-# Where a kind stands, with what it needs beside it: {} is the element itself.
+# Where a kind stands, with the elements that it needs around it; {} is the element itself.
 PLACES = {
     "integrator": '{}<sensor type="perspective"/>',
     "sensor": "{}",
@@ -88,7 +88,7 @@ PLACES = {
     "area light": '<sensor type="perspective"/><shape type="cube">{}</shape>',
 }
 MESHES = ("obj", "ply", "stl", "glb", "gltf", "serialized")
-# What an element must have to be read at all; the second of a pair, where one excludes the other.
+# Contents without which an element is not read; alternatives where one excludes the other.
 NEEDS = {
     **dict.fromkeys(("perspective", "projector"), ["", '<float name="fov" value="40"/>']),
     "thinlens": [f'<float name="aperture_radius" value="1"/>{fov}' for fov in ("", '<float name="fov" value="40"/>')],
@@ -111,7 +111,7 @@ NEEDS = {
     **dict.fromkeys(("aov", "moment", "stokes"), ['<integrator type="path"/>']),
 } | {kind: [f'<string name="filename" value="mesh.{kind}"/>'] for kind in MESHES}
 
-# One triangle. Of the formats this is the one that trimesh cannot write.
+# One triangle, in the only format that trimesh cannot write.
 SERIALIZED = b"\x1c\x04\x03\x00" + zlib.compress(
     struct.pack("<IQQ", 0x1000, 3, 1) + struct.pack("<9f", 0, 0, 0, 1, 0, 0, 0, 1, 0) + struct.pack("<3I", 0, 1, 2)
 )
@@ -119,7 +119,7 @@ SERIALIZED = b"\x1c\x04\x03\x00" + zlib.compress(
 
 @pytest.fixture(scope="module")
 def refusal(root, tmp_path_factory):
-    """(place, type, what is inside) -> the message that refuses a scene with such an element."""
+    """(place, type, content) -> the message that refuses a scene with such an element."""
     import trimesh
 
     folder = tmp_path_factory.mktemp("kinds")
@@ -156,7 +156,7 @@ def refusal(root, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def described(root):
-    """Kind -> names of its parameters, by the page; "the same" are those of the row above."""
+    """Kind -> names of its parameters on the page; "the same" refers to the row above."""
     kinds, names = {}, set()
     for which, parameters in table(root, "scenes"):
         names = set(re.findall(r"`(\w+)`", parameters)) | (names if "the same" in parameters else set())
