@@ -1,9 +1,9 @@
-"""A package whose annotations are checked while it runs: arguments, results and records, in types, shapes and dtypes.
+"""Run a package with its annotations checked: types, shapes and dtypes of arguments, results and record fields.
 
     python tests/checked_annotations.py [--no-fit] SCENE...
 
-traces images of the scenes and their derivatives, for shapes are known by then, and fits to the first one; with
---no-fit nothing is compiled. The first annotation that does not hold ends it with a TypeError.
+traces images of the scenes and their derivatives, since tracing already knows all shapes, and fits to the first scene;
+with --no-fit nothing is compiled. The first annotation that does not hold ends the run with a TypeError.
 """
 
 from __future__ import annotations
@@ -23,19 +23,19 @@ import jaxtyping
 import numpy as np
 from beartype.door import is_bearable
 
-# An int may stand for a float, as type checkers have it.
+# As in type checkers, an int is accepted for a float.
 CONF = beartype.BeartypeConf(is_pep484_tower=True)
 
 
 def check_function(function):
-    """What jaxtyping applies to each function; of records, `check_record` looks after what makes them."""
+    """Type-check a function; jaxtyping applies this to each one. `check_record` checks the constructors of records."""
     return function if function.__name__ == "__init__" else beartype.beartype(conf=CONF)(function)
 
 
 def check_record(record: type, package: str) -> None:
-    """Check the fields of a NamedTuple or dataclass wherever the package itself makes one.
+    """Check the fields of a NamedTuple or dataclass wherever the package itself constructs one.
 
-    Not where JAX makes one of leaves, which may be batches or no arrays at all.
+    Records that JAX rebuilds from leaves are not checked: the leaves may be batched or no arrays at all.
     """
     name = "__new__" if issubclass(record, tuple) else "__init__"
     make, hints = getattr(record, name), typing.get_type_hints(record)
@@ -55,7 +55,7 @@ def check_record(record: type, package: str) -> None:
 
 
 def holds(value, hint) -> bool:
-    """Whether a field is what it should be. A NumPy array is as good as one of JAX: tables are filled with them."""
+    """Return whether a value fits its field's annotation. NumPy arrays, which fill tables, count as JAX arrays."""
     if is_bearable(value, hint, conf=CONF):
         return True
     import jax.numpy as jnp
@@ -79,13 +79,13 @@ def load(package: str):
 
 
 def trace(pj, file: Path) -> None:
-    """Trace a scene's image, the derivatives in all its parameters, and what else is asked of a scene."""
+    """Trace a scene's image, its terms by depth, a query, and the derivatives in all parameters but textures."""
     import jax
     import jax.numpy as jnp
 
     scene = pj.load_scene(file, res=4)
     jax.eval_shape(lambda scene: pj.render(scene, spp=1), scene)
-    # A Jacobian has no textures.
+    # `jacobian` takes no textures.
     names = [name for name, parameter in scene.about.parameters.items() if not parameter.is_texture]
     jax.eval_shape(lambda scene: tuple(pj.jacobian(scene, names, spp=1)), scene)
     jax.eval_shape(lambda scene: pj.render_bounces(scene, depth=2, spp=4), scene)
@@ -100,7 +100,7 @@ def fit(pj, file: Path) -> None:
 
 
 if __name__ == "__main__":
-    gc.set_threshold(50_000, 20, 50)  # most objects stay: to look for garbage as often as Python does takes long
+    gc.set_threshold(50_000, 20, 50)  # most objects live on: frequent garbage collection is slow
     package, paths = load("pathjax"), [Path(name) for name in sys.argv[1:] if name != "--no-fit"]
     for path in paths:
         trace(package, path)

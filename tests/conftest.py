@@ -1,4 +1,4 @@
-"""What the tests of rendering share: scenes from text, replicated renders, and the z-test between images."""
+"""Fixtures shared by the tests of rendering: scenes from text, replicated renders, and the z-test between images."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
-# The workers of a run, and what processes they start, share what they compile, in a folder that goes with the run.
-# Before JAX is imported, which reads this then.
+# The workers of a run and the processes that they start share a compilation cache in a folder that is deleted after the
+# run. Set before JAX is imported, which reads these variables then.
 if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
     _shared = tempfile.mkdtemp(prefix="pathjax-tests-")
     atexit.register(shutil.rmtree, _shared, ignore_errors=True)
     os.environ |= {"JAX_COMPILATION_CACHE_DIR": _shared, "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
 
-# The workers share the processors: threads of theirs for products of matrices would wait for those of the others.
+# The workers share the processors: BLAS threads of one worker would wait for those of the others.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import pathjax  # before anything starts JAX's backend  # isort: skip
@@ -43,21 +43,21 @@ from pathjax.sensors import film
 
 os.environ["PATHJAX_CACHE"] = "0"  # tests leave the user's cache of kernels alone
 
-# Programs that are traced are many objects that stay: to look through all of them for garbage, as often as Python does,
-# takes a quarter of the time of tracing.
+# Traced programs are many objects that live on: collecting garbage as often as Python does by default takes a quarter
+# of the time of tracing.
 gc.set_threshold(50_000, 20, 50)
 
 ROOT = Path(__file__).resolve().parents[1]
 
-# Chance that one correct comparison of two images fails. Seeds are fixed, so a test either fails always or never.
+# Chance that a correct comparison of two images fails. Seeds are fixed, so a test fails either always or never.
 FALSE_ALARM = 1e-4
-# Relative error that float32 leaves in the mean of a pixel; what differs by less is no disagreement.
+# Relative float32 rounding error in the mean of a pixel; smaller differences are no disagreement.
 ROUNDING = 1e-5
 
 
 @pytest.fixture(scope="session", autouse=True)
 def interrupts_are_heard():
-    """What shells and other programs start in the background may be deaf to signals that some tests send."""
+    """Handle SIGINT and SIGTERM, which some tests send: shells may start background processes with both ignored."""
     for number, handler in ((signal.SIGINT, signal.default_int_handler), (signal.SIGTERM, signal.SIG_DFL)):
         if signal.getsignal(number) == signal.SIG_IGN:
             signal.signal(number, handler)
@@ -67,8 +67,8 @@ def interrupts_are_heard():
 
 @pytest.fixture
 def compiled_anew():
-    """Nothing is taken from what other tests have compiled: for those that time compilation."""
-    compilation_cache.reset_cache()  # JAX asks once whether to keep anything
+    """Compile without the compilation cache, for tests that time compilation."""
+    compilation_cache.reset_cache()  # JAX decides only once whether to use the cache
     jax.config.update("jax_enable_compilation_cache", False)
     yield
     jax.config.update("jax_enable_compilation_cache", True)
@@ -76,7 +76,7 @@ def compiled_anew():
 
 
 class Compilations:
-    """Counts what JAX's backend compiles."""
+    """Counter of the programs that JAX's backend compiles."""
 
     def __init__(self):
         self.count, self.on = 0, True
@@ -89,8 +89,8 @@ class Compilations:
 @pytest.fixture
 def compilations():
     counter = Compilations()
-    jax.jit(lambda x: x + 1)(0)  # no other function's
-    assert counter.count == 1  # it hears
+    jax.jit(lambda x: x + 1)(0)  # a new function, which no other test has compiled
+    assert counter.count == 1  # the listener works
     yield counter
     counter.on = False
 
@@ -133,7 +133,7 @@ def scene_text(
 
 @pytest.fixture(scope="session")
 def write_scene(tmp_path_factory):
-    """(body, **camera) -> path of a scene file beside the meshes of the tests."""
+    """(body, **camera) -> path of a scene file next to the meshes of the tests."""
     folder = tmp_path_factory.mktemp("scenes")
     (folder / "meshes").symlink_to(ROOT / "tests" / "scenes" / "meshes")
     numbers = iter(range(10**6))
@@ -170,7 +170,7 @@ def shipped():
 
 @pytest.fixture(scope="session")
 def x64():
-    """A context in which JAX has float64."""
+    """A context in which JAX supports float64."""
     if hasattr(jax, "enable_x64"):
         return lambda: jax.enable_x64(True)
     from jax.experimental import enable_x64
@@ -179,7 +179,7 @@ def x64():
 
 
 class Kernel(NamedTuple):
-    """A shipped scene at 16 pixels wide, compiled once for all tests that look at its kernel or its image.
+    """A shipped scene at 16 pixels wide, compiled once for all tests that examine its kernel or its image.
 
     The program is the one that `render` compiles.
     """
@@ -193,14 +193,14 @@ class Kernel(NamedTuple):
 
 
 def arguments_of_render(scene, spp, seed):
-    """What `render` gives to `pixel_means`."""
+    """Return the arguments that `render` passes to `pixel_means`."""
     pixels = film.pixels(scene.film)
     return on_all_devices(nameless(scene)), pixels, *pixel.numbers(pixels, 0, spp, seed), None
 
 
 @pytest.fixture(scope="session")
 def kernel_of(shipped):
-    """(name, dtype) -> Kernel; in float64 to be called, and the kernel used, under `x64`."""
+    """(name, dtype) -> Kernel; compile and call float64 kernels under `x64`."""
 
     @functools.cache
     def compile(name, dtype=jnp.float32):
@@ -218,7 +218,7 @@ class JacobianKernel(NamedTuple):
     compiled: jax.stages.Compiled
 
     def __call__(self, spp, seed=1, first_sample=0, step=0.02):
-        """Means of all pixels (N, 3), derivatives in colours (N, T, 3) and in IORs (N, G, 3), biases (N, G, 3)."""
+        """Return pixel means (N, 3), derivatives in colours (N, T, 3) and in IORs (N, G, 3), and biases (N, G, 3)."""
         pixels = jnp.arange(film.pixel_count(self.scene.film), dtype=jnp.int32)
         numbers = pixel.numbers(pixels, first_sample, spp, seed)
         glass = self.compiled.in_avals[0][-1].shape
@@ -229,7 +229,7 @@ class JacobianKernel(NamedTuple):
 
 @pytest.fixture(scope="session")
 def jacobian_kernel_of(shipped):
-    """(name, which) -> JacobianKernel of all its "colours", of its "glass", or of "both"."""
+    """(name, which) -> JacobianKernel of all the scene's "colours", of its "glass" IORs, or of "both"."""
 
     @functools.cache
     def compile(name, which):
@@ -251,9 +251,9 @@ def jacobian_kernel_of(shipped):
 
 @pytest.fixture(scope="session")
 def native_kernels():
-    """(lowered or compiled program) -> how many compiled loops its entry computation calls; it dispatches none itself.
+    """(lowered or compiled program) -> number of compiled loops that its entry computation calls; it has none itself.
 
-    What is lowered is compiled without LLVM's optimisation: that comes after what XLA tells of here, and takes long.
+    Lowered programs are compiled without LLVM's optimisation, which is slow and comes after the passes that matter.
     """
 
     def count(program):
@@ -291,7 +291,7 @@ def estimate_type():
 
 @pytest.fixture(scope="session")
 def estimate():
-    """(scene, spp, count, **how of `render`) -> Estimate over `count` seeds.
+    """(scene, spp, count, **keywords of `render`) -> Estimate over `count` seeds.
 
     Samples of one image share a sequence and are not independent of each other; images of different seeds are.
     """
@@ -305,7 +305,7 @@ def estimate():
 
 @pytest.fixture(scope="session")
 def mitsuba():
-    """(scene file, spp, count, variant, **its parameters) -> Estimate of Mitsuba's image over `count` seeds."""
+    """(scene file, spp, count, variant, **scene parameters) -> Estimate of Mitsuba's image over `count` seeds."""
     pytest.importorskip("mitsuba")
 
     def render(path, spp, count, variant="llvm_ad_rgb", **parameters):
@@ -322,8 +322,8 @@ def mitsuba():
 
 @pytest.fixture(scope="session")
 def derivatives():
-    """(scene, names, spp, count, **how of `jacobian`) -> Estimates over `count` seeds: of the image, and by name of the
-    derivative; for a colour that in the same channel, the others being 0.
+    """(scene, names, spp, count, **keywords of `jacobian`) -> Estimates over `count` seeds: of the image, and of each
+    derivative by name. A colour's derivative is the one in the same channel; those in the other channels must be 0.
     """
 
     def diagonal(derivative):
@@ -346,18 +346,18 @@ def derivatives():
 
 @pytest.fixture(scope="session")
 def agree():
-    """Assert that two Estimates, or one and an exact image, differ by chance only.
+    """Assert that two Estimates, or an Estimate and an exact image, differ by chance only.
 
-    Two Welch tests share the false alarm rate: the worst of all pixels and channels (Sidak), which finds what is wrong
-    in a place, and the mean of the image in each channel, which finds a small bias everywhere. The second supposes
-    that pixels are independent of each other. Where all pixels estimate one number, `pixelwise=False` leaves the first
-    out: samples that are stratified well can give one pixel the same coarse fraction of hits for every seed.
+    Two Welch tests share the false-alarm rate: one of the worst of all pixels and channels (Sidak), which finds local
+    errors, and one of the image mean in each channel, which finds a small bias everywhere. The second assumes that
+    pixels are independent. Where all pixels estimate the same value, `pixelwise=False` leaves out the first:
+    well-stratified samples can give a pixel the same coarse fraction of hits for every seed.
     """
     from scipy import ndimage, stats
 
     def p_value(difference, variances, counts, floor):
         variance = sum(variances) + floor**2 + np.finfo(float).tiny
-        # Welch-Satterthwaite; an exact side has no variance and counts for nothing.
+        # Welch-Satterthwaite; an exact side has no variance and no effect.
         spread = sum(v**2 / (count - 1) for v, count in zip(variances, counts, strict=True) if count > 1)
         freedom = np.where(spread > 0, variance**2 / np.where(spread > 0, spread, 1), np.inf)
         freedom = np.clip(freedom, min(count - 1 for count in counts if count > 1), 1e6)
@@ -371,7 +371,7 @@ def agree():
         counts, rate = (a.count, b.count), false_alarm / (whole + pixelwise)
         if pixelwise:
             floor = rounding * (np.abs(a.mean) + np.abs(b.mean)) / 2
-            # A few seeds may all miss what a pixel rarely sees; its neighbours know that it varies.
+            # The few seeds of a pixel may all miss a rare event; the variance of its neighbours shows that it varies.
             variances = [np.maximum(e.variance, ndimage.uniform_filter(e.variance, (3, 3, 1))) for e in (a, b)]
             p, place = p_value(a.mean - b.mean, variances, counts, floor)
             worst = f"at (y, x, channel) {tuple(map(int, place))}: {a.mean[place]:.6g} against {b.mean[place]:.6g}"
@@ -379,7 +379,7 @@ def agree():
         if whole:
             means, pixels = (a.mean.mean((0, 1)), b.mean.mean((0, 1))), a.mean[..., 0].size
             variances = tuple(e.variance.sum((0, 1)) / pixels**2 for e in (a, b))
-            # The mean of many pixels knows its variance far better than one pixel does.
+            # The variance of the mean of many pixels is known far better than that of one pixel.
             many = tuple(1 + (count - 1) * pixels for count in counts)
             p, _ = p_value(means[0] - means[1], variances, many, rounding * np.abs(means).mean(0))
             assert p > rate, f"image means disagree, p = {p:.1e}: {means[0]} against {means[1]}"

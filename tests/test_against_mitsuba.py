@@ -1,4 +1,4 @@
-"""Images against Mitsuba 3, by z-tests of means and variances over seeds. Mitsuba runs in a process of its own."""
+"""Images against Mitsuba 3, by z-tests of means and variances over seeds. Mitsuba runs in its own process."""
 
 from pathlib import Path
 
@@ -14,14 +14,14 @@ FILES = sorted([*ROOT.glob("scenes/*.xml"), *ROOT.glob("tests/scenes/*.xml")])
 QUICK = ("cornell_box",)
 SEEDS = 24
 SPP = 256
-# Two programs, two float32 renderings of one scene: their intersections and offsets differ by some 1e-6 of its size,
-# which tilts what is seen at edges and in contacts by less than this.
+# Two float32 programs: their intersections and offsets differ by some 1e-6 of the scene's size, which shifts edges and
+# contacts by less than this.
 ROUNDING = 1e-3
 
 
 @pytest.fixture
 def with_border(tmp_path):
-    """Copy of a scene whose pixels look beyond the border of the film."""
+    """(scene file) -> path of a copy whose pixels also sample beyond the border of the film."""
 
     def copy(path):
         for folder in ("meshes", "textures"):
@@ -37,7 +37,7 @@ def with_border(tmp_path):
 
 
 def double_variant():
-    """A variant of Mitsuba in double precision with RGB colours, if this build of it has one."""
+    """Return a double-precision RGB variant of Mitsuba, or None if this build has none."""
     mi = pytest.importorskip("mitsuba")
     return next((name for name in mi.variants() if name.endswith("rgb_double")), None)
 
@@ -53,8 +53,8 @@ def double_variant():
 def test_image_agrees_with_mitsuba(path, with_border, mitsuba, estimate, agree):
     path = with_border(path)
     scene = pj.load_scene(path, res=32)
-    # Mitsuba's wide filters share samples among neighbours: pixels then depend on each other, and their mean tells
-    # less than its variance says.
+    # Mitsuba's wide filters share samples between neighbours: pixels are then correlated, and their mean varies more
+    # than the pixels' variances suggest.
     independent = isinstance(scene.film.filter, Box)
     ours, theirs = estimate(scene, SPP, SEEDS), mitsuba(path, SPP, SEEDS, res=32)
     agree(ours, theirs, whole=independent, rounding=ROUNDING)
@@ -63,7 +63,7 @@ def test_image_agrees_with_mitsuba(path, with_border, mitsuba, estimate, agree):
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["gaussian", "mitchell", "catmullrom", "lanczos"])
 def test_images_through_other_filters_agree_with_mitsuba(kind, with_border, mitsuba, estimate, agree):
-    """The border of the lamp, that is, with the lobes that a filter draws beside it."""
+    """The border of the lamp shows the filter's lobes."""
     path = with_border(ROOT / "scenes" / "cornell_box.xml")
     path.write_text(path.read_text().replace('<rfilter type="box"/>', f'<rfilter type="{kind}"/>'))
     ours, theirs = estimate(pj.load_scene(path, res=32), SPP, SEEDS), mitsuba(path, SPP, SEEDS, res=32)
@@ -72,15 +72,15 @@ def test_images_through_other_filters_agree_with_mitsuba(kind, with_border, mits
 
 @pytest.mark.slow
 def test_nine_spheres_agree_with_double_precision(shipped, mitsuba, estimate, agree, x64):
-    """Mitsuba's single precision is 3 to 10 % too dark among walls of radius 1e5, so it cannot judge here. Where its
-    build has no double precision (the wheels have none), pathjax itself in float64 does, with seeds of its own."""
+    """Mitsuba's single precision is 3 to 10 % too dark among walls of radius 1e5, so it is no reference here. Where
+    its build has no double precision (the wheels have none), the reference is pathjax in float64 with other seeds."""
     single = estimate(shipped("nine_spheres", res=32), spp=SPP, count=SEEDS)
     if variant := double_variant():
         double = mitsuba(ROOT / "scenes" / "nine_spheres.xml", SPP, SEEDS, variant, res=32)
     else:
         with x64():
             double = estimate(shipped("nine_spheres", jnp.float64, res=32), spp=SPP, count=SEEDS, first_seed=1001)
-    # float32 holds points on these walls to 0.008 in a box of 80: corners and contacts move by as much.
+    # Points on these walls have float32 errors of 0.008 in a box of 80: corners and contacts move by as much.
     agree(single, double, rounding=3e-3)
 
 

@@ -1,4 +1,4 @@
-"""Annotations between rooms hold: in types, shapes and dtypes, where scenes are rendered, differentiated and fitted."""
+"""Annotations between rooms hold (types, shapes and dtypes) where scenes are rendered, differentiated and fitted."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ def test_annotations_hold_in_images_and_jacobians(root):
 @pytest.mark.slow
 @pytest.mark.parametrize("half", [0, 1])
 def test_annotations_hold_in_every_scene_and_in_a_fit(root, half):
-    """The fit is with the first half; two workers can take one each."""
+    """The fit runs with the first half; two workers can take one half each."""
     files = [*sorted(root.glob("scenes/*.xml")), *sorted(root.glob("tests/scenes/*.xml"))][half::2]
     done = run([CHECKED, *(["--no-fit"] if half else ["scenes/furnace.xml"]), *files], cwd=root)
     assert done.returncode == 0, done.stderr
 
 
 def test_shapes_in_annotations_can_be_read(root):
-    """jaxtyping reads them only when a value comes by, which may be in no quick test: "3M" is no number of anything."""
+    """jaxtyping parses a shape only when a value is checked, perhaps in no quick test: "3M" is no valid dimension."""
     shapes = re.compile(r"\b(?:Array|ndarray)(?: \| \w+)*, \"([^\"]*)\"\]")
     files = list((root / "pathjax").rglob("*.py"))
     found = [(file.name, shape) for file in files for shape in shapes.findall(file.read_text())]

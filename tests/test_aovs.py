@@ -1,4 +1,4 @@
-"""Output variables against closed forms, and against Mitsuba's."""
+"""Output variables (AOVs) against closed forms, and against Mitsuba's."""
 
 import subprocess
 import sys
@@ -34,7 +34,7 @@ def plate(inside):
     ],
 )
 def test_a_plate_that_fills_the_view(make_scene, inside, normal, albedo):
-    """4 from the camera, of which the near clip plane takes 0.01."""
+    """The plate is 4 from the camera; depth starts at the near clip plane, 0.01 from the camera."""
     aovs = pj.render_aovs(make_scene(plate(inside), fov=0.1), NAMES)
     assert {name: image.shape for name, image in aovs.items()} == {
         "depth": (16, 16, 1),
@@ -47,7 +47,7 @@ def test_a_plate_that_fills_the_view(make_scene, inside, normal, albedo):
 
 
 def test_normals_of_a_sphere_point_outwards(make_scene):
-    """Where the ray grazes, depth and normal vary within a pixel: the middle alone."""
+    """At grazing rays depth and normal vary within a pixel, so only the middle is compared."""
     aovs = pj.render_aovs(make_scene(f'<shape type="sphere">{GREY}</shape>', fov=20), NAMES, spp=4)
     y, x = np.mgrid[:16, :16] - 7.5
     d = np.stack([x, -y, np.full_like(x, -8 / np.tan(np.radians(10)))], -1)
@@ -66,7 +66,7 @@ def test_misses_are_0(make_scene):
 
 @pytest.mark.parametrize("spp", [1, 3, 16])
 def test_film_positions_are_those_of_the_image(make_scene, spp):
-    """A lamp seen directly: its share of the pixel is the image, and the albedo over that of the whole lamp."""
+    """A lamp seen directly: the image is its share of the pixel, and the albedo that share times the lamp's albedo."""
     scene = make_scene(f'<shape type="disk">{GREY}{LAMP}</shape>', depth=1, fov=40)
     image = pj.render_until(scene, spp=spp, seed=5).image
     albedo = pj.render_aovs(scene, ["albedo"], spp=spp, seed=5)["albedo"]
@@ -96,7 +96,7 @@ def test_chunks_make_no_difference(shipped, monkeypatch):
     whole = pj.render_aovs(scene, NAMES)
     monkeypatch.setattr(aovs, "CHUNK_PIXELS", 100)
     for name, image in pj.render_aovs(scene, NAMES).items():
-        # Another number of pixels is another kernel, which may round differently.
+        # Another pixel count is another kernel, which may round differently.
         np.testing.assert_allclose(image, whole[name], rtol=1e-4, atol=1e-5)
 
 
@@ -129,7 +129,7 @@ np.save(sys.argv[2], [np.array(mi.render(scene, integrator=aovs, spp=64, seed=se
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["cornell_box", "mesh", "glass_and_mirror"])
 def test_output_variables_agree_with_mitsuba(root, shipped, agree, estimate_type, tmp_path, name):
-    """Its albedo is of diffuse reflection alone, so it is compared where all is diffuse."""
+    """Mitsuba's albedo includes diffuse reflection only, so it is compared where everything is diffuse."""
     pytest.importorskip("mitsuba")
     file = tmp_path / "aovs.npy"
     subprocess.run([sys.executable, "-c", MITSUBA, root / "scenes" / f"{name}.xml", file], check=True)
@@ -138,7 +138,7 @@ def test_output_variables_agree_with_mitsuba(root, shipped, agree, estimate_type
     ours = np.array([np.concatenate([aovs[name] for name in NAMES], -1) for aovs in ours], float)
     theirs = np.load(file).astype(float)
     channels = 4 if name == "glass_and_mirror" else 7
-    # All numbers are of the order of 1, and so is their rounding, where they are 0 too.
+    # All values are of order 1, and so is their rounding error, even where they are 0: hence the offset.
     both = [1 + x[..., :channels] for x in (ours, theirs)]
     estimates = [estimate_type(x.mean(0), x.var(0, ddof=1) / len(x), len(x)) for x in both]
     agree(*estimates, whole=False, rounding=1e-3)

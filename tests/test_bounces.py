@@ -1,4 +1,4 @@
-"""Terms of the Neumann series against closed forms, their sum against the render, their errors against the truth."""
+"""Terms of the Neumann series against closed forms, their sum against the render, their errors against true errors."""
 
 from dataclasses import replace
 
@@ -16,7 +16,7 @@ RHO = np.array([0.2, 0.5, 0.8])
 DEPTH = 6
 GREY = '<bsdf type="diffuse" id="wall"><rgb name="reflectance" value="0.2, 0.5, 0.8"/></bsdf>'
 ALPHA = 0.7
-# A disk spans a cap of the unit sphere and emits like it, 3; the rest of the wall sees it everywhere alike.
+# A disk spans a cap of the unit sphere and emits 3 as the cap would; all other wall points see it alike.
 CAVITY = f"""
 <shape type="sphere"><boolean name="flip_normals" value="true"/>{GREY}</shape>
 <shape type="disk"><transform name="to_world"><scale value="{np.sin(ALPHA)}"/><translate z="{-np.cos(ALPHA)}"/>
@@ -31,7 +31,7 @@ def with_depth(scene, depth):
 
 @pytest.fixture(scope="module")
 def furnace(shipped):
-    """Closed, diffuse, Le = 1 from everywhere."""
+    """Closed and diffuse, Le = 1 everywhere."""
     return shipped("furnace", res=16)
 
 
@@ -41,7 +41,7 @@ def cavity(make_scene):
 
 
 def estimates(estimate_type, images):
-    """An Estimate of each term, from terms (depth, H, W, 3) of independent seeds."""
+    """Return an Estimate of each term, from terms (depth, H, W, 3) of independent seeds."""
     images = np.asarray(images, float)
     mean, variance = images.mean(0), images.var(0, ddof=1) / len(images)
     return [estimate_type(*term, len(images)) for term in zip(mean, variance, strict=True)]
@@ -49,7 +49,7 @@ def estimates(estimate_type, images):
 
 # ---- the sum --------------------------------------------------------------------------------------------------------
 
-SUMS = {"rtol": 3e-6, "atol": 1e-6}  # of some ten numbers of float32, the largest of them about 10
+SUMS = {"rtol": 3e-6, "atol": 1e-6}  # sums of about ten float32 numbers, the largest about 10
 
 
 @pytest.mark.parametrize("name", ["cornell_box", pytest.param("glass_and_mirror", marks=pytest.mark.slow)])
@@ -59,7 +59,7 @@ def test_terms_add_up_to_the_render_of_the_same_seed(shipped, name):
     assert one.terms.shape == one.variance.shape == (DEPTH, 16, 16, 3)
     np.testing.assert_allclose(one.terms.sum(0), pj.render(scene, 13, 3), **SUMS)
     assert np.isnan(one.variance).all()
-    scene = shipped(name, res=64)  # the manual's, with its kernels
+    scene = shipped(name, res=64)  # the scene of the manual, which shares its kernels
     four = pj.render_bounces(scene, 8, 13, 3)
     np.testing.assert_allclose(four.terms.sum(0), pj.render_until(scene, spp=13, seed=3).image, **SUMS)
     assert np.isfinite(four.standard_error).all()
@@ -85,7 +85,7 @@ def test_hidden_emitters_are_hidden_in_the_terms(make_scene):
 
 @pytest.mark.slow
 def test_depth_alone_says_how_many_terms(furnace):
-    """Whatever the scene's max_depth; so the first terms of a longer series are those of a shorter."""
+    """The scene's max_depth does not matter, so the first terms of a longer series are those of a shorter one."""
     short, long = (pj.render_bounces(with_depth(furnace, d), depth, 4).terms for d, depth in ((9, 2), (1, DEPTH)))
     np.testing.assert_allclose(short, long[:2], rtol=1e-6)
 
@@ -127,7 +127,7 @@ def test_term_of_the_furnace_is_the_power_of_its_albedo(furnace_terms, estimate_
 
 @pytest.mark.slow
 def test_furnace_by_bsdf_sampling_has_no_noise(furnace, furnace_terms):
-    """Only rounding is left, and what roulette would do."""
+    """Only rounding is left, until roulette adds noise."""
     terms, slopes = furnace_terms(1, strategy="bsdf")
     k = np.arange(DEPTH)[:, None, None, None]
     quiet = slice(0, int(furnace.rr_depth))
@@ -138,9 +138,9 @@ def test_furnace_by_bsdf_sampling_has_no_noise(furnace, furnace_terms):
 
 
 def cavity_terms():
-    """Of what the camera sees, a wall without lamp, (DEPTH, 3): rho mean(rho)^(k-1) mean(Le), means over the sphere.
+    """Return the terms (DEPTH, 3) of a wall without lamp: rho mean(rho)^(k-1) mean(Le), means over the sphere.
 
-    The cap of f = (1 - cos alpha) / 2 of the sphere emits 3 and is black.
+    A cap with the share f = (1 - cos alpha) / 2 of the sphere emits 3 and is black.
     """
     f = (1 - np.cos(ALPHA)) / 2
     k = np.arange(DEPTH)[:, None]
@@ -155,7 +155,7 @@ def test_indirect_light_in_a_cavity_with_uneven_emission_is_even(cavity, estimat
 
 
 def test_variance_is_that_of_the_terms(cavity):
-    """Its mean against the mean squared error, both over 16 seeds of 256 pixels and each known to some 3 %."""
+    """The mean variance equals the mean squared error; both, over 16 seeds of 256 pixels, are known to about 3 %."""
     expected = cavity_terms()[1:, None, None]
     all_of = [pj.render_bounces(cavity, DEPTH, 64, seed) for seed in range(16)]
     squares = np.mean([(np.asarray(b.terms)[1:] - expected) ** 2 for b in all_of], (0, 2, 3))
@@ -165,7 +165,7 @@ def test_variance_is_that_of_the_terms(cavity):
 
 @pytest.mark.parametrize("power", [-66, 66, 80])
 def test_a_power_of_two_in_the_lamp_scales_terms_and_errors(cavity, power):
-    """2^-66 is 1.4e-20, and 2^66 7e19."""
+    """2^-66 is 1.4e-20, and 2^66 is 7e19."""
     radiance = pj.parameters(cavity)["lamp.radiance"]
     one = pj.render_bounces(cavity, DEPTH, 16)
     other = pj.render_bounces(pj.with_parameters(cavity, {"lamp.radiance": 2.0**power * radiance}), DEPTH, 16)
@@ -227,7 +227,7 @@ def test_terms_are_one_native_kernel(native_kernels, furnace, derivative):
     work = pixels, 0, jnp.full((4, 256), 4), jnp.arange(4, dtype=jnp.uint32)
     static = {"depth": DEPTH, "options": Options(by_vertex=True), "colors": colors}
     lowered = bounces._kernel.lower(replace(furnace, about=None), *work, **static)
-    assert native_kernels(lowered.compile()) == 1  # the program is that of renders here
+    assert native_kernels(lowered.compile()) == 1  # the program is the one that renders use
 
 
 def test_other_spp_seeds_and_colours_reuse_the_kernel(furnace):
@@ -243,7 +243,7 @@ def test_other_spp_seeds_and_colours_reuse_the_kernel(furnace):
 
 
 def test_tail_of_the_furnace(furnace):
-    """Of Le = 1: after d terms rho^d is cut off of all light, 1 / (1 - rho)."""
+    """With Le = 1, cutting off after d terms loses the share rho^d of all light, 1 / (1 - rho)."""
     found = pj.render_bounces(furnace, DEPTH, 64).tail()
     for max_depth in (3, DEPTH, 20):
         share, error = found.cut_off(max_depth)
@@ -254,7 +254,7 @@ def test_tail_of_the_furnace(furnace):
 
 @pytest.mark.parametrize("error, depth", [(0.3, 2), (0.1, 4), (0.01, 7), (1e-6, 20)])
 def test_tail_of_a_geometric_series(error, depth):
-    """Of ratio 1/2: d terms leave 2^-d."""
+    """Ratio 1/2: after d terms the share 2^-d is left."""
     terms = np.repeat(0.5 ** np.arange(8.0)[:, None], 3, 1)
     found = tail.fit(terms, 0.01 * terms)
     np.testing.assert_allclose(found.ratio, 0.5)
@@ -286,7 +286,7 @@ def test_nothing_is_left_after_black():
     np.testing.assert_allclose(found.cut_off(0)[0], [1, 1, 0])
 
 
-# ---- what is refused ------------------------------------------------------------------------------------------------
+# ---- errors ---------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("depth", [0, -1, 65, 2.5, True, "3"])

@@ -1,7 +1,7 @@
-"""No kernel asks for an entry outside an array.
+"""No kernel reads or writes outside an array.
 
-Kernels clamp indices and promise nothing, so one outside reads a wrong entry and never foreign memory. Here each kernel
-is made item by item, with real branches, and JAX's `checkify` looks at every index of every array.
+Kernels clamp indices, so an index outside reads a wrong entry but never foreign memory. Here each kernel runs item by
+item, with real branches, and JAX's `checkify` checks every index of every array.
 """
 
 from dataclasses import replace
@@ -23,12 +23,12 @@ from pathjax.sensors import film
 from pathjax.shapes import triangle
 from pathjax.shapes.accel import traverse as bvh
 
-# Numbers of samplers from the ends of their range, the ends of steps, and between.
+# Sampler values at the ends of the range, at the ends of steps, and between.
 ENDS = np.float32([0, 2**-24, 0.25, 0.5, 0.75, 1 - 2**-12, 1 - 2**-24])
 
 
 class SignedStarts:
-    """`lax`, but slices start at signed numbers: of an unsigned -1, `checkify` would add 1 and find 0 inside."""
+    """`lax`, but slices start at signed indices: to an unsigned -1 `checkify` would add 1 and take the 0 for valid."""
 
     def __getattr__(self, name):
         return getattr(lax, name)
@@ -41,7 +41,7 @@ class SignedStarts:
 
 
 class Inline:
-    """`one_by_one` without its primitive, into which `checkify` does not look."""
+    """`one_by_one` without its primitive, which `checkify` cannot look into."""
 
     def bind(self, *inputs, program, search):
         return jaxpr_as_fun(program)(*inputs)
@@ -49,7 +49,7 @@ class Inline:
 
 @pytest.fixture(scope="module")
 def outside_of():
-    """(function of no argument that calls kernels) -> messages about the indices outside of arrays, one a kernel."""
+    """(function without arguments that calls kernels) -> messages about indices outside arrays, one per kernel."""
     met = []
 
     def checked_map(f, xs, shared, form, devices):
@@ -87,7 +87,7 @@ def some_slow(names, quick):
 @pytest.mark.parametrize("how", [lambda f: f, one_by_one], ids=["plainly", "one by one"])
 @pytest.mark.parametrize("index, found", [(0, False), (3, False), (-1, True), (4, True), (1 << 30, True)])
 def test_check_finds_what_lies_outside(outside_of, how, index, found):
-    """Within control flow, as most reads of kernels are."""
+    """Inside control flow, as most array reads in kernels are."""
 
     def read(i, table):
         def add(k, total):
@@ -144,7 +144,7 @@ def test_aovs_and_bounces_stay_inside_of_arrays(outside_of, shipped):
 
 @pytest.mark.parametrize("name", some_slow(("furnace", "cornell_box"), ("furnace",)))
 def test_patches_stay_inside_of_arrays(outside_of, shipped, name):
-    """Those that rays meet, and those that the camera sees; sums over rows rely on their order."""
+    """Patches that rays hit and that the camera sees. Sums over rows rely on the order of the rows."""
     scene, made = shipped(name, res=4), []
     assert not outside_of(lambda: made.append(transport.operator(scene, 24, method="rays", rays=16)))
     (op,) = made
@@ -169,7 +169,7 @@ SKY = '<emitter type="constant"><rgb name="radiance" value="1"/></emitter>'
 
 @pytest.mark.parametrize("body", ["", SKY, ONE.format("sphere") + SKY, ONE.format("rectangle")])
 def test_scenes_of_few_shapes_stay_inside_of_arrays(outside_of, make_scene, body):
-    """Of none, and of one that most rays miss."""
+    """Scenes without shapes, and with one that most rays miss."""
     assert not outside_of(lambda: pj.render(make_scene(body, res=4, fov=120), 2))
 
 
@@ -188,7 +188,7 @@ LAMPS = (
 
 
 def test_lights_are_chosen_inside_of_arrays(outside_of, make_scene):
-    """A light, and a triangle of a mesh, by numbers at the ends of their ranges."""
+    """A light and a triangle of a mesh are chosen by random numbers at the ends of their ranges."""
     scene = replace(make_scene(LAMPS + SKY), about=None)
     chosen = jax.jit(lambda lights: emitters.choice(lights, "light"))(scene.emitters)
     numbers = jnp.asarray(np.stack(np.meshgrid(ENDS, ENDS, ENDS), -1).reshape(-1, 3))

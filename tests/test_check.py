@@ -1,4 +1,4 @@
-"""`check_gradient`: right derivatives pass, wrong ones do not."""
+"""`check_gradient` passes right derivatives and rejects wrong ones."""
 
 from dataclasses import replace
 
@@ -53,7 +53,7 @@ def test_wrong_derivatives_do_not_pass(room, monkeypatch, name, error):
 
 @pytest.mark.slow
 def test_smooth_ior_passes(shipped):
-    """36 blocks: the mean of z^2, of 15 degrees of freedom, is 1.15, and known to 0.3."""
+    """36 blocks: the expected mean of z^2, with 15 degrees of freedom, is 1.15, with a standard error of 0.3."""
     result = pj.check_gradient(shipped("glass_ball", res=48), "glass.int_ior", spp=64)
     assert result.passed and result.mean_square < 1.15 + 4 * 0.3
 
@@ -62,7 +62,7 @@ def test_smooth_ior_passes(shipped):
 
 
 class Renderer:
-    """Images that are noisy polynomials of numbers, and their derivatives, along v, with an error."""
+    """Images that are noisy polynomials of theta, and their derivatives along v with a relative error."""
 
     bounds = 0, 1
 
@@ -76,7 +76,7 @@ class Renderer:
         return self.coefficients(seed, np.size(theta)) @ np.ravel(theta + theta**3)
 
     def derivative(self, theta, v, seed):
-        # Of paths of their own, as of a renderer whose derivative takes other random numbers.
+        # Independent noise, like that of a renderer whose derivative uses other random numbers.
         return (1 + self.error) * self.coefficients(~seed & 0xFFFF, np.size(theta)) @ np.ravel((1 + 3 * theta**2) * v)
 
     def check(self, theta=0.4, **how):
@@ -91,8 +91,8 @@ def test_functions_that_render_are_tested_at_any_values_within_the_bounds(theta)
 
 
 def test_false_alarms_are_as_frequent_as_stated():
-    """Of 400 right derivatives 0.05 are to fail, between 6 and 38 with the chance 1 - 1e-3: by Sidak's rule, since the
-    blocks are independent."""
+    """With false_alarm = 0.05, 20 of 400 right derivatives should fail on average, and 6 to 38 with probability
+    1 - 1e-3. Blocks are independent, so Sidak's rule is exact."""
     passed = [Renderer().check(seed=100 * k, seeds=8, false_alarm=0.05).passed for k in range(400)]
     assert 6 <= passed.count(False) <= 38
 
@@ -116,7 +116,7 @@ def test_what_is_not_finite_does_not_pass():
 
 
 def test_a_moving_edge_is_seen_by_differences():
-    """A step whose edge moves with theta, by samples: its derivative is that of the area, not 0."""
+    """A sampled step whose edge moves with theta: its derivative is that of the area, not 0."""
 
     def image(theta, seed):
         x = (np.arange(64)[:, None, None] + np.random.default_rng(seed).uniform(size=(64, 8, 256))) / 64

@@ -1,4 +1,4 @@
-"""Choices of classic path tracers: the same image but for Schlick's, and nothing of them where they are not chosen."""
+"""Choices of classic path tracers: all but Schlick's keep the image, and a program holds only what is chosen."""
 
 from dataclasses import replace
 
@@ -23,8 +23,8 @@ INTERFACE = """
 
 @pytest.fixture(scope="module")
 def interface(make_scene):
-    """(degrees) -> an interface of glass that mirrors a lamp of radiance 1 and lets see the dark, at this angle from
-    its normal; beyond 90 degrees from inside.
+    """(degrees) -> a glass interface seen at this angle to its normal, from inside beyond 90 degrees. It reflects a
+    lamp of radiance 1 and transmits darkness.
     """
 
     def at(degrees):
@@ -65,7 +65,7 @@ def test_interface_shows_schlicks_reflectance_by_chance(interface, estimate, agr
 
 @pytest.mark.slow
 def test_derivative_in_the_ior_is_that_of_schlicks_reflectance(interface):
-    """From outside only R0 = ((n - 1) / (n + 1))^2 varies."""
+    """From outside, only R0 = ((n - 1) / (n + 1))^2 varies."""
     scene = interface(60)
 
     def image(ior, seed):
@@ -74,7 +74,7 @@ def test_derivative_in_the_ior_is_that_of_schlicks_reflectance(interface):
     tangent = jax.jit(lambda seed: jax.jvp(lambda ior: image(ior, seed), (1.5,), (1.0,))[1].mean())
     slopes = np.array([tangent(seed) for seed in range(16)])
     exact = (1 - 0.5**5) * 4 * 0.5 / 2.5**3
-    # 4.5 standard errors of 16 seeds, some 3e-4 of false alarm; the difference's own bias is some 1e-4 of the slope.
+    # 4.5 standard errors of 16 seeds, a false-alarm rate of some 3e-4. The difference's bias is some 1e-4 of the slope.
     assert abs(slopes.mean() - exact) < 4.5 * slopes.std(ddof=1) / 4 + 1e-3 * exact
 
 
@@ -83,12 +83,12 @@ def test_derivative_in_the_ior_is_that_of_schlicks_reflectance(interface):
 
 @pytest.fixture(scope="module")
 def default(shipped, estimate):
-    """(name) -> scene and its image."""
+    """(name) -> (scene, Estimate of its image)."""
     made = {}
 
     def of(name):
         if name not in made:
-            scene = shipped(name, res=16)  # of which other tests have the kernel
+            scene = shipped(name, res=16)  # shares its kernel with other tests
             made[name] = scene, estimate(scene, spp=256, first_seed=101)
         return made[name]
 
@@ -133,7 +133,7 @@ def test_samplers_agree_on_many_bounces(default, estimate, agree):
 
 
 def test_two_by_two_strata_lower_the_error_of_independent_numbers(make_scene, estimate):
-    """Half of the pixel in the middle is bright: two of its quarters."""
+    """Half of the middle pixel is bright: two of its quarters."""
     half = """<shape type="rectangle"><transform name="to_world"><scale value="9"/><translate x="9"/></transform>
       <emitter type="area"/></shape>"""
     scene = make_scene(half, res=3)
@@ -150,7 +150,7 @@ def lowered(scene, form=None, **chosen):
     return pixel_means.lower(*work, options=Options(**chosen), form=form)
 
 
-TRACES = {  # what the debug information of a program names, if it was chosen
+TRACES = {  # names in a program's debug information -> the choice that brings them
     "/splitting.py": {"split_depth": 2},
     "schlick": {"fresnel": "schlick"},
     "independent_point": {"sampler": "independent"},

@@ -1,4 +1,4 @@
-"""What is compiled, and how often: one native kernel for a render or a query, without what the scene lacks."""
+"""What is compiled, and how often: one native kernel per render or query, without code for kinds the scene lacks."""
 
 import re
 from dataclasses import replace
@@ -30,19 +30,19 @@ from pathjax.transport import control, factors, patches, rays, view
 ROOT = Path(__file__).resolve().parents[1]
 NAMES = sorted(path.stem for path in (*ROOT.glob("scenes/*.xml"), *ROOT.glob("tests/scenes/*.xml")))
 
-# Those whose kernels take longest to compile, among the scenes made for tests.
+# Scenes made for tests whose kernels take longest to compile.
 LARGE = (
     *("more_shapes", "nested", "normals", "plastics", "principled"),
     *("rough_glass", "rough_metals", "shapes_and_filters", "textures", "turned"),
 )
-# Those that hold no kind which the others lack.
+# Scenes whose kinds all occur in other scenes.
 REPEATED = ("conductors", "glass_in_glass", "nine_spheres")
-# Nor do these; their images are looked at all the same.
+# The same holds for these, but their images are tested all the same.
 WITHIN_OTHERS = ("cornell_box", "glass_ball")
 
 
 def but(*slow):
-    """All scenes, of which these are slow."""
+    """Return all scenes as parameters, the given ones marked slow."""
     return [pytest.param(name, marks=pytest.mark.slow if name in slow else ()) for name in NAMES]
 
 
@@ -69,15 +69,15 @@ def test_every_scene_renders_in_one_native_kernel_what_is_finite_and_not_negativ
 
 @pytest.mark.parametrize("name, lines, loops", [("cornell_box", 4400, 12), ("mesh", 8600, 42)])
 def test_programs_are_small(shipped, name, lines, loops):
-    """What is compiled takes time by its length, and by its loops: so many lines and loops when this was written."""
+    """Compile time grows with the number of lines and loops, so both stay near what they were when this was written."""
     program = lowered(shipped(name)).as_text()
     assert program.count("\n") < 1.12 * lines
-    assert program.count("stablehlo.while") < 1.3 * loops  # one for each value computed once would be twice as many
+    assert program.count("stablehlo.while") < 1.3 * loops  # a loop for each value computed once would double the number
 
 
 @pytest.mark.parametrize("name", ["cornell_box", "glass_and_mirror", "mesh"])
 def test_columns_of_lanes_are_seldom_copied(kernel_of, name):
-    """XLA copies what it believes to be overwritten while it is read: once two columns for each that was computed."""
+    """XLA copies columns that it believes to be overwritten while they are read: once two per computed column."""
     text = kernel_of(name).compiled.as_text()
     copied, computed = (len(re.findall(rf"= \w+\[128\]\S* {what}\(", text)) for what in ("copy", "fusion"))
     assert computed > 50
@@ -102,7 +102,7 @@ def test_float64_renders_in_one_native_kernel(native_kernels, kernel_of, x64, na
         assert native_kernels(kernel_of(name, jnp.float64).compiled) == 1
 
 
-@pytest.mark.parametrize("name, devices", [("glass_and_mirror", 1), ("mesh", None)])  # each scene and number once
+@pytest.mark.parametrize("name, devices", [("glass_and_mirror", 1), ("mesh", None)])  # each scene, each count once
 def test_closest_hit_is_one_native_kernel(native_kernels, shipped, name, devices):
     rays = jnp.ones((1000, 3)), jnp.ones((1000, 3))
     lowered = query._closest_hit.lower(shipped(name, res=16).geometry, *rays, devices=devices)
@@ -124,7 +124,7 @@ def test_render_in_the_users_jit_is_one_native_kernel(native_kernels, shipped):
 
 
 def kernels_of_derivatives():
-    """Quick: each kind once. Slow: all scenes."""
+    """Return cases for derivative kernels; the quick ones cover each kind once, the slow ones all scenes."""
     cases = []
     for name in NAMES:
         has_glass = "dielectric" in next(ROOT.glob(f"**/scenes/{name}.xml")).read_text()
@@ -141,15 +141,15 @@ def test_image_and_derivatives_are_one_native_kernel_and_finite(native_kernels, 
     parts = kernel(spp=16)
     assert all(np.isfinite(part).all() for part in parts)
     _, colors, glass, _ = parts
-    # Nothing is constant in the picture, but what it does not show.
+    # Every parameter changes the image, except what is not in view.
     assert colors.size + glass.size > 0 and max(np.abs(x).max(initial=0) for x in (colors, glass)) > 1e-3
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("few", "near"), [(totals.FEW, totals.NEAR), (0, totals.NEAR), (0, 0)])
 def test_a_sweep_is_native(native_kernels, monkeypatch, shipped, few, near):
-    """The paths of a part, its last sweep, and what a path too long makes of the sums: of few entries, of lists in near
-    caches and of larger ones.
+    """One kernel each: the paths of a part, its last sweep, and the sums after a path too long for the ring. Cases: few
+    entries, lists that stay in near caches, and larger lists.
     """
     monkeypatch.setattr(totals, "FEW", few)
     monkeypatch.setattr(totals, "NEAR", near)
@@ -176,7 +176,7 @@ def test_no_derivative_of_a_million_paths_is_nan(jacobian_kernel_of, name):
 
 @pytest.fixture
 def left_to_vmap(monkeypatch):
-    """What lanes leave to vmap, which costs them their registers, while they are traced: "primitive at file:line"."""
+    """Primitives that traced lanes leave to vmap, at the cost of registers, as "primitive at file:line"."""
     found, within = set(), []
     apply, by_vmap = Interpreter.apply, Interpreter.by_vmap
 
@@ -188,7 +188,7 @@ def left_to_vmap(monkeypatch):
             within.pop()
 
     def recorded(self, eqn, inputs):
-        place = next(filter(None, reversed(within)), "unknown")  # JAX's own functions have no place but their caller's
+        place = next(filter(None, reversed(within)), "unknown")  # JAX's own functions have only their caller's
         found.add(f"{eqn.primitive.name} at {place}")
         return by_vmap(self, eqn, inputs)
 
@@ -198,7 +198,7 @@ def left_to_vmap(monkeypatch):
 
 
 def trace(kernel, *arguments, **static):
-    """Trace a jitted function anew, whatever JAX has kept of it."""
+    """Trace a jitted function anew, without JAX's caches."""
     jax.make_jaxpr(partial(kernel.__wrapped__, **static))(*arguments)
 
 
@@ -206,7 +206,7 @@ def test_what_lanes_leave_to_vmap_is_told_with_its_place(left_to_vmap):
     def f(x):
         return jnp.sort(x), jnp.repeat(x, 2, total_repeat_length=14)
 
-    # Of a size that no other test has: JAX tells of a function that it knows already where it was traced before.
+    # A size that no other test has: for a function that JAX has traced before it reports the place of that trace.
     jax.make_jaxpr(lanes(f, 4))(jnp.ones((8, 7)))
     assert {entry.partition(" at ")[0] for entry in left_to_vmap} == {"sort", "gather"}
     assert all(f"/{Path(__file__).name}:" in entry for entry in left_to_vmap)
@@ -214,7 +214,7 @@ def test_what_lanes_leave_to_vmap_is_told_with_its_place(left_to_vmap):
 
 @pytest.mark.parametrize("name", but(*LARGE, *REPEATED, *WITHIN_OTHERS))
 def test_no_primitive_of_an_image_is_left_to_vmap(shipped, left_to_vmap, name):
-    """What JAX unpacks arrays by, from one version to the next, must have a rule, or all kernels are slower."""
+    """The primitives to which JAX unpacks arrays differ between versions; one without a rule would slow all kernels."""
     scene = replace(shipped(name, res=16), about=None)
     pixels = jnp.arange(256, dtype=jnp.int32)
     work = pixels, *pixel.numbers(pixels, 0, 4, 1)
@@ -243,7 +243,7 @@ QUICK_DERIVATIVES = ("furnace", "glass_ball")
 
 @pytest.mark.parametrize("name", but(*set(NAMES).difference(QUICK_DERIVATIVES)))
 def test_no_primitive_of_a_derivative_is_left_to_vmap(shipped, left_to_vmap, name):
-    """Nor of the terms of the series, from which derivatives are taken too, nor of the step of an IOR."""
+    """The same holds for the terms of the series, which are differentiated too, and for the step of an IOR."""
     scene = shipped(name, res=16)
     parameters = scene.about.parameters.values()
     colors = tangents.places(p for p in parameters if not p.moves_paths)
@@ -264,7 +264,7 @@ def test_no_primitive_of_a_derivative_is_left_to_vmap(shipped, left_to_vmap, nam
 
 
 def test_every_kernel_over_samples_has_a_persistent_loop(shipped, monkeypatch):
-    """Or lanes would wait for the longest path of their pixel: right, and slow."""
+    """Without one, lanes would wait for the longest path of their pixel: right, but slow."""
     found = []
 
     def counted(*arguments):
@@ -287,7 +287,7 @@ def test_every_kernel_over_samples_has_a_persistent_loop(shipped, monkeypatch):
 
 # ---- nothing that the scene lacks -----------------------------------------------------------------------------------
 
-# Source files that the debug information of a lowered program names.
+# Source files named in the debug information of a lowered program.
 ALWAYS = {"render.py", "path.py", "perspective.py", "film.py", "sampler.py"}
 OPTIONAL = {
     "dielectric.py": {"glass_and_mirror", "glass_in_glass"},
@@ -306,7 +306,7 @@ OPTIONAL = {
 
 @pytest.mark.parametrize("name", sorted(set.union(*OPTIONAL.values())))
 def test_program_holds_code_of_the_kinds_present_and_of_no_others(shipped, name):
-    # In the form that tells files; the program of one pixel, of which lanes are made, is the same.
+    # The loop form keeps file names; the program of one pixel, from which lanes are made, is the same.
     text = lowered(shipped(name, res=16), form="loop").as_text(debug_info=True)
     holds = {file for file in ALWAYS | set(OPTIONAL) if f"/{file}" in text}
     assert holds == ALWAYS | {file for file, names in OPTIONAL.items() if name in names}
@@ -322,7 +322,7 @@ def test_background_is_sampled_by_strategy_light_alone(shipped):
 
 
 def test_a_first_render_compiles_its_kernel_and_nothing_else(make_scene, compilations):
-    scene = make_scene('<emitter type="constant"/>', res=17)  # of which nothing else is
+    scene = make_scene('<emitter type="constant"/>', res=17)  # a resolution that no other test has
     before = compilations.count
     pj.render(scene, 2)
     assert compilations.count == before + 1
@@ -341,7 +341,7 @@ def changes(scene):
 
 
 def test_parameters_are_set_by_one_program(make_scene, compilations):
-    # Of so many bsdfs as no other test has.
+    # No other test has this number of bsdfs.
     balls = (BALLS.format(f"ball{i}", i, f"clay{i}", "0.5, 0.1, 0.1", f"sky{i}") for i in range(7))
     scene = make_scene("".join(ball.partition("<emitter")[0] for ball in balls))
     before = compilations.count
@@ -353,7 +353,7 @@ def test_parameters_are_set_by_one_program(make_scene, compilations):
 def test_other_values_never_compile_again(shipped, compilations):
     scene = shipped("glass_and_mirror", res=16)
     base = np.asarray(pj.render(scene, 2))
-    list(changes(scene))  # small operations of the changes themselves compile here
+    list(changes(scene))  # this compiles the small operations of the changes themselves
     for what, changed, how in changes(scene):
         before = compilations.count
         image = pj.render(changed, **({"spp": 2} | how))
@@ -362,8 +362,8 @@ def test_other_values_never_compile_again(shipped, compilations):
 
 
 def test_a_sweep_over_32_iors_compiles_once(shipped, compilations):
-    """The kernel, and what chooses its step."""
-    scene = shipped("glass_ball", res=64)  # as in the README, whose kernel this is
+    """Neither the kernel nor the program that chooses its step is compiled again."""
+    scene = shipped("glass_ball", res=64)  # the scene of the README, which shares its kernel
     sweep = [pj.with_parameters(scene, {"glass.int_ior": 1.1 + 0.03 * i}) for i in range(32)]
     pj.jacobian(sweep[0], ["glass.int_ior"], 1)
     before = compilations.count
@@ -389,7 +389,7 @@ def test_scenes_of_one_structure_share_a_kernel_whatever_their_names(make_scene,
 
 
 def test_renders_until_an_error_share_a_kernel(shipped, compilations):
-    """Of other targets, seeds and numbers of samples."""
+    """Other targets, seeds and sample counts."""
     scene = shipped("cornell_box", res=16)
     pj.render_until(scene, 0.2)
     before = compilations.count

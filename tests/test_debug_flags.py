@@ -1,4 +1,4 @@
-"""JAX's debug flags, by which users look for bugs of their own, find nothing in healthy scenes."""
+"""JAX's debug flags, which users set to find bugs of their own, report nothing in healthy scenes."""
 
 from functools import partial
 
@@ -11,14 +11,14 @@ import pathjax as pj
 from pathjax import transport
 
 SLOW = pytest.mark.slow
-# Boxes and rectangles; triangles in a tree, whose leaves have empty lanes; a sphere and glass, of which the derivatives
-# are quick; the rest.
+# Boxes and rectangles; triangles in a tree, whose leaves have empty lanes; a sphere and glass, whose derivatives are
+# quick; the rest.
 SCENES = ["cornell_box", "mesh", *(pytest.param(n, marks=SLOW) for n in ("glass_ball", "textures", "conductors"))]
 
 
 @pytest.fixture(autouse=True)
 def flags():
-    """All at once, as each raises an error of its own: while an array is computed, or while a program is traced."""
+    """Set all flags at once: each raises an error of its own, while an array is computed or a program is traced."""
     with jax.debug_nans(True), jax.numpy_dtype_promotion("strict"), jax.numpy_rank_promotion("raise"):
         yield
 
@@ -35,7 +35,7 @@ def test_each_flag_finds_its_fault():
 
 @pytest.mark.parametrize("name", SCENES)
 def test_scenes_load_and_render(shipped, name):
-    scene = shipped(name, res=16)  # of which other tests have the kernel
+    scene = shipped(name, res=16)  # shares its kernel with other tests
     scene = pj.with_parameters(scene, pj.parameters(scene))
     assert np.isfinite(pj.render(scene, 2)).all()
     assert np.isfinite(pj.render_aovs(scene, ["depth"])["depth"]).any()
@@ -43,21 +43,21 @@ def test_scenes_load_and_render(shipped, name):
 
 
 def test_images_with_errors_and_terms_of_the_series(shipped):
-    """A single sample a pixel, which has no standard error, is said to have nan, and no flag takes that for a fault."""
-    scene = shipped("cornell_box", res=64)  # as in the manual, whose kernels these are
+    """One sample per pixel has no standard error; it is reported as nan without tripping a flag."""
+    scene = shipped("cornell_box", res=64)  # the scene of the manual, which shares its kernels
     assert pj.render_until(scene, spp=5).reason
     assert np.isnan(pj.render_until(scene, spp=1).standard_error).all()
     assert np.isfinite(pj.render_bounces(scene, depth=8, spp=8).standard_error).all()
 
 
 def test_derivatives(shipped):
-    scene = shipped("glass_ball", res=64)  # as in the manual, whose kernels these are
+    scene = shipped("glass_ball", res=64)  # the scene of the manual, which shares its kernels
     ior, grey = "glass.int_ior", "pattern.color0"
 
     def loss(name, value):
         return jnp.sum(pj.render(pj.with_parameters(scene, {name: value}), 2))
 
-    gradient = jax.jit(jax.grad(partial(loss, ior)))(1.5)  # in a jit the rule of differentiation is called later
+    gradient = jax.jit(jax.grad(partial(loss, ior)))(1.5)  # inside jit, the differentiation rule is called later
     _, J = pj.jacobian(scene, [ior], 2)
     np.testing.assert_allclose(gradient, J[ior].sum(), atol=1e-5 * np.abs(J[ior]).sum())
     assert jax.grad(partial(loss, grey))(0.5) > 0
@@ -74,9 +74,9 @@ def test_fits_and_checks_of_gradients(shipped):
 
 
 def test_light_on_patches(shipped):
-    scene = shipped("cornell_box", res=64)  # as in the manual
+    scene = shipped("cornell_box", res=64)  # the scene of the manual
     op = transport.operator(scene, patches=200)
     assert np.isfinite(op.solve().L).all() and np.isfinite(op.terms(5)).all()
-    radius = np.asarray(op.spectral_radius())  # of each channel
+    radius = np.asarray(op.spectral_radius())  # per channel
     assert (radius > 0).all() and (radius < 1).all()
     assert np.isfinite(transport.image(scene, op.radiosity(op.Le), 1)).all()

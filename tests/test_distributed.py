@@ -1,4 +1,4 @@
-"""Scripts in several processes: whatever takes a scene gives the bits of one process, within a user's own jit too."""
+"""Scripts in several processes: every function of a scene gives the bits of one process, inside a user's jit too."""
 
 import os
 import re
@@ -28,7 +28,7 @@ distributed.start(f"127.0.0.1:{port}", int(processes), int(process))
 
 @pytest.fixture
 def started(root, tmp_path):
-    """(script, processes) -> running processes of one device each, each of which may save what it has found."""
+    """(script, processes) -> running processes with one device each; each may save its results."""
     running = []
 
     def start(script, processes):
@@ -51,7 +51,7 @@ def started(root, tmp_path):
 
 @pytest.fixture
 def found(started, tmp_path):
-    """(script, processes) -> what each process saved."""
+    """(script, processes) -> the results that each process saved."""
 
     def found(script, processes):
         for process in started(script, processes):
@@ -64,7 +64,7 @@ def found(started, tmp_path):
 
 @pytest.fixture
 def here(root, tmp_path, monkeypatch):
-    """(script) -> what it saves in this process, whose devices are all cores."""
+    """(script) -> the results that it saves in this process, which has one device per core."""
 
     def here(script):
         monkeypatch.chdir(root)
@@ -123,7 +123,7 @@ def test_kernels_are_dealt_to_all_processes_and_what_differs_is_refused(found, h
     assert_same(here(MAPS), *found(MAPS + REFUSED, 2))
 
 
-# What takes a scene, outside of jit and within a user's own.
+# All functions of a scene, outside jit and inside a user's jit.
 EVERYTHING = """
 from pathjax.inverse import normal as module
 
@@ -190,7 +190,7 @@ def test_fits_of_few_numbers_and_of_textures_are_those_of_one_process(found, her
     ("sends", "spp", "says"), [("SIGKILL", 8, "ended"), ("SIGKILL", 20000, "ended"), ("SIGSTOP", 8, "not answered")]
 )
 def test_a_process_is_killed_or_stopped_and_the_other_ends_and_names_it(started, victim, sends, spp, says):
-    """Between calls; and within one, of many samples, which computes for long and does not ask for the other."""
+    """Between calls, and within a long call of many samples, which does not check on the other process."""
     running = started(LOOP.format(spp=spp), 2)
     for line in running[1 - victim].stdout:
         if line == "called 2\n" or (line == "called 1\n" and spp > 8):
@@ -207,7 +207,7 @@ def test_a_process_is_killed_or_stopped_and_the_other_ends_and_names_it(started,
 @pytest.mark.slow
 @pytest.mark.parametrize("faulty", [0, 1])
 def test_an_error_in_one_process_ends_it_and_the_other(started, faulty):
-    """Python would first wait for the other one, which waits for it."""
+    """Without pathjax, Python would first wait for the other process, which waits for this one."""
     fails = f'if process == "{faulty}":\n    raise KeyError("of this script")\n'
     running = started(fails + LOOP.format(spp=8), 2)
     told, _ = running[faulty].communicate(timeout=60)

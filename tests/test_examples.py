@@ -1,4 +1,4 @@
-"""Every example runs, at a reduced size, and writes its picture."""
+"""Every example runs, at a reduced size, and writes its image."""
 
 import os
 import subprocess
@@ -24,7 +24,7 @@ SMALL = {
     "original_results": ["--res", "32", "--spp", "8"],
     "check_mitsuba": ["--res", "32", "--spp", "16", "--seeds", "8"],
 }
-# What is no dependency of pathjax.
+# Modules that are no dependencies of pathjax.
 NEEDS = {"choices": "matplotlib", "check_mitsuba": "mitsuba"}
 
 
@@ -55,7 +55,7 @@ def test_example_runs_and_writes_its_picture(name, tmp_path):
 
 
 def test_without_mitsuba_its_example_says_so(tmp_path):
-    """A module that hides it, and fails as a missing one does."""
+    """A fake module hides Mitsuba and fails as a missing one does."""
     (tmp_path / "mitsuba.py").write_text("raise ModuleNotFoundError")
     environment = python_finds(tmp_path, ROOT)
     command = [sys.executable, ROOT / "examples" / "check_mitsuba.py"]

@@ -1,4 +1,4 @@
-"""Derivatives of images: against closed forms, against differences of independent images, and against each other."""
+"""Derivatives of images against closed forms, differences of independent images, and each other."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -51,7 +51,7 @@ def furnace(shipped):
 
 
 def series(rho, depth):
-    """Radiance in the furnace cut off at `depth`, and its derivative in the albedo."""
+    """Return the radiance in the furnace truncated at `depth`, and its derivative in the albedo."""
     k = np.arange(1, depth)[:, None]
     return 1 + np.sum(rho**k, 0), np.sum(k * rho ** (k - 1), 0)
 
@@ -61,7 +61,7 @@ FURNACE_NAMES = ["wall.reflectance", "glow.radiance"]
 
 @pytest.mark.parametrize("depth", [1, 2, 3, 8])
 def test_closed_diffuse_sphere_per_sample(furnace, derivatives, depth):
-    """Every vertex sees radiance 1, so a single sample is the truncated series, and so is its derivative."""
+    """Every vertex sees radiance 1, so each sample is the truncated series, and so is its derivative."""
     image, slopes = derivatives(without_roulette(furnace, depth), FURNACE_NAMES, 1, 2, strategy="bsdf")
     L, dL = series(RHO, depth)
     for estimate, exact in ((image, L), (slopes["wall.reflectance"], dL), (slopes["glow.radiance"], L)):
@@ -71,7 +71,7 @@ def test_closed_diffuse_sphere_per_sample(furnace, derivatives, depth):
 
 
 def test_many_samples_keep_their_digits(furnace):
-    """Every sample is the same number, so plain float32 sums would all round one way: by 1 % after a million."""
+    """All samples are equal, so plain float32 sums would always round the same way: off by 1 % after a million."""
     scene = without_roulette(furnace, 2)
     _, J = pj.jacobian(scene, FURNACE_NAMES, 1 << 16, strategy="bsdf")
     L, dL = series(RHO, 2)
@@ -81,7 +81,7 @@ def test_many_samples_keep_their_digits(furnace):
 
 @pytest.mark.parametrize("strategy", ["mis", "light", "bsdf"])
 def test_strategies_agree_with_the_closed_form(furnace, derivatives, agree, strategy):
-    """At depth 6, with roulette from the second vertex on and without."""
+    """Depth 6, with roulette from the second vertex on and without."""
     L, dL = series(RHO, 6)
     for rr_depth in (1, NO_LIMIT):
         scene = replace(furnace, max_depth=jnp.int32(6), rr_depth=jnp.int32(rr_depth))
@@ -92,7 +92,7 @@ def test_strategies_agree_with_the_closed_form(furnace, derivatives, agree, stra
 
 
 def test_black_walls_and_dark_lamps_keep_their_derivatives(furnace, derivatives, agree):
-    """An albedo of exactly 0 has dL/drho = 1; a radiance of exactly 0 leaves a black image that can change."""
+    """An albedo of exactly 0 has dL/drho = 1; a radiance of exactly 0 gives a black image with a derivative."""
     for rr_depth in (1, NO_LIMIT):
         scene = replace(furnace, max_depth=jnp.int32(6), rr_depth=jnp.int32(rr_depth))
         black = pj.with_parameters(scene, {"wall.reflectance": 0.0})
@@ -128,7 +128,7 @@ def test_diffuse_plane_under_uniform_light(plane):
     np.testing.assert_allclose(J["plate.reflectance"], np.broadcast_to(np.eye(3), (8, 8, 3, 3)), rtol=1e-6)
 
 
-# Radiances and albedos of two facing plates, the camera looking at the first.
+# Radiances and albedos of two facing plates; the camera looks at the first.
 E1, E2 = np.array([0.5, 1.0, 2.0]), np.array([3.0, 2.0, 1.0])
 RHO1, RHO2 = np.array([0.3, 0.6, 0.9]), np.array([0.8, 0.5, 0.2])
 PLATES = ["one.reflectance", "two.reflectance", "glow-one.radiance", "glow-two.radiance"]
@@ -140,7 +140,7 @@ def listed(values):
 
 @pytest.fixture(scope="module")
 def plates(make_scene):
-    """(half width, depth) -> plates at z = 0 and z = 1, and a camera between them that sees the middle of the first."""
+    """(half width, depth) -> plates at z = 0 and z = 1; a camera between them sees the middle of the first."""
 
     def make(size, depth):
         first = diffuse("one", listed(RHO1)) + area_light("glow-one", listed(E1))
@@ -159,7 +159,7 @@ def plates(make_scene):
 
 
 def plate_series(f, depth):
-    """B1 = E1 + rho1 f B2, B2 = E2 + rho2 f B1, cut off at `depth` vertices, and its four partial derivatives."""
+    """Return B1 = E1 + rho1 f B2, B2 = E2 + rho2 f B1, truncated at `depth` vertices, and its four derivatives."""
 
     def radiosity(rho1, rho2, e1, e2):
         b1, b2 = 0, 0
@@ -168,19 +168,19 @@ def plate_series(f, depth):
         return b1
 
     at = (RHO1, RHO2, E1, E2)
-    # A polynomial with real coefficients: complex steps give its derivatives to the last bits.
+    # A polynomial with real coefficients: complex steps give its derivatives to full precision.
     steps = np.eye(4)[:, :, None] * 1e-30j
     return radiosity(*at), [radiosity(*(a + s for a, s in zip(at, step, strict=True))).imag / 1e-30 for step in steps]
 
 
 def test_two_infinite_plates(plates, derivatives, agree):
-    """F = 1, and (E1 + rho1 E2) / (1 - rho1 rho2): at 64 vertices the rest of the series is below 1e-8."""
+    """f = 1 gives (E1 + rho1 E2) / (1 - rho1 rho2); at 64 vertices the rest of the series is below 1e-8."""
     f = 1
     B1, partials = plate_series(f, 64)
     np.testing.assert_allclose(B1, (E1 + RHO1 * f * E2) / (1 - RHO1 * RHO2 * f**2))
-    # Light sampling over plates so large would seldom hit where it matters.
+    # Light sampling over such large plates would seldom sample the region that matters.
     image, slopes = derivatives(plates(1e3, 64), PLATES, 64, strategy="bsdf")
-    # Beyond 1e3 plate distances lie 1e-6 of the light.
+    # Beyond 1e3 plate distances lies 1e-6 of the light.
     agree(image, B1, pixelwise=False)
     for name, partial in zip(PLATES, partials, strict=True):
         agree(slopes[name], partial, pixelwise=False)
@@ -188,7 +188,7 @@ def test_two_infinite_plates(plates, derivatives, agree):
 
 @pytest.mark.parametrize("strategy", ["mis", pytest.param("bsdf", marks=pytest.mark.slow)])
 def test_two_finite_plates_with_their_form_factor(plates, derivatives, agree, strategy):
-    """One bounce: the point's form factor to the other plate, a rectangle seen from below its middle."""
+    """One bounce: the point's form factor to the other plate, a rectangle whose middle faces it."""
     # Four quarters, each 1 / (2 pi) (a / A atan(b / A) + b / B atan(a / B)), A^2 = 1 + a^2 (Howell's catalogue, B-3).
     root = np.sqrt(2)
     f = 4 / (2 * np.pi) * 2 * (1 / root) * np.arctan(1 / root)
@@ -199,11 +199,11 @@ def test_two_finite_plates_with_their_form_factor(plates, derivatives, agree, st
         agree(slopes[name], partial, pixelwise=False)
 
 
-METAL = ["metal.eta", "metal.k", "metal.specular_reflectance"]  # in all tests, which share one kernel
+METAL = ["metal.eta", "metal.k", "metal.specular_reflectance"]  # the same in all tests, which share one kernel
 
 
 def metal_sheet(make_scene, angle):
-    """A sheet of metal that fills the view, seen at an angle under radiance 1."""
+    """Return a sheet of metal that fills the view, seen at an angle under radiance 2."""
     metal = (
         '<bsdf type="conductor" id="metal"><rgb name="eta" value="0.2, 0.924, 1.102"/>'
         '<rgb name="k" value="3.912, 2.452, 2.142"/><rgb name="specular_reflectance" value="0.9, 0.8, 0.7"/></bsdf>'
@@ -213,7 +213,7 @@ def metal_sheet(make_scene, angle):
 
 
 def conductor_reflectance(cos_i, eta, k):
-    """Complex amplitudes, in float64."""
+    """Return the reflectance from complex amplitudes, in float64."""
     n = eta + 1j * k
     cos_t = np.sqrt(1 - (1 - cos_i**2) / n**2)
     r_s, r_p = (cos_i - n * cos_t) / (cos_i + n * cos_t), (n * cos_i - cos_t) / (n * cos_i + cos_t)
@@ -237,14 +237,14 @@ def test_metals(make_scene, angle):
     )
     np.testing.assert_allclose(image, np.broadcast_to(2 * s * F(eta, k), (8, 8, 3)), rtol=1e-5)
     for name, slope in zip(METAL, exact, strict=True):
-        # In float32 some digits cancel in 1 - F; and the view is 1e-5 wide.
+        # In float32 some digits of 1 - F cancel, and the view is 1e-5 wide.
         wanted = np.broadcast_to(np.diag(slope), (8, 8, 3, 3))
         np.testing.assert_allclose(J[name], wanted, rtol=1e-4, atol=2e-6)
 
 
 @pytest.mark.parametrize("angle", [0, 40, 75])
 def test_metals_of_next_to_no_eta(make_scene, angle):
-    """They reflect nearly all, and dI/deta is that at eta = 0, where 1 - F = eta times a closed form."""
+    """Such metals reflect nearly all light; dI/deta is that at eta = 0, where 1 - F = eta times a closed form."""
     k, s = np.array([0.5, 2, 30]), np.array([0.9, 0.8, 0.7])
     scene = metal_sheet(make_scene, angle)
     cos, sin = np.cos(np.radians(angle)), np.sin(np.radians(angle))
@@ -254,14 +254,14 @@ def test_metals_of_next_to_no_eta(make_scene, angle):
         changed = pj.with_parameters(scene, {"metal.eta": [eta] * 3, "metal.k": k})
         image, J = pj.jacobian(changed, METAL, 1)
         np.testing.assert_allclose(image, np.broadcast_to(2 * s * (1 + eta * slope), (8, 8, 3)), rtol=1e-5)
-        # Pixels see the sheet under slightly other angles; and the slope itself changes by a few eta.
+        # Pixels see the sheet at slightly different angles, and the slope itself changes by a few eta.
         expected = np.broadcast_to(np.diag(2 * s * slope), (8, 8, 3, 3))
         np.testing.assert_allclose(J["metal.eta"], expected, rtol=1e-4 + 10 * eta, atol=1e-9)
 
 
 def test_checkerboard_colours(shipped):
-    """Up to depth 5 the screen is met twice at most, so a sample is quadratic in its colours, and central differences
-    with the same seed are exact."""
+    """Up to depth 5 a path meets the screen at most twice, so a sample is quadratic in the screen's colours and
+    central differences with the same seed are exact."""
     scene = without_roulette(shipped("glass_ball", res=8), 5)
     names = ["pattern.color0", "pattern.color1", "sky.radiance"]
     image, J = pj.jacobian(scene, names, 16)
@@ -277,7 +277,7 @@ def test_checkerboard_colours(shipped):
 
 @pytest.mark.slow
 def test_second_derivatives_of_some_colours(shipped):
-    """Samples are quadratic in the colours of the screen, as above, so that slopes differ by the second derivative."""
+    """Samples are quadratic in the screen's colours, as above, so slopes differ by exactly the second derivative."""
     scene = without_roulette(shipped("glass_ball", res=8), 5)
     names = ["pattern.color0", "pattern.color1", "sky.radiance"]
     values = {name: pj.parameters(scene)[name] for name in names}
@@ -298,7 +298,7 @@ def test_second_derivatives_of_some_colours(shipped):
 # ---- glass: closed forms --------------------------------------------------------------------------------------------
 
 GRID = 12
-# Of the ramp over the screen, per channel, in albedo per half width.
+# Slope of the ramp over the screen, per channel, in albedo per half width.
 RAMP = np.array([0.4, 0.2, -0.3])
 PICTURES = {
     "black": np.zeros((GRID, GRID, 3)),
@@ -311,9 +311,9 @@ AWAY = '<scale value="1e-3"/><translate y="1e5"/>'
 
 @pytest.fixture(scope="module")
 def stage(make_scene, tmp_path_factory):
-    """A ball, a slab and an octahedron of one glass, and a screen with a picture, under radiance 1.
+    """A ball, a slab and an octahedron of one glass, and a screen with an image, under radiance 1.
 
-    Each where its transform puts it, or out of sight: one structure, so one kernel for all tests.
+    Each shape is placed by its transform, or out of sight: one structure, so one kernel for all tests.
     """
     file = tmp_path_factory.mktemp("stage") / "picture.exr"
     write_exr(file, {c: np.zeros((GRID, GRID), np.float32) for c in "RGB"}, {})
@@ -347,7 +347,7 @@ def stage(make_scene, tmp_path_factory):
 
 
 def with_picture(scene, picture):
-    """The scene whose only texture shows one of PICTURES."""
+    """Return the scene with its only texture set to one of PICTURES."""
     (table,) = scene.materials.textures.tables
     table = table.with_column("texels", jnp.asarray(PICTURES[picture].reshape(-1, 3), jnp.float32))
     table = table.with_column("nearest", jnp.asarray([picture != "ramp"]))
@@ -359,12 +359,12 @@ SCREEN = '<scale value="6"/><translate z="-3"/>'
 
 
 def reflectance(eta):
-    """At normal incidence, and its derivative."""
+    """Return the reflectance at normal incidence, and its derivative."""
     return ((eta - 1) / (eta + 1)) ** 2, 4 * (eta - 1) / (eta + 1) ** 3
 
 
 def difference(f, step):
-    """What a central difference estimates without bias; (eta -> value), at the IOR of the tests."""
+    """Return the central difference of f (eta -> value) at IOR, which the difference method estimates without bias."""
     return (f(IOR + step) - f(IOR - step)) / (2 * step)
 
 
@@ -377,7 +377,7 @@ BODIES = {
 
 @pytest.mark.parametrize("body", BODIES)
 def test_glass_in_uniform_light_stays_invisible(stage, derivatives, agree, body):
-    """Image 1 and derivative 0 for ball, cube and mesh, if paths are followed to their end."""
+    """The image is 1 and the derivative 0 for a ball, a cube and a mesh, if paths are followed to their end."""
     scene = without_roulette(stage(**{body: BODIES[body]}))
     image, slopes = derivatives(scene, [GLASS], 32, step=0.01)
     agree(image, 1)
@@ -386,7 +386,7 @@ def test_glass_in_uniform_light_stays_invisible(stage, derivatives, agree, body)
 
 
 def test_truncated_glass_shows_what_is_cut_off(stage, derivatives, agree):
-    """Two vertices leave only the front reflection, I = R and dI/deta = dR/deta: what a small max_depth does."""
+    """Two vertices leave only the front reflection, I = R and dI/deta = dR/deta: the effect of a small max_depth."""
     scene = without_roulette(stage(ball="", fov=1e-3), 2)
     image, slopes = derivatives(scene, [GLASS], 64, step=0.01)
     R, dR = reflectance(IOR)
@@ -417,7 +417,7 @@ SLAB = f'<scale x="1" y="1" z="{THICKNESS / 2}"/><rotate y="1" angle="45"/>'
 
 
 def shift(eta):
-    """Of what is seen through the tilted slab, and its derivative."""
+    """Return the lateral shift of the view through the tilted slab, and its derivative."""
     s, c = np.sin(TILT), np.cos(TILT)
     root = eta**2 - s**2
     return THICKNESS * s * (1 - c / np.sqrt(root)), THICKNESS * s * c * eta / root**1.5
@@ -430,7 +430,7 @@ def slab_reflectance(eta):
 
 
 def through_slab(eta, albedo):
-    """Radiance at depth 4: front reflection, one internal reflection, and what comes through from the screen."""
+    """Return the radiance at depth 4: front reflection, one internal reflection, and transmission of the screen."""
     R = slab_reflectance(eta)
     return R + R * (1 - R) ** 2 + (1 - R) ** 2 * albedo
 
@@ -440,32 +440,32 @@ def ramp_image(eta):
 
 
 def test_oblique_slab_before_a_ramp(stage, derivatives, agree):
-    """The ramp shifts by d(eta) towards the side that the slab is turned to."""
+    """The ramp shifts by d(eta) towards the side that the slab faces."""
     scene = without_roulette(stage(slab=SLAB, screen=f'<translate z="{-FAR}"/>', picture="ramp", fov=1e-3, far=1e6), 4)
     image, slopes = derivatives(scene, [GLASS], 64, step=0.02)
-    rounding = 3e-4  # what the slab hides, and the ulp of positions 100 away over the step
+    rounding = 3e-4  # the light hidden by the slab, and the ulp of positions 100 away over the step
     agree(image, ramp_image(IOR), rounding=rounding)
     agree(slopes[GLASS], difference(ramp_image, 0.02), rounding=rounding, pixelwise=False)
 
 
 @pytest.fixture(scope="module")
 def edge_seen_through_a_slab(stage):
-    """The edge of the picture in the middle of the image. Returns the scene, and the image's width on the screen."""
+    """Return the scene with the texture's edge in the middle of the image, and the image's width on the screen."""
     fov = 0.1
-    # The eye is 4 from the slab, which is short against the way to the screen.
+    # The eye is 4 from the slab, which is small compared with the distance to the screen.
     width = 2 * np.tan(np.radians(fov / 2)) * (FAR + 4)
     at_edge = f'<translate x="{-shift(IOR)[0]}" z="{-FAR}"/>'
     return without_roulette(stage(slab=SLAB, screen=at_edge, picture="edge", fov=fov), 4), width
 
 
 def edge_image(eta, width):
-    """Mean of the image: as the shift grows, more of the dark left side comes in."""
+    """Return the mean of the image: as the shift grows, more of the dark left side comes into view."""
     moved = shift(eta)[0] - shift(IOR)[0]
     return through_slab(eta, (0.1 + 0.8) / 2 - 0.7 * moved / width)
 
 
 def test_oblique_slab_before_a_step_edge(edge_seen_through_a_slab, derivatives, agree):
-    """The edge term is there: a jump of 0.7, at the density 1 / width, moves with dd/deta."""
+    """The derivative includes the edge term: a jump of 0.7, at the density 1 / width, moves with dd/deta."""
     scene, width = edge_seen_through_a_slab
     step = 0.02
     image, slopes = derivatives(scene, [GLASS], 64, step=step)
@@ -477,34 +477,34 @@ def test_oblique_slab_before_a_step_edge(edge_seen_through_a_slab, derivatives, 
 
 
 def test_attached_derivatives_know_no_edges(edge_seen_through_a_slab, derivatives, agree):
-    """They find the Fresnel terms alone; before a ramp they are right, without any step."""
+    """They include the Fresnel terms only; before a ramp they are right, without any step."""
     scene, width = edge_seen_through_a_slab
     image, slopes = derivatives(scene, [GLASS], 32, method="attached")
     fresnel_alone = difference(lambda eta: through_slab(eta, 0.45), 1e-6)
     agree(image, edge_image(IOR, width), rounding=3e-4, pixelwise=False)
     agree(slopes[GLASS], fresnel_alone, rounding=1e-3, pixelwise=False)
     _, slopes = derivatives(with_picture(scene, "ramp"), [GLASS], 32, method="attached")
-    # The screen is moved here so that the image's middle sees the ramp's.
+    # The screen is placed such that the middle of the image sees the middle of the ramp.
     exact = difference(lambda eta: through_slab(eta, 0.5 - RAMP * (shift(eta)[0] - shift(IOR)[0])), 1e-6)
     agree(slopes[GLASS], exact, rounding=1e-3, pixelwise=False)
 
 
-# A ball of radius 0.1, seen from 4 away by a ray that meets it at a height of 0.002, and a screen 3 behind it.
+# A ball of radius 0.1, seen from 4 away by a ray aimed at a height of 0.002, and a screen 3 behind it.
 BALL, EYE, BEHIND, HEIGHT = 0.1, 4, 3, 0.002
 
 
 def focal_length(eta):
-    """And its derivative, -2 R at 1.5."""
+    """Return the focal length and its derivative, -2 R at 1.5."""
     return eta * BALL / (2 * (eta - 1)), -BALL / (2 * (eta - 1) ** 2)
 
 
 def seen_at(eta):
-    """Height on the screen, by the lens equation."""
+    """Return the height on the screen, by the lens equation."""
     return HEIGHT / EYE * (EYE + BEHIND - BEHIND * EYE / focal_length(eta)[0])
 
 
 def test_ball_lens_in_the_paraxial_limit(stage, derivatives, agree):
-    """Twice the ramp's height at +y, less that at -y: all that is the same on both sides drops out."""
+    """Twice the ramp at the height for +y: the difference to -y cancels all that is the same on both sides."""
     f, df = focal_length(IOR)
     assert df == pytest.approx(-2 * BALL)
     half = 0.1
@@ -525,12 +525,12 @@ def test_ball_lens_in_the_paraxial_limit(stage, derivatives, agree):
         up._replace(mean=up.mean - down.mean, variance=up.variance + down.variance)
         for up, down in ((means[1][0], means[-1][0]), (means[1][1][GLASS], means[-1][1][GLASS]))
     )
-    light = 1 - (BALL / BEHIND) ** 2  # of the sky, what the ball leaves to the screen
+    light = 1 - (BALL / BEHIND) ** 2  # of the sky's light, the share that the ball leaves to the screen
 
     def odd(eta):
         return 2 * RAMP / half * seen_at(eta) * (1 - reflectance(eta)[0]) ** 2 * light
 
-    # Heights of 2 % of the radius are off by their square, times the order of 1.
+    # Heights of 2 % of the radius have an error of the order of their square.
     agree(image, odd(IOR), rounding=2e-3, pixelwise=False)
     agree(slope, difference(odd, 0.02), rounding=2e-3, pixelwise=False)
     dy = HEIGHT / EYE * BEHIND * EYE / f**2 * df
@@ -541,7 +541,7 @@ def test_ball_lens_in_the_paraxial_limit(stage, derivatives, agree):
 
 @pytest.mark.slow
 def test_motion_of_the_image_behind_a_ball_lens(stage):
-    """What chooses the step: pixels by which the image moves, from the same lens equation."""
+    """The motion that chooses the step: pixels by which the image moves, from the same lens equation."""
     scene = stage(
         ball=f'<scale value="{BALL}"/>',
         screen=f'<scale value="0.2"/><translate z="{-BEHIND}"/>',
@@ -557,14 +557,14 @@ def test_motion_of_the_image_behind_a_ball_lens(stage):
 
 
 def test_glass_of_ior_1(stage, derivatives, agree):
-    """Nothing is reflected and nothing bends, but what is seen through it is about to."""
+    """Nothing is reflected or refracted, but the view through the glass has a derivative."""
     scene = stage(ball="", screen=SCREEN, picture="checkerboard")
     clear = pj.with_parameters(scene, {GLASS: 1.0})
     image, slopes = derivatives(clear, [GLASS], 32, step=0.01)
     bare, _ = derivatives(stage(screen=SCREEN, picture="checkerboard"), [GLASS], 32, step=0.01)
     agree(image, bare, rounding=1e-4)
     assert np.isfinite(slopes[GLASS].mean).all() and np.abs(slopes[GLASS].mean).max() > 0.5
-    # Reflection alone: R is even about 1 up to the third order, step^2 / 4.
+    # Reflection only: R is even about 1 up to the third order, step^2 / 4.
     mirror = pj.with_parameters(without_roulette(stage(ball="", fov=1e-3), 2), {GLASS: 1.0})
     _, slopes = derivatives(mirror, [GLASS], step=0.01)
     np.testing.assert_allclose(slopes[GLASS].mean, 0, atol=1e-4)
@@ -584,7 +584,7 @@ def ball_before_checkerboard(stage):
 
 
 def rendered_difference(estimate, scene, name, step, spp, count):
-    """Estimate of the central difference of images that share no random number."""
+    """Return an Estimate of the central difference of images that share no random numbers."""
     value = pj.parameters(scene)[name]
     up, down = (
         estimate(pj.with_parameters(scene, {name: value + sign * step}), spp, count, first_seed=first)
@@ -596,21 +596,21 @@ def rendered_difference(estimate, scene, name, step, spp, count):
 
 
 def test_ball_before_checkerboard(ball_before_checkerboard, derivatives, estimate, agree):
-    """Pixel by pixel against differences of independent plain images."""
+    """Pixel by pixel against differences of independent renders."""
     scene, step = ball_before_checkerboard, 0.02
     _, slopes = derivatives(scene, [GLASS], 64, step=step)
     reference = rendered_difference(estimate, scene, GLASS, step, 512, 16)
     agree(slopes[GLASS], reference, rounding=1e-4)
     z = (slopes[GLASS].mean - reference.mean) / np.sqrt(slopes[GLASS].variance + reference.variance + 1e-12)
-    # Variances of 16 seeds widen z^2 to (15 / 13); pixels that see no glass have none.
+    # With variances from 16 seeds the mean of z^2 is 15 / 13; pixels that see no glass have no variance.
     touched = reference.variance[..., 0] > 1e-6
     assert np.mean(z[touched] ** 2) <= 1.5
-    # What is compared is there to be seen.
+    # The compared derivative stands out from its noise.
     assert np.sqrt(np.mean(slopes[GLASS].mean ** 2)) > 5 * np.sqrt(np.mean(slopes[GLASS].variance))
 
 
 def test_exterior_ior_is_the_same_derivative_scaled(ball_before_checkerboard):
-    """Only the ratio counts: dI/dext = -(int / ext) dI/dint / 1, sample by sample."""
+    """Only the ratio matters: dI/dext = -(int / ext) dI/dint, sample by sample."""
     outside = 1.2
     scene = pj.with_parameters(ball_before_checkerboard, {"glass.ext_ior": outside})
     _, J = pj.jacobian(scene, [GLASS, "glass.ext_ior"], 8, step=0.01)
@@ -621,7 +621,7 @@ def test_exterior_ior_is_the_same_derivative_scaled(ball_before_checkerboard):
 
 
 def test_estimated_bias_is_that_of_the_step(stage, derivatives, agree):
-    """Through a slab before a ramp, where closed forms know both: derivative - bias is right to a higher order."""
+    """The front reflection of a ball, whose bias has a closed form: derivative - bias is right to a higher order."""
     scene = without_roulette(stage(ball="", fov=1e-3), 2)
     step = 0.2
     biases = []
@@ -648,7 +648,7 @@ def test_roulette_changes_no_derivative_of_glass(ball_before_checkerboard, deriv
 
 
 def test_image_is_that_of_render(ball_before_checkerboard, plane):
-    """With the same seed, to rounding; so a fit sees what a render shows."""
+    """With the same seed, to rounding, so a fit sees the image that a render shows."""
     for scene, names, how in ((ball_before_checkerboard, [GLASS], {"step": 0.01}), (plane, [PLATE], {})):
         image, J = pj.jacobian(scene, names, 16, 7, **how)
         np.testing.assert_allclose(image, pj.render(scene, 16, 7), rtol=1e-5, atol=1e-6)
@@ -658,12 +658,12 @@ def test_image_is_that_of_render(ball_before_checkerboard, plane):
         }
 
 
-# Every transformation compiles anew: the plane does so fastest.
+# Every transformation compiles anew; the plane compiles fastest.
 
 
 @pytest.fixture(scope="module")
 def dim_plane(plane):
-    """Whose sky may vary too."""
+    """The plane under a sky that may vary too."""
     return pj.with_parameters(plane, {"sky.radiance": [0.5, 1.0, 2.0]})
 
 
@@ -686,7 +686,7 @@ def assert_adjoint(f, at):
         right = sum(np.vdot(np.asarray(a, float), np.asarray(b, float)) for a, b in zip(transpose(v), u, strict=True))
         scale = np.linalg.norm(v) * np.linalg.norm(Ju)
         assert scale > 0.1
-        # Sums of some 1000 products in float32.
+        # Sums of about 1000 products in float32.
         assert abs(left - right) < 1e-5 * scale
 
 
@@ -726,7 +726,7 @@ def test_every_transformation_gives_the_jacobian(dim_plane):
 
 
 def test_a_table_set_by_hand_has_its_derivative_too(dim_plane):
-    """Beside parameters set by name: a table without any is refused, one that holds some is differentiated in all."""
+    """Beside parameters set by name. A table without parameters is refused; one with some is differentiated in all."""
     sky = pj.parameters(dim_plane)["sky.radiance"]
 
     place = named.find(dim_plane, "sky.radiance")
@@ -742,7 +742,7 @@ def test_a_table_set_by_hand_has_its_derivative_too(dim_plane):
 
 
 def test_second_derivative_in_a_colour_is_that_of_the_series(furnace):
-    """1 + rho + rho^2, sample by sample."""
+    """The series is 1 + rho + rho^2, sample by sample."""
     scene = without_roulette(furnace, 3)
 
     def slope(rho):
@@ -835,12 +835,12 @@ def test_jacobian_is_the_same_on_every_number_of_devices(plane, ball_before_chec
     if kind == "colours":
         jax.tree.map(np.testing.assert_array_equal, one, all_of_them)
     else:
-        # XLA contracts other products in the two programs. Near grazing and critical angles float32 reflectances keep
-        # 2e-5, which differences divide by twice the step.
+        # XLA contracts other products in the two programs. Near grazing and critical angles float32 reflectances are
+        # accurate to 2e-5, which differences divide by twice the step.
         np.testing.assert_allclose(one[1][GLASS], all_of_them[1][GLASS], atol=2e-5 / 0.02)
 
 
-# ---- what is refused ------------------------------------------------------------------------------------------------
+# ---- errors ---------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -895,7 +895,7 @@ def test_derivatives_of_geometry_and_cameras_are_refused(plane, move, place, tra
 def test_ball_before_checkerboard_in_blocks(stage, derivatives, estimate):
     """64 x 64 pixels in blocks of 8 x 8, against differences of independent images.
 
-    Mean z^2 is 15 / 13, of variances from 16 seeds, but for its noise.
+    With variances from 16 seeds the expected mean of z^2 is 15 / 13.
     """
     scene, step = stage(ball="", screen=SCREEN, picture="checkerboard", res=64), 0.01
     _, slopes = derivatives(scene, [GLASS], 64, 16, step=step)
@@ -929,11 +929,11 @@ SCENES = sorted(path.stem for folder in ("scenes", "tests/scenes") for path in (
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SCENES)
 def test_colours_of_every_scene_against_differences(shipped, derivatives, agree, name):
-    """Every colour of every material and light: against central differences of plain images with the same seeds.
+    """Every colour of every material and light: against central differences of renders with the same seeds.
 
-    Without roulette, which depends on the colours. Images are polynomials of third order in a colour; they are linear
-    in a radiance or intensity, which takes a step of half its size: a light's power also changes how often it is
-    chosen, and of few such changes no variance could be told.
+    There is no roulette, since it depends on the colours. Images are third-order polynomials in a colour. They are
+    linear in a radiance or intensity, which takes a step of half its size: a light's power also changes how often it is
+    chosen, and a small step changes too few choices to give a variance.
     """
     scene = without_roulette(shipped(name, res=16), 4)
     textures = [n for n in pj.parameters(scene) if named.find(scene, n).is_texture]
@@ -947,7 +947,7 @@ def test_colours_of_every_scene_against_differences(shipped, derivatives, agree,
         middle = np.clip(value, low + h, high - h)
         slope = slopes[parameter]
         if not np.array_equal(middle, value):
-            # At a bound there is no room to both sides.
+            # At a bound there is no room on both sides.
             _, moved_slopes = derivatives(pj.with_parameters(scene, {parameter: middle}), names, spp, count)
             slope = moved_slopes[parameter]
 
@@ -957,12 +957,12 @@ def test_colours_of_every_scene_against_differences(shipped, derivatives, agree,
 
         difference = (images(parameter, middle + h) - images(parameter, middle - h)) / (2 * h)
         other = slope._replace(mean=difference.mean(0), variance=difference.var(0, ddof=1) / count)
-        # Rounding of images over twice the step, and the third order.
+        # Rounding of images over twice the step, and the third-order term.
         agree(slope, other, rounding=2e-3)
 
 
 def test_more_dielectrics_than_one_kernel_takes(make_scene, monkeypatch):
-    """Two balls, one before the other."""
+    """Two balls, one in front of the other."""
     balls = (
         shape("sphere", f'<scale value="0.7"/><translate x="{x}" z="{z}"/>', f'<bsdf type="dielectric" id="{name}"/>')
         for name, x, z in (("front", 0, 1), ("back", 0.5, -1))

@@ -1,4 +1,4 @@
-"""What float32 renders must survive, case by case."""
+"""Hard cases that float32 renders must survive."""
 
 import itertools
 from dataclasses import replace
@@ -43,7 +43,7 @@ def without_roulette(scene, max_depth=NO_LIMIT):
 
 
 def reflectance_of_glass(cos_i, eta):
-    """Fresnel's equations as textbooks have them, in float64; 1 under total internal reflection."""
+    """Fresnel's equations in textbook form, in float64; 1 under total internal reflection."""
     cos_i = np.asarray(cos_i, float)
     sin2_t = (1 - cos_i**2) / eta**2
     cos_t = np.sqrt(np.maximum(1 - sin2_t, 0))
@@ -57,7 +57,7 @@ def reflectance_of_glass(cos_i, eta):
 
 @pytest.fixture(scope="module")
 def still_life(make_scene):
-    """(scale, shift) -> a ball, a mesh with a tree and a cube on a floor under a lamp, so large and so far away."""
+    """(scale, shift) -> a ball, a mesh with a tree and a cube on a floor under a lamp, all scaled and then moved."""
 
     def make(scale, shift=0.0):
         place = f'<scale value="{scale!r}"/><translate x="{shift!r}" y="{-shift!r}" z="{shift!r}"/>'
@@ -89,7 +89,7 @@ def still_life_image(still_life, estimate):
 
 @pytest.mark.parametrize("power", [-10, 17])
 def test_scaled_by_a_power_of_2_the_image_is_the_same_to_the_bit(still_life, power):
-    """Such a scale rounds nothing, so any difference is a length that somebody wrote down."""
+    """Such a scale causes no rounding, so any difference comes from an absolute length in the code."""
     np.testing.assert_array_equal(pj.render(still_life(2.0**power), 8), pj.render(still_life(1.0), 8))
 
 
@@ -100,13 +100,13 @@ def test_scaled_by_any_number_the_image_is_the_same(still_life, still_life_image
 
 @pytest.mark.parametrize("scale", [1.0, 1e-3])
 def test_moved_by_1e4_of_its_size_the_image_is_the_same(still_life, still_life_image, estimate, agree, scale):
-    """Up to the ulp of its coordinates, 1e-3 of its size: 1 % of a pixel at silhouettes, more in contact shadows."""
+    """Up to the coordinates' ulp, 1e-3 of the scene's size: 1 % of a pixel at silhouettes, more in contact shadows."""
     moved = estimate(still_life(scale, shift=1e4 * scale), spp=32, first_seed=101)
     agree(moved, still_life_image, rounding=0.03)
 
 
 def test_walls_of_radius_1e5_stand_where_float64_has_them(shipped, x64):
-    """Distances of 40 to 200 to walls whose coordinates are 1e5, whose ulp is 0.008."""
+    """Distances of 40 to 200 to walls whose coordinates are about 1e5, with an ulp of 0.008."""
     rng = np.random.default_rng(0)
     origins = rng.uniform([5, 5, 5], [95, 75, 160], (4096, 3))
     directions = rng.normal(size=(4096, 3))
@@ -116,14 +116,14 @@ def test_walls_of_radius_1e5_stand_where_float64_has_them(shipped, x64):
         t, which = np.asarray(double.t), np.asarray(double.primitive)
     same = np.asarray(single.primitive) == which
     assert same.mean() > 0.998
-    # A ray at 3 degrees to a wall turns an error of 0.008 across it into one of 0.15 along the ray.
+    # At 3 degrees to a wall, an error of 0.008 across the wall becomes 0.15 along the ray.
     error = np.abs(single.t - t)[same]
     assert np.quantile(error, 0.9) < 0.02
     assert error.max() < 1
 
 
 def test_walls_of_radius_1e5_show_no_speckles(shipped, x64):
-    """Renders in float32 and float64 follow the same paths, so their difference is nearly free of noise."""
+    """float32 and float64 renders follow the same paths, so their difference is nearly free of noise."""
 
     def images(dtype):
         scene = shipped("nine_spheres", dtype, res=16)
@@ -135,22 +135,22 @@ def test_walls_of_radius_1e5_show_no_speckles(shipped, x64):
     difference, reference = (single - double).mean(0), double.mean(0)
     np.testing.assert_allclose(single.mean((0, 1, 2)), double.mean((0, 1, 2)), rtol=0.01)
     spread = (single - double).std(0, ddof=1) / np.sqrt(8)
-    # 768 numbers, 7 degrees of freedom: chance alone exceeds 12 standard errors once in 200 runs.
+    # 768 values with 7 degrees of freedom: by chance one exceeds 12 standard errors once in 200 runs.
     assert (np.abs(difference) < 12 * spread + 0.02 * reference + 1e-4).all()
 
 
 # ---- glass ----------------------------------------------------------------------------------------------------------
 
 TILTED = '<rotate x="0.8" y="0.6" angle="37"/>'
-# Out of sight; no two in one place, for surfaces that coincide have another structure.
+# Out of sight; no two share a place, since coincident surfaces give the scene another structure.
 AWAY = [f'<scale value="1e-3"/><translate x="{place}" y="1e4"/>' for place in range(5)]
 
 
 @pytest.fixture(scope="module")
 def glassware(make_scene):
-    """A ball, one in it, a slab and a plane, all of glass, a square lamp and a sky: one structure, so one kernel.
+    """A ball, a ball inside it, a slab and a plane of glass, a square lamp and a sky: one structure, so one kernel.
 
-    Each where its transform puts it, or out of sight; what is not told of gives no light.
+    Each shape is placed by its transform, or out of sight; lights are dark by default.
     """
 
     def make(ball=AWAY[0], core=AWAY[1], slab=AWAY[2], plane=AWAY[3], square=AWAY[4], sky=0, radiance=0, **camera):
@@ -177,7 +177,7 @@ SPLIT = {"fresnel": "schlick", "split_depth": 4}
 )
 def test_glass_in_uniform_light_is_invisible(glassware, body, how):
     scene = without_roulette(glassware(**{body: ""}, sky=1, origin="1.2, 1.5, 4"))
-    # Some 10 refractions by reciprocal factors, an ulp or two each.
+    # About 10 refractions by reciprocal factors, each off by an ulp or two.
     np.testing.assert_allclose(pj.render(scene, 16, **how), 1, rtol=1e-5)
 
 
@@ -189,7 +189,7 @@ def test_glass_under_roulette_stays_as_bright(glassware, estimate, agree):
 @pytest.mark.parametrize("tilt", ["", TILTED])
 @pytest.mark.parametrize("thickness", [0.1, 1e-4, 1e-7])
 def test_slab_of_glass_has_both_its_faces(glassware, estimate, agree, thickness, tilt):
-    """Between its faces light bounces to and fro: T = (1 - R) / (1 + R), which is 2 eta / (eta^2 + 1) head-on."""
+    """Light bounces between the faces: T = (1 - R) / (1 + R), which is 2 eta / (eta^2 + 1) at normal incidence."""
     slab, far = f'<scale x="1" y="1" z="{thickness / 2}"/>{tilt}', '<scale value="5"/><translate z="-6"/>'
     scene = without_roulette(glassware(slab=slab, square=far, radiance=1, fov=0.2))
     normal = scene.about.description.shapes[2].geometry.to_world[:3, 2]
@@ -206,12 +206,12 @@ def test_thin_slab_reflects_what_it_does_not_transmit(glassware, estimate, agree
 
 @pytest.fixture(scope="module")
 def water_level(glassware):
-    """A plane of glass, its normal up, in uniform light above and below."""
+    """A plane of glass with its normal up, in uniform light above and below."""
     return partial(glassware, plane='<scale value="1e4"/><rotate x="1" angle="-90"/>', sky=1)
 
 
 def cosines_in_pixels(scene, samples=64):
-    """(H, W, K) cosines against the y axis of rays through a grid of points in each pixel."""
+    """Return the cosines (H, W, K) to the y axis of rays through a grid of points in each pixel."""
     side = int(samples**0.5)
     height, width = scene.film.height, scene.film.width
     grid = (np.arange(side) + 0.5) / side
@@ -223,7 +223,7 @@ def cosines_in_pixels(scene, samples=64):
 
 
 def test_total_reflection_around_the_critical_angle(water_level, estimate, agree):
-    """Snell's window seen from under the surface, in light of 1 on both sides: L = R + eta^2 (1 - R)."""
+    """Snell's window seen from below the surface, with radiance 1 on both sides: L = R + eta^2 (1 - R)."""
     scene = water_level(origin="0, -1, 0", target="1, -0.1, 0", fov=60)
     cos, critical = cosines_in_pixels(scene), np.sqrt(1 - 1 / 1.5**2)
     expected = 1 + (1 - reflectance_of_glass(cos, 1 / 1.5)) * (1.5**2 - 1)
@@ -234,7 +234,7 @@ def test_total_reflection_around_the_critical_angle(water_level, estimate, agree
 
 
 def test_grazing_incidence_on_glass(water_level, estimate, agree):
-    """From 10 degrees down to 1e-4 of one above the horizon: R goes to 1."""
+    """From 10 degrees down to 1e-4 degrees above the horizon: R goes to 1."""
     scene = water_level(origin="0, 1e-2, 0", target="1, 0.0099, 0", fov=1)
     r = reflectance_of_glass(cosines_in_pixels(scene), 1.5)
     below_horizon = np.arange(16) >= 8
@@ -255,13 +255,13 @@ def test_rays_that_graze_glass_stay_finite(water_level, d_y):
 
 
 def test_ior_of_1_is_invisible(glassware):
-    """A ball of air before a bright square: the same image but for squares' edges, which rounding may move."""
+    """A ball of air before a bright square: the same image, except at the square's edges, which rounding may move."""
     square = '<rotate z="1" angle="20"/><translate z="-2"/>'
     scene, out_of_view = (glassware(ball=ball, square=square, radiance=1) for ball in ("", '<translate x="100"/>'))
     air = without_roulette(pj.with_parameters(scene, {"glass.int_ior": 1.0}))
     image, plain = pj.render(air, 16), pj.render(out_of_view, 16)
     assert np.isclose(image, plain, atol=1e-5).mean() > 0.99
-    assert not np.isclose(pj.render(scene, 16), plain, atol=1e-5).all()  # glass of 1.5 shows
+    assert not np.isclose(pj.render(scene, 16), plain, atol=1e-5).all()  # with an IOR of 1.5 it is visible
 
 
 def test_camera_inside_glass_sees_eta_squared(glassware):
@@ -270,7 +270,7 @@ def test_camera_inside_glass_sees_eta_squared(glassware):
 
 
 def test_light_caught_in_glass_is_dark_and_its_paths_end(glassware):
-    """Near the wall of a glass ball, rays along it are reflected totally for ever."""
+    """Near the wall of a glass ball, rays along the wall are totally reflected for ever."""
     scene = glassware(ball="", sky=1, origin="0, 0, 0.95", target="1, 0, 0.95", fov=10)
     assert not np.asarray(pj.render(without_roulette(scene, 1000), 4)).any()
     assert not np.asarray(pj.render(replace(scene, max_depth=jnp.int32(NO_LIMIT)), 4)).any()
@@ -278,10 +278,10 @@ def test_light_caught_in_glass_is_dark_and_its_paths_end(glassware):
 
 @pytest.mark.parametrize("origin, expected", [("0, 0, 0.01", 4.0), ("0, 0, 0.75", 1.5**2), ("0, 0, 4", 1.0)])
 def test_glass_in_glass_scales_radiance_both_ways(glassware, origin, expected):
-    """eta = 2 in 1.5 in 1. Rays that total reflection holds for ever would be dark: the views avoid them."""
+    """eta = 2 in 1.5 in 1. The views avoid rays caught by total reflection, which would be dark."""
     scene = glassware(ball="", core='<scale value="0.5"/>', sky=1, origin=origin, fov=10)
     image = np.asarray(pj.render(without_roulette(scene, 10_000), 16))
-    np.testing.assert_allclose(image, expected, rtol=3e-5)  # some 20 interfaces
+    np.testing.assert_allclose(image, expected, rtol=3e-5)  # about 20 interfaces
 
 
 # ---- reflectance and light at their limits --------------------------------------------------------------------------
@@ -298,7 +298,7 @@ def test_reflectance_1_counts_every_bounce_and_ends_at_max_depth(shipped):
 
 
 def test_reflectance_1_ends_by_roulette(shipped):
-    """Emission with no way out adds up without limit, yet every path ends."""
+    """Without escape the emission adds up without limit, yet every path ends."""
     scene = pj.with_parameters(shipped("furnace", res=16), {"wall.reflectance": 1.0})
     image = np.asarray(pj.render(replace(scene, max_depth=jnp.int32(NO_LIMIT)), 16))
     assert np.isfinite(image).all() and image.min() > 1
@@ -306,7 +306,7 @@ def test_reflectance_1_ends_by_roulette(shipped):
 
 @pytest.fixture(scope="module")
 def floor_and_lamps(make_scene):
-    """(transform of a square lamp, of a ball lamp) -> with a floor of albedo RHO, all under a sky of 1."""
+    """(transform of a square lamp, of a ball lamp) -> a floor of albedo RHO and the lamps under a sky of radiance 1."""
 
     def make(square, ball, **looks):
         floor = shape("rectangle", '<scale value="2"/><rotate x="1" angle="-90"/>', GREY)
@@ -327,19 +327,19 @@ def test_lamps_of_hardly_any_area_add_nothing(floor_and_lamps, size, strategy):
     image = np.asarray(pj.render(floor_and_lamps(tiny, ball), 64, strategy=strategy))
     assert np.isfinite(image).all()
     without = np.asarray(pj.render(floor_and_lamps(FAR, FAR), 64, strategy=strategy))
-    # By "light", other lights leave other numbers to the sky; the lamps themselves bring 1e-12 at most.
+    # With "light", other lights change the random numbers of the sky; the lamps themselves contribute at most 1e-12.
     tolerance = 1e-4 if strategy == "mis" else 0.05
     np.testing.assert_allclose(image.mean((0, 1)), without.mean((0, 1)), rtol=tolerance)
 
 
 @pytest.mark.parametrize("strategy", ["mis", "light"])
 def test_lamp_seen_edge_on_adds_nothing(floor_and_lamps, strategy):
-    """In the plane of the floor, beside it: all of the floor sees it edge-on."""
+    """The lamp lies in the plane of the floor, beside it, so every point of the floor sees it edge-on."""
     beside = '<rotate x="1" angle="-90"/><translate x="4"/>'
     image = np.asarray(pj.render(floor_and_lamps(beside, FAR), 64, strategy=strategy))
     without = np.asarray(pj.render(floor_and_lamps(FAR, FAR), 64, strategy=strategy))
     assert np.isfinite(image).all()
-    # By "light", other lights leave other numbers to the sky.
+    # With "light", other lights change the random numbers of the sky.
     np.testing.assert_allclose(image.mean((0, 1)), without.mean((0, 1)), rtol=1e-4 if strategy == "mis" else 0.05)
 
 
@@ -354,7 +354,7 @@ TOUCHING = {
 
 @pytest.mark.parametrize("case", TOUCHING)
 def test_lamps_that_touch_the_floor(floor_and_lamps, estimate, agree, case):
-    """Finite, and the same by both techniques. Light sampling alone has unbounded noise at the contact."""
+    """Images are finite, and both techniques agree. Light sampling alone has unbounded noise at the contact."""
     scene = floor_and_lamps(*TOUCHING[case])
     agree(estimate(scene, spp=64), estimate(scene, spp=128, strategy="bsdf", first_seed=101))
     assert np.isfinite(np.asarray(pj.render(scene, 64, strategy="light"))).all()
@@ -377,7 +377,7 @@ EXTREMES = (0.0, 1 - 2**-24)
     ],
 )
 def test_random_numbers_at_their_ends_give_finite_light(shipped, name, strategy):
-    """All combinations of 0 and 1 - 2^-24 for what a vertex draws, from many points of the film."""
+    """All combinations of 0 and 1 - 2^-24 for the random numbers of a vertex, from many points of the film."""
     scene = shipped(name, res=16)
     choice = emitters.choice(scene.emitters, strategy)
     draws = np.array(list(itertools.product(EXTREMES, repeat=6)), np.float32)
@@ -417,7 +417,7 @@ def test_film_samples_at_the_ends_of_random_numbers_are_finite(shipped):
 
 @pytest.mark.parametrize("spp", [1 << 17, pytest.param(10**6, marks=pytest.mark.slow)])
 def test_a_million_samples_keep_their_digits(shipped, spp):
-    """By bsdf sampling every sample of a furnace is exact: what is off is the sum. A plain one loses 1e-4 or 1e-3."""
+    """With bsdf sampling every furnace sample is exact, so only the sum can err. A plain sum loses 1e-4 to 1e-3."""
     scene = shipped("furnace", res=16, max_depth=3)
     image = render_pixels(scene, jnp.arange(4, dtype=jnp.int32), 0, spp, 1, Options("bsdf"))
     expected = (1 - RHO**3) / (1 - RHO)
@@ -426,7 +426,7 @@ def test_a_million_samples_keep_their_digits(shipped, spp):
 
 @pytest.mark.slow
 def test_a_million_noisy_samples_have_the_right_mean(shipped):
-    """To 1e-5, and four standard errors of 32 pixels, which are about as much."""
+    """The tolerance is 1e-5 plus four standard errors of 32 pixels, which are about as large."""
     scene = shipped("furnace", res=16, max_depth=3)
     pixels = np.asarray(render_pixels(scene, jnp.arange(32, dtype=jnp.int32), 0, 10**6, 1), float)
     expected, error = (1 - RHO**3) / (1 - RHO), pixels.std(0, ddof=1) / 32**0.5
@@ -436,7 +436,7 @@ def test_a_million_noisy_samples_have_the_right_mean(shipped):
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 def test_one_bad_number_spoils_no_other_pixel(make_scene, value):
-    """Two lamps beside each other, one of them broken."""
+    """Two lamps side by side, one of them broken."""
     left, right = (shape("sphere", f'<translate x="{x}"/>', lamp(2)) for x in (-1.2, 1.2))
     scene = make_scene(left + right, depth=1, fov=60)
     (lights,) = scene.emitters

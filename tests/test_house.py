@@ -1,4 +1,4 @@
-"""The house: rooms import in one direction, and nobody outside a room asks which kind of thing something is."""
+"""The house: rooms import in one direction, and no module outside a room asks for the kind of an object."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 PACKAGE = Path(__file__).parents[1] / "pathjax"
-# From what knows nothing of the others to what knows all; a room may import from those before it.
+# From the room that depends on no other to those that depend on all; a room may import from those before it.
 ROOMS = (
     "version",
     "errors",
@@ -48,12 +48,12 @@ MODULES = {module(path): ast.parse(path.read_text(encoding="utf-8")) for path in
 
 
 def room(name: str) -> str:
-    """Empty for the package itself, which all may not import."""
+    """Return a module's room; empty for the package itself, which rooms may not import."""
     return name.split(".")[1] if "." in name else ""
 
 
 def imports(tree: ast.AST, late: bool):
-    """Modules of the package that a module names, those in functions too where `late`."""
+    """Return the pathjax modules that a module imports, those imported in functions too if `late`."""
 
     def visit(node):
         if isinstance(node, ast.Import):
@@ -79,7 +79,7 @@ def test_rooms_import_from_those_before_them_alone():
         for imported in imports(tree, late=True):
             there = room(imported)
             if imported == "pathjax" and here in ("bench", "cli"):
-                continue  # they call the public names, as a user does
+                continue  # like a user, they call the public names
             if not there or ROOMS.index(there) > ROOMS.index(here):
                 wrong.append(f"{name} imports {imported}")
     assert not wrong
@@ -113,12 +113,12 @@ def classes_of(*rooms: str) -> set[str]:
     return {node.name for tree in trees for node in ast.walk(tree) if isinstance(node, ast.ClassDef)}
 
 
-# Records of a scene file are of kinds as their tables are. These are of no kind: there is one of each.
+# Records of scene files belong to kinds, as their tables do. The names subtracted here belong to no kind.
 KINDS = classes_of(*ROOMS_OF_KINDS, "description") - {
     *("Element", "Document", "Fields", "Parameter", "Description", "Transform")
 }
 
-# Fields by which a parameter is named, and would be known for what it is.
+# Fields of bsdfs and emitters. To compare a parameter's name with one of them is to ask for its kind.
 FIELDS = {
     node.target.id
     for name, tree in MODULES.items()
@@ -129,7 +129,7 @@ FIELDS = {
 
 
 def names_in(node: ast.AST) -> set[str]:
-    """Of `Kind`, `room.Kind`, `A | B` and `(A, B)`."""
+    """Return the names in `Kind`, `room.Kind`, `A | B` and `(A, B)`."""
     names = (n for n in ast.walk(node) if isinstance(n, ast.Name | ast.Attribute))
     return {n.id if isinstance(n, ast.Name) else n.attr for n in names}
 
@@ -139,7 +139,7 @@ def is_call(node: ast.AST, *functions: str) -> bool:
 
 
 def questions(tree: ast.AST, kinds: set[str], fields: set[str]):
-    """What asks whether something is of one of the kinds, or a string whether it names one of the fields."""
+    """Yield the code that tests an object for one of the kinds, or a string for one of the fields."""
     for node in ast.walk(tree):
         asked, texts = set(), []
         if is_call(node, "isinstance", "issubclass"):
@@ -196,7 +196,7 @@ PRIVATE = ("core", "extend", "_src", "interpreters", "custom_derivatives.Symboli
 
 
 def names_of_jax(tree: ast.AST):
-    """Dotted names that a module imports from JAX or reads of it: "core.Tracer"."""
+    """Yield the dotted names that a module imports from JAX or reads from it: "core.Tracer"."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             yield from (alias.name.removeprefix("jax.") for alias in node.names)
@@ -218,7 +218,7 @@ def test_one_module_uses_what_is_not_public_in_jax():
 
 
 def test_dataclasses_become_pytrees_in_one_way():
-    """JAX's own has structures of different classes be equal, and whoever uses it may get the kernel of another."""
+    """With JAX's own registration, structures of different classes are equal, so one class may get another's kernel."""
     assert not [name for name, tree in MODULES.items() if "tree_util.register_dataclass" in names_of_jax(tree)]
 
 

@@ -1,4 +1,4 @@
-"""The checks of `pathjax.testing`: kinds of the package pass, and faults are found. (Of bsdfs: tests/bsdfs.)"""
+"""`pathjax.testing`: kinds of the package pass its checks, and faults are found. (For bsdfs: tests/bsdfs.)"""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def test_emitters_of_the_package_pass(kind, values):
 
 
 class Brighter(Checkerboard):
-    """Twice as bright as it says."""
+    """Twice as bright as its `span` says."""
 
     @staticmethod
     def look_up(p, uv, surface):
@@ -74,7 +74,7 @@ def test_a_fault_of_a_texture_is_found_and_named(kind, complaint):
 
 
 class Uneven(Constant):
-    """Draws the upper half alone, and says that it draws everywhere."""
+    """Samples the upper half only, but claims to sample all directions."""
 
     @staticmethod
     def sample(p, u, u_part):
@@ -83,7 +83,7 @@ class Uneven(Constant):
 
 
 class HalfSeen(emitters.Background):
-    """Shines from everywhere, and never draws the lower half."""
+    """Emits in all directions, but never samples the lower half."""
 
     radiance = Color(1.0, textured=False, radiance=True)
     power, emitted = Constant.power, Constant.emitted
@@ -98,7 +98,7 @@ class HalfSeen(emitters.Background):
 
 
 class Negative(Area):
-    """Swallows light on one side."""
+    """Emits negative radiance on one side."""
 
     @staticmethod
     def emitted(p, d):

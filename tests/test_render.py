@@ -1,4 +1,4 @@
-"""Images of whole scenes against closed forms, and against each other where only the way to them differs."""
+"""Images of whole scenes against closed forms, and against each other where only the computation differs."""
 
 from dataclasses import replace
 from functools import partial
@@ -45,7 +45,7 @@ def test_furnace_is_the_truncated_geometric_series(shipped, estimate, agree, kin
 
 
 def test_furnace_by_bsdf_sampling_has_no_noise(shipped):
-    """Every path meets Le = 1 at every vertex: only rounding is left."""
+    """Every path meets Le = 1 at every vertex, so only rounding is left."""
     scene = shipped("furnace", res=16)
     for depth in (1, 2, 3, 8):
         image = pj.render(with_depth(scene, depth, NO_LIMIT), 4, strategy="bsdf")
@@ -66,7 +66,7 @@ def test_mirror_ball_in_uniform_light_shows_its_reflectance(make_scene):
 # ---- direct and indirect light --------------------------------------------------------------------------------------
 
 
-# A plate at the origin that looks up, and a light of each kind around it.
+# A plate at the origin that faces up, and a light of each kind around it.
 LIGHTS = {
     "disk": '<transform name="to_world"><scale value="0.5"/><lookat origin="0, 2, 0" target="0, 0, 0" up="1, 0, 0"/>'
     "</transform>",
@@ -78,7 +78,7 @@ LIGHTS = {
 }
 
 
-# Out of sight; no two in one place, for surfaces that coincide have another structure.
+# Out of sight; no two share a place, since coincident surfaces give the scene another structure.
 AWAY = {
     kind: f'<transform name="to_world"><scale value="1e-3"/><translate x="{place}" y="1e4"/></transform>'
     for place, kind in enumerate(["plate", *LIGHTS])
@@ -88,9 +88,9 @@ AWAY["obj"] += OCTAHEDRON
 
 @pytest.fixture(scope="module")
 def plate_and_lamps(make_scene):
-    """A plate, a lamp of each kind, what stands in them, and a sky: one structure, so one kernel for many tests.
+    """A plate, a lamp of each kind and a sky: one structure, so one kernel for many tests.
 
-    Those that are not told of are dark and out of sight.
+    Lamps that a test does not place are dark and out of sight.
     """
 
     def make(plate=AWAY["plate"], sky=0, **camera_and_lamps):
@@ -108,14 +108,14 @@ def plate_and_lamps(make_scene):
 
 @pytest.fixture(scope="module")
 def lit_plate(plate_and_lamps):
-    """All lights at once, the sky too; `parameters` turn them off."""
+    """All lights at once, with the sky; tests turn them off by `with_parameters`."""
     upwards = '<transform name="to_world"><scale value="3"/><rotate x="1" angle="-90"/></transform>'
     lamps = {kind: (inside, GREY, "2, 3, 4") for kind, inside in LIGHTS.items()}
     return plate_and_lamps(upwards, 1, **lamps, origin="0.5, 1.2, -2", fov=25)
 
 
 def at_the_origin(scene):
-    """The scene seen through so long a lens that only the origin is in view."""
+    """Return the scene seen through so long a lens that only the origin is in view."""
     from dataclasses import replace
 
     camera = scene.camera
@@ -123,7 +123,7 @@ def at_the_origin(scene):
 
 
 def lambert(polygon):
-    """Irradiance at the origin, normal y, under a polygon of radiance 1 that is all above the horizon (Lambert)."""
+    """Return the irradiance at the origin, normal y, from a polygon of radiance 1 above the horizon (Lambert)."""
     v = polygon / np.linalg.norm(polygon, axis=-1, keepdims=True)
     w = np.roll(v, -1, axis=0)
     angle = np.arccos((v * w).sum(-1))
@@ -132,7 +132,7 @@ def lambert(polygon):
 
 
 def irradiance(scene, kind):
-    """Closed form of the irradiance of one light of radiance 1 at the origin."""
+    """Return the closed form of the irradiance at the origin from one light of radiance 1."""
     if kind == "sphere":
         return np.pi * 0.6**2 / 8 * np.sqrt(0.5)
     if kind == "disk":
@@ -158,9 +158,9 @@ def test_direct_light_is_the_form_factor(lit_plate, estimate, agree, kind, strat
 
 @pytest.mark.parametrize("strategy", ["mis", "light", "bsdf"])
 def test_spherical_cavity_with_uneven_emission_is_lit_evenly(plate_and_lamps, estimate, agree, strategy):
-    """A disk spans a cap of the unit sphere and emits like it; all other wall points see the cap alike.
+    """A disk spans a cap of the unit sphere and emits as the cap would; all other wall points see the cap alike.
 
-    With f the cap's share of the sphere: E = pi Le f / (1 - rho (1 - f)), cut off after max_depth.
+    With f the cap's share of the sphere: E = pi Le f / (1 - rho (1 - f)), truncated at max_depth.
     """
     alpha, depth = 0.7, 5
     f = (1 - np.cos(alpha)) / 2
@@ -190,7 +190,7 @@ def test_convex_diffuse_object_under_uniform_light_reflects_its_albedo(plate_and
 def test_one_triangle_covers_half_of_a_square(plate_and_lamps, write_scene, agree, estimate):
     """The triangle (-1,-1) (1,-1) (-1,1) fills the view up to its hypotenuse, a diagonal of the image.
 
-    The others of its mesh, which has as many as an octahedron, are far away.
+    The mesh has as many triangles as an octahedron; the others are far away.
     """
     file = write_scene("").with_name("one.obj")
     corners = "v -1 -1 0\nv 1 -1 0\nv -1 1 0\nv 0 0 1e4\nv 1 0 1e4\nv 0 1 1e4\n"
@@ -199,7 +199,7 @@ def test_one_triangle_covers_half_of_a_square(plate_and_lamps, write_scene, agre
     scene = plate_and_lamps(obj=(triangle, GREY, 1), origin="0, 0, 1", fov=90, depth=1)
     y, x = np.mgrid[:16, :16]
     covered = np.where(x < y, 1.0, np.where(x == y, 0.5, 0.0))
-    # The diagonal passes pixel corners to some ulps.
+    # The diagonal misses the pixel corners by a few ulps.
     agree(estimate(scene, spp=64), covered[..., None], rounding=1e-4)
 
 
@@ -209,7 +209,7 @@ def test_roulette_changes_noise_only(lit_plate, estimate, agree):
 
 
 def test_image_is_linear_in_emission(lit_plate):
-    """A power of 2 scales every number on the way exactly."""
+    """A power of 2 scales every intermediate value exactly."""
     names = [name for name in pj.parameters(lit_plate) if name.endswith("radiance")]
     brighter = pj.with_parameters(lit_plate, {name: 4 * pj.parameters(lit_plate)[name] for name in names})
     np.testing.assert_array_equal(pj.render(brighter, 4), 4 * pj.render(lit_plate, 4))
@@ -220,7 +220,7 @@ def test_depth_1_is_emission_alone(shipped):
     np.testing.assert_array_equal(pj.render(with_depth(scene, 1), 4), np.broadcast_to([3, 2, 1], (16, 16, 3)))
 
 
-# ---- the same image by other ways -----------------------------------------------------------------------------------
+# ---- the same image, computed differently ---------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -243,8 +243,8 @@ def test_one_device_and_two_give_the_same_bits(cornell):
 
 
 def test_vectorised_form_gives_the_same_image(cornell):
-    """Up to rounding: code vectorised over lanes is contracted to multiply-adds in other places. Where rounding tips a
-    decision (a grazing hit, roulette) a path goes another way, so a few pixels may differ at all."""
+    """Up to rounding: vectorised code is contracted to multiply-adds in other places. Where rounding tips a decision
+    (a grazing hit, roulette) a path takes another course, so a few pixels may differ completely."""
     pixels = jnp.arange(pixel_count(cornell), dtype=jnp.int32)
     loop, lanes = (render_pixels(cornell, pixels, 0, 4, 3, form=form, devices=1) for form in ("loop", "vmap"))
     far = ~np.isclose(loop, lanes, rtol=1e-4, atol=1e-5).all(-1)
@@ -252,7 +252,7 @@ def test_vectorised_form_gives_the_same_image(cornell):
 
 
 def test_two_halves_of_the_samples_average_to_the_whole(cornell):
-    """Same sequence, added in another order: rounding only."""
+    """The same samples, added in another order: only rounding differs."""
     pixels = jnp.arange(pixel_count(cornell), dtype=jnp.int32)
     part = partial(render_pixels, cornell, pixels)
     halves = (3 * part(0, 12, 5) + part(12, 4, 5)) / 4
@@ -262,12 +262,12 @@ def test_two_halves_of_the_samples_average_to_the_whole(cornell):
 def test_chosen_pixels_are_those_of_the_whole_image(cornell):
     pixels = jnp.asarray([3, 203, 117, 117], jnp.int32)
     chosen = render_pixels(cornell, pixels, 0, 4, 5)
-    # Another number of pixels is another kernel, which may round differently.
+    # Another pixel count is another kernel, which may round differently.
     np.testing.assert_allclose(chosen, pj.render(cornell, 4, 5).reshape(-1, 3)[pixels], rtol=1e-5)
 
 
 def test_samples_and_seeds_that_differ_from_pixel_to_pixel(cornell):
-    """One call for all is as many calls of the same kernel."""
+    """One call with arrays of samples and seeds equals separate calls of the same kernel."""
     pixels = jnp.asarray([3, 203, 117, 117], jnp.int32)
     first, spp, seed = np.array([0, 5, 7, 7]), np.array([4, 1, 16, 16]), np.array([2, 2, 9, 2**32 - 1], np.uint32)
     together = render_pixels(cornell, pixels, first, spp, seed)
@@ -277,7 +277,7 @@ def test_samples_and_seeds_that_differ_from_pixel_to_pixel(cornell):
 
 
 def test_float64_agrees_with_float32_path_by_path(cornell, kernel_of, x64):
-    """Both draw the same numbers, so all but the paths that rounding tips are the same."""
+    """Both use the same random numbers, so all paths agree except those that rounding tips."""
     single = np.asarray(pj.render(cornell, 4, seed=2))
     with x64():
         double = kernel_of("cornell_box", jnp.float64).image(4, seed=2)
@@ -310,7 +310,7 @@ def test_scene_of_nothing_at_all_is_black(make_scene):
 
 
 def test_hidden_emitters_light_the_scene_and_let_the_camera_through(make_scene, estimate, agree):
-    """A lamp of 5 between camera and plate fills a share f of the sky of 1 over the point in view: not seen, felt."""
+    """A hidden lamp of 5 between camera and plate covers a share f of the sky of 1, seen from the point in view."""
     plate = shape("rectangle", GREY)
     lamp = shape(
         "rectangle",

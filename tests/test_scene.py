@@ -1,4 +1,4 @@
-"""Parameters by name: what they are called, what they reach, what they refuse."""
+"""Parameters by name: their names, the values they set, and the errors."""
 
 import re
 import warnings
@@ -89,7 +89,7 @@ def values(scene):
 def test_parameters_have_the_names_shapes_and_values_of_the_file(zoo):
     found = values(zoo)
     unnamed = {"lamp.reflectance", *(name for name in found if re.match(r"bsdf\d+\.reflectance$", name))}
-    assert found.keys() - unnamed == VALUES.keys()  # lights without a bsdf reflect nothing, and that can be changed
+    assert found.keys() - unnamed == VALUES.keys()  # lights without a bsdf have reflectance 0, which can be changed
     for name, expected in VALUES.items():
         assert found[name].shape == np.shape(expected)
         np.testing.assert_allclose(found[name], expected, rtol=1e-6)
@@ -104,7 +104,7 @@ def test_every_parameter_reaches_one_entry_and_no_other(zoo):
 
 
 def textured(*sizes):
-    """A scene of a rectangle for each texture, of so many texels along a side."""
+    """Return a scene with a rectangle for each texture, with the given sizes in texels along a side."""
     rng = np.random.default_rng(0)
     images = {
         f"b{k}": {"type": "bitmap", "data": rng.random((n, n, 3)).astype(np.float32), "raw": True}
@@ -131,7 +131,7 @@ def test_textures_that_are_set_together_are_those_set_one_after_another(names):
 
 
 def test_what_textures_replace_is_not_read():
-    """They may be most of a scene, and what a jitted function reads of a scene is copied to each device."""
+    """Textures may be most of a scene, and whatever a jitted function reads of a scene is copied to each device."""
     scene = textured(2, 3)
     path = scene.described.parameters["b0.reflectance"].path
 
@@ -196,7 +196,7 @@ def test_every_shipped_scene_round_trips_its_parameters(root):
             np.testing.assert_array_equal(a, b)
 
 
-# ---- what is refused ------------------------------------------------------------------------------------------------
+# ---- errors ---------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -214,7 +214,7 @@ def test_unknown_names_get_near_ones(zoo, name, offers):
 
 
 def test_trees_of_all_kinds_are_kept(make_scene):
-    """Of cubes too, which a table of rectangles holds, beside the table of disks."""
+    """A cube's tree too, although a table of rectangles holds the cubes, beside the table of disks."""
     place = '<transform name="to_world"><scale value="0.1"/><translate x="{}"/></transform>'
     cubes = "".join(f'<shape type="cube">{place.format(i)}</shape>' for i in range(40))
     assert list(make_scene(cubes + '<shape type="disk"/>').about.trees) == ["cube"]
@@ -271,7 +271,7 @@ def test_traced_values_of_the_wrong_shape_are_refused(zoo):
 
 
 def test_a_scene_may_pass_through_transformations(zoo):
-    """A Scene is a pytree: its names survive `jit`, and `jax.tree.map` keeps them."""
+    """A Scene is a pytree: its names survive `jit` and `jax.tree.map`."""
     again = jax.jit(lambda scene: scene)(zoo)
     assert values(again).keys() == values(zoo).keys()
     doubled = jax.tree.map(lambda x: x * 2, zoo)
@@ -286,7 +286,7 @@ def test_derivative_passes_through_with_parameters(zoo):
 
 
 def test_scenes_of_other_known_values_have_the_structure_of_the_first(zoo):
-    """So that they can be stacked, and share kernels; traced values are kept by name beside the tables."""
+    """So they can be stacked and share kernels. Traced values are kept by name beside the tables."""
     changed = pj.with_parameters(zoo, {"glass.int_ior": 1.7, "paint.reflectance": 0.1})
     assert jax.tree.structure(changed) == jax.tree.structure(zoo)
 

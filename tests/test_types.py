@@ -1,4 +1,4 @@
-"""What users' type checkers know of pathjax, which `mypy` checks of this file, is what is returned when it runs."""
+"""Public types, which `mypy` checks in this file, are the types returned at run time."""
 
 from __future__ import annotations
 
