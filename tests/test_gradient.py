@@ -288,7 +288,7 @@ def test_second_derivatives_of_some_colours(shipped):
     slope = jax.grad(brightness)
     change = {name: jnp.full(3, 0.5) for name in names[:2]} | {"sky.radiance": jnp.zeros(3)}
     curved = jax.jvp(slope, (values,), (change,))[1]
-    assert jacobian.takes_sweep(scene, [scene.about.parameters[name] for name in names], DEFAULTS)
+    assert jacobian.takes_sweep(scene, [scene.about.parameters[name] for name in names])
     up, down = (slope(jax.tree.map(lambda x, dx, h=h: x + h * dx, values, change)) for h in (0.1, -0.1))
     assert curved["sky.radiance"].min() > 10
     for name in names:

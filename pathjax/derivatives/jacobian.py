@@ -21,7 +21,7 @@ from jaxtyping import Array, Float, Int
 
 from pathjax import emitters
 from pathjax.bsdfs import dielectric
-from pathjax.compile import is_symbolic_zero, is_traced, native, on_all_devices, register_dataclass, standard_promotion
+from pathjax.compile import is_symbolic_zero, is_traced, on_all_devices, register_dataclass, standard_promotion
 from pathjax.core.types import Number
 from pathjax.derivatives import backward, differentiated, ior, ior_difference, ior_step, rules, tangents, totals
 from pathjax.derivatives.kept import kept as kept_of
@@ -180,7 +180,7 @@ def pixel_jacobians(
     steps = ior_step.steps(scene, glass, step)
     numbers = pixel.numbers(pixels, first_sample, spp, seed)
     ring = ring or backward.longest_ring(scene)
-    if not rows and ring <= backward.MOST_RING and takes_sweep(scene, wanted.values(), options, **how):
+    if not rows and ring <= backward.MOST_RING and takes_sweep(scene, wanted.values(), how.get("form")):
         return *_swept(wanted, options, ring, how, scene, pixels, *numbers), {}, {}
     tangents.refuse_textures(wanted, UNLESS)
     held = tangents.places(wanted[name] for name in colors)
@@ -215,14 +215,10 @@ def _of_glass(by_ior, bias, steps, place, scale):
     return by_ior[:, place] * scale, bias[:, place] * scale, steps[place]
 
 
-def takes_sweep(scene: Scene, parameters, options: Options, form: str | None = None, devices: int | None = None):
-    """Return whether a recorded sweep makes all derivatives: in textures, or in more parameters than tangents are for.
-
-    A sweep needs native kernels.
-    """
-    lanes = form == "lanes" or (form is None and native())
+def takes_sweep(scene: Scene, parameters, form: str | None = None) -> bool:
+    """Return whether a recorded sweep makes all derivatives: in textures, or in too many parameters for tangents."""
     few = len(parameters) <= MOST_TANGENTS and not any(parameter.is_texture for parameter in parameters)
-    return lanes and not few and has_rows(scene, parameters)
+    return form != "loop" and not few and has_rows(scene, parameters)
 
 
 def has_rows(scene: Scene, parameters) -> bool:
@@ -234,13 +230,10 @@ def has_rows(scene: Scene, parameters) -> bool:
 
 @partial(jax.custom_jvp, nondiff_argnums=(0, 1, 2, 3))
 def _swept(wanted, options, ring, how, scene, pixels, *numbers):
-    """Return means and, by name, derivatives. how: `form` and `devices`; lanes are the only form."""
+    """Return means and, by name, derivatives. how: `form` and `devices`."""
     kept = kept_of(scene, wanted.values())
     options = replace(options, derivative=True, by_vertex=True)
-    image, rows = backward.rows(
-        scene, pixels, *numbers, kept=kept, options=options, ring=ring, devices=how.get("devices")
-    )
-
+    image, rows = backward.rows(scene, pixels, *numbers, kept=kept, options=options, ring=ring, **how)
     places = tuple((name, Place.of(scene, kept.of(scene, each), each)) for name, each in wanted.items())
     return image, RowSlopes(rows, places, (len(image),))
 

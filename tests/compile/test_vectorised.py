@@ -50,10 +50,7 @@ results = {"image": image, "J": J.derivatives}
 """
 EVERYTHING = """
 from pathjax import transport
-from pathjax.derivatives import backward
-from pathjax.derivatives.kept import kept
-from pathjax.integrators import pixel, reference
-from pathjax.integrators.options import Options
+from pathjax.integrators import reference
 from pathjax.scene import parameters as named
 
 box = load("scenes/cornell_box", res=8)
@@ -71,19 +68,15 @@ normal = pj.normal_equations(box, list(colors), 1.1 * image, spp=4)
 operator = transport.operator(box, 60, rays=8)
 by_rays = transport.operator(box, 60, method="rays", rays=64)
 view = transport.image(box, operator.radiosity(operator.solve().L), spp=2)
-plain = named.nameless(named.attached(box))
-numbers = pixel.numbers(jnp.arange(64), 0, 4, 1)
-wanted = [named.find(box, name) for name in colors]
-choice = dict(kept=kept(plain, wanted), ring=backward.longest_ring(plain))
-means, rows = backward.rows(plain, jnp.arange(64), *numbers, options=Options(derivative=True, by_vertex=True), **choice)
 wide = load("tests/scenes/shapes_and_filters", res=8)
 textured = load("tests/scenes/textures", res=8)
 texture = next(name for name, x in pj.parameters(textured).items() if np.ndim(x) == 3)
 texels = pj.parameters(textured)[texture]
+rows = pj.jacobian(textured, [texture], 4, 1)[1][texture]
 seen, pull = jax.vjp(lambda v: pj.render(pj.with_parameters(textured, {texture: v}), 4, 1), texels)
 results |= {
     "image": image, "J v": push, "normal": (normal.matrix, normal.gradient), "solution": operator.solve().L,
-    "view": view, "by rays": by_rays.solve().L, "rows": (means, rows),
+    "view": view, "by rays": by_rays.solve().L, "J in texels": rows,
     "samples": reference.samples(named.nameless(box), 2, 1),
     "shared samples": pj.render(wide, 4, 1), "J^T v": pull(seen),
 }

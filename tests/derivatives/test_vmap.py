@@ -24,7 +24,8 @@ def image(scene, names, **how):
 
 def jacobian(scene, names, **how):
     scene, wanted = attached(scene, names)
-    return pixel_jacobians(scene, wanted, pixels_of(scene), 0, SPP, SEED, Options(), **how)
+    image, slopes, *others = pixel_jacobians(scene, wanted, pixels_of(scene), 0, SPP, SEED, Options(), **how)
+    return image, [slopes[name] for name in names], others
 
 
 def forwards(scene, names, **how):
@@ -73,6 +74,8 @@ COLORS = ["white.reflectance", "light.radiance"]
         (image, "mesh", []),
         (image, "media", []),
         (jacobian, "cornell_box", COLORS),
+        (jacobian, "cornell_box", [*COLORS, "red.reflectance"]),
+        (jacobian, "textures", ["plain.reflectance"]),
         (jacobian, "glass_ball", ["glass.int_ior"]),
         (forwards, "cornell_box", COLORS),
         (backwards, "cornell_box", COLORS),
