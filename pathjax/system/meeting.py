@@ -47,20 +47,22 @@ def meet(
     own = {"process": process, "host": socket.gethostname(), "facts": facts}
     if process:
         return {0: _call(host, int(port), address, own, seconds)}
-    return _welcome(int(port), address, own, seconds)
+    return _welcome(host, int(port), address, own, seconds)
 
 
-def _welcome(port: int, address: str, own: dict, seconds: float) -> dict[int, socket.socket]:
+def _welcome(host: str, port: int, address: str, own: dict, seconds: float) -> dict[int, socket.socket]:
     """Accept connections from all other processes, and tell them the problem if they cannot work together."""
     try:
         dual = socket.has_dualstack_ipv6()
         family = socket.AF_INET6 if dual else socket.AF_INET
         server = socket.create_server(("", port), family=family, dualstack_ipv6=dual, backlog=512)
     except OSError as error:
-        raise InputError(
-            f"process 0 cannot be found at {address}: {error.strerror}; if no other process has the number 0 too, stop "
-            "what uses the port, or name another"
-        ) from None
+        problem = ""
+        with suppress(OSError, ValueError), socket.create_connection((host, port), timeout=_SLOWEST) as call:
+            _tell(call, own)  # another one with the number 0 tells all of it
+            problem = json.loads(_line(call)) == _SEEN and json.loads(_line(call))
+        unusable = f"process 0 cannot be found at {address}: {error.strerror}"
+        raise InputError(problem or f"{unusable}; stop what uses the port, or name another") from None
     with server, selectors.DefaultSelector() as selector, ExitStack() as opened:
         selector.register(server, selectors.EVENT_READ, 0)
         came, calls, problem = {0: own}, [], ""
