@@ -56,6 +56,9 @@ def _join(options) -> None:
     elif given["process"] >= given["processes"]:
         raise InputError(f"--process {given['process']} of {given['processes']}: they are counted from 0")
     distributed.start(**given)
+    from pathjax.scene.alike import fingerprint  # as late as what the command imports
+
+    distributed.same({"command": fingerprint(options.command)})
 
 
 @contextlib.contextmanager

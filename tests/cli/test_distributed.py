@@ -35,7 +35,8 @@ def test_wrong_numbers_are_refused(refused, tmp_path, arguments, says):
 def together(root, environment, tmp_path):
     """(processes, *arguments) -> running processes of one command.
 
-    devices: the device count of each, or a tuple of counts; each: further arguments, with the process index for {}.
+    devices, command: the device count and the command of each, or a tuple of them.
+    each: further arguments, with the process index for {}.
     """
     running = []
 
@@ -43,13 +44,14 @@ def together(root, environment, tmp_path):
         with socket.socket() as free:
             free.bind(("127.0.0.1", 0))
             address = f"127.0.0.1:{free.getsockname()[1]}"
-        devices = devices if isinstance(devices, tuple) else (devices,) * processes
+        devices, commands = (x if isinstance(x, tuple) else (x,) * processes for x in (devices, command))
         own = environment | {"PATHJAX_CACHE": "1", "XDG_CACHE_HOME": str(tmp_path / "cache")}
-        command = [sys.executable, "-m", "pathjax", command, *map(str, arguments)]
         numbers = ["--coordinator", address, "--processes", str(processes), "--process"]
         started = [
             subprocess.Popen(
-                command + [word.format(i) for word in each] + [*numbers, str(i)] * (processes > 1),
+                [sys.executable, "-m", "pathjax", commands[i], *map(str, arguments)]
+                + [word.format(i) for word in each]
+                + [*numbers, str(i)] * (processes > 1),
                 env=own | {"JAX_NUM_CPU_DEVICES": str(devices[i])},
                 **{"cwd": root, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True},
             )
@@ -124,6 +126,13 @@ def test_scenes_that_differ_are_refused(together, tmp_path):
         _, err = process.communicate(timeout=60)
         assert process.returncode == 2
         assert "another scene than process" in err
+
+
+@pytest.mark.slow
+def test_commands_that_differ_are_refused(together, tmp_path):
+    for process in together(2, SCENE, "--spp", 4, "-o", tmp_path / "a.exr", command=("render", "bench")):
+        _, err = process.communicate(timeout=60)
+        assert process.returncode == 2 and "another command than process" in err
 
 
 @pytest.mark.slow
