@@ -161,10 +161,11 @@ def _key(function, arguments, static) -> str:
 
 
 @functools.cache
-def _sources() -> list[tuple]:
-    """Return path, time and size of each source file, as Python checks whether a compiled module is up to date."""
+def _sources() -> str:
+    """Return a hash of the path, time and size of each source file, by which Python knows compiled modules, too."""
     files = sorted(Path(__file__).parents[1].rglob("*.py"))
-    return [(str(file), file.stat().st_mtime_ns, file.stat().st_size) for file in files]
+    told = [(str(file), file.stat().st_mtime_ns, file.stat().st_size) for file in files]
+    return hashlib.sha256(repr(told).encode()).hexdigest()
 
 
 def _canonical_tree(tree) -> object:
