@@ -39,7 +39,7 @@ T = TypeVar("T")
 MEETING, SILENCE = 300, 60
 # Calls per device between two exchanges. All processes wait for the slowest at an exchange, so few are better; but only
 # then do they notice signals.
-_CALLS = 2
+CALLS = 2
 # Bytes per exchange when a process sends what it has read from a file.
 _PART = 1 << 22
 # Words in the transport's errors after the loss of a process.
@@ -261,7 +261,7 @@ def dealt(f: Callable[[T], np.ndarray], items: Iterable[T], stopped: Callable[[]
     if count() == 1:
         yield from concurrently(lambda item: None if stopped() else f(item), items)
         return
-    items, each = iter(items), _CALLS * calls_at_once()
+    items, each = iter(items), CALLS * calls_at_once()
     while batch := list(islice(items, each * count())):
         if highest(bool(stopped())):
             yield batch[0], None

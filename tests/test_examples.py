@@ -22,6 +22,7 @@ SMALL = {
     "rough_metal": ["--res", "24", "--target-spp", "256", "--spp", "32"],
     "own_bsdf": ["--res", "24", "--target-spp", "256", "--spp", "16"],
     "original_results": ["--res", "32", "--spp", "8"],
+    "planning": ["--res", "480", "--rows", "48", "--spp", "4"],
     "check_mitsuba": ["--res", "32", "--spp", "16", "--seeds", "8"],
 }
 # Modules that are no dependencies of pathjax.

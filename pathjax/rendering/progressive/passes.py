@@ -170,7 +170,7 @@ class SharedState(State):
 def start(scene: Scene) -> State:
     count = film.pixel_count(film.of_samples(scene.film))
     none, one = np.zeros(count, np.int32), np.ones(count, np.float32)
-    beside = none, none.copy(), one, _chunk(count)
+    beside = none, none.copy(), one, pixels_per_call(count, calls_at_once() * distributed.count())
     if not scene.film.shared:
         return State(np.zeros((replicates.COUNT, count, 3), np.float32), *beside)
     sums = np.zeros((replicates.COUNT, count, 4), np.float32)
@@ -269,8 +269,7 @@ def _sums_of_replicates(scene, numbers, seed, scale, *, options):
     return jnp.concatenate([sums, weights[..., None]], -1).astype(jnp.float32)
 
 
-def _chunk(count: int) -> int:
+def pixels_per_call(count: int, at_once: int) -> int:
     """Return the pixels per call: all calls have one shape, so one kernel, and concurrent calls get equally many."""
-    at_once = calls_at_once() * distributed.count()
     calls = at_once * -(-count // (at_once * CHUNK_PIXELS))
     return min(count, max(-(-count // calls), _LEAST_CHUNK))
