@@ -27,7 +27,7 @@ from pathjax.system.output import say
 # Number of scenes that are loaded ahead.
 _AHEAD = 2
 # Seconds between lines of progress if there is no bar.
-_TELLS = 60
+_SECONDS_BETWEEN_LINES = 60
 
 
 @dataclass(frozen=True)
@@ -85,12 +85,12 @@ def render_batch(
         raise InputError(f"{folder}: the folder cannot be made: {error.strerror or error}") from None
     check_room(folder)
     outcomes: list[Outcome] = []
-    with Interrupts() as interrupts, _told(progress, len(mine)) as tell, ThreadPoolExecutor(1) as thread:
+    with Interrupts() as interrupts, _reporting(progress, len(mine)) as report, ThreadPoolExecutor(1) as thread:
         for job, output, scene in _loaded(mine, beside, folder, thread):
             outcome = _outcome(job, output, scene, interrupts) if scene else _skipped(job, output, beside)
             if outcome is not None:
                 outcomes.append(outcome)
-                tell(outcome)
+                report(outcome)
             if outcome is None or outcome.status == "unwritten":
                 thread.shutdown(cancel_futures=True)
                 break
@@ -113,8 +113,8 @@ def _skipped(job: Job, output: Path, beside: Path) -> Outcome:
         old = output.stat().st_mtime < (beside / job.scene).stat().st_mtime
     except OSError:  # one of them is gone, which does not matter for a job that is done
         old = False
-    told = f"{job.place}: {output} is older than {job.scene}, and kept; delete it to have it rendered anew"
-    return Outcome(job, output, "skipped", told if old else "")
+    note = f"{job.place}: {output} is older than {job.scene}, and kept; delete it to have it rendered anew"
+    return Outcome(job, output, "skipped", note if old else "")
 
 
 def _load(job: Job, beside: Path) -> tuple[Scene, float]:
@@ -152,7 +152,7 @@ def _outcome(job: Job, output: Path, loading: Future, interrupts: Interrupts) ->
 
 
 @contextmanager
-def _told(progress: bool | Callable[[Outcome], None], count: int) -> Iterator[Callable[[Outcome], None]]:
+def _reporting(progress: bool | Callable[[Outcome], None], count: int) -> Iterator[Callable[[Outcome], None]]:
     """Context of a function that shows outcomes as they come: by a bar, or by lines if stderr is not a terminal."""
     if progress is not True:
         yield progress or (lambda outcome: None)
@@ -160,7 +160,7 @@ def _told(progress: bool | Callable[[Outcome], None], count: int) -> Iterator[Ca
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
-    started = told = time.monotonic()
+    started = reported = time.monotonic()
     seen, rendered = 0, 0
     console = Console(stderr=True)
     columns = BarColumn(), MofNCompleteColumn(), TextColumn("{task.description}")
@@ -168,19 +168,19 @@ def _told(progress: bool | Callable[[Outcome], None], count: int) -> Iterator[Ca
     with bar or nullcontext():
         task = bar and bar.add_task("", total=count)
 
-        def tell(outcome: Outcome) -> None:
-            nonlocal told, seen, rendered
+        def report(outcome: Outcome) -> None:
+            nonlocal reported, seen, rendered
             seen, rendered, now = seen + 1, rendered + (outcome.status != "skipped"), time.monotonic()
             left = f"{_time((now - started) / max(rendered, 1) * (count - seen))} left"
             if outcome.message:
                 say(outcome.message)
             if bar:
                 bar.update(task, advance=1, description=f"{outcome.output.name}  {left}")
-            elif now - told >= _TELLS:
-                told = now
+            elif now - reported >= _SECONDS_BETWEEN_LINES:
+                reported = now
                 say(f"{seen} of {count} jobs, about {left}")
 
-        yield tell
+        yield report
 
 
 def _time(seconds: float) -> str:

@@ -47,10 +47,10 @@ def meet(
     own = {"process": process, "host": socket.gethostname(), "facts": facts}
     if process:
         return {0: _call(host, int(port), address, own, seconds)}
-    return _welcome(host, int(port), address, own, seconds)
+    return _accept(host, int(port), address, own, seconds)
 
 
-def _welcome(host: str, port: int, address: str, own: dict, seconds: float) -> dict[int, socket.socket]:
+def _accept(host: str, port: int, address: str, own: dict, seconds: float) -> dict[int, socket.socket]:
     """Accept connections from all other processes, and tell them the problem if they cannot work together."""
     try:
         dual = socket.has_dualstack_ipv6()
@@ -59,7 +59,7 @@ def _welcome(host: str, port: int, address: str, own: dict, seconds: float) -> d
     except OSError as error:
         problem = ""
         with suppress(OSError, ValueError), socket.create_connection((host, port), timeout=_SLOWEST) as call:
-            _tell(call, own)  # another one with the number 0 tells all of it
+            _send(call, own)  # another one with the number 0 tells all of it
             problem = json.loads(_line(call)) == _SEEN and json.loads(_line(call))
         unusable = f"process 0 cannot be found at {address}: {error.strerror}"
         raise InputError(problem or f"{unusable}; stop what uses the port, or name another") from None
@@ -86,7 +86,7 @@ def _welcome(host: str, port: int, address: str, own: dict, seconds: float) -> d
                 try:
                     other = json.loads(_line(call))
                     problem = _problem(own, came, other)
-                    _tell(call, _SEEN)
+                    _send(call, _SEEN)
                 except (OSError, ValueError, KeyError, TypeError):  # another program
                     call.close()
                     continue
@@ -96,7 +96,7 @@ def _welcome(host: str, port: int, address: str, own: dict, seconds: float) -> d
                 selector.register(call, selectors.EVENT_READ, number)
         for _, call in calls:
             with suppress(OSError):
-                _tell(call, problem)
+                _send(call, problem)
         if problem:
             _turn_away(server, problem, count - len(came), min(until, time.monotonic() + _LATE))
             raise InputError(problem)
@@ -112,11 +112,11 @@ def _turn_away(server: socket.socket, problem: str, missing: int, until: float) 
             with server.accept()[0] as call:
                 call.settimeout(_SLOWEST)
                 _line(call)
-                _tell(call, _SEEN)
-                _tell(call, problem)
+                _send(call, _SEEN)
+                _send(call, problem)
 
 
-def _tell(call: socket.socket, what: object) -> None:
+def _send(call: socket.socket, what: object) -> None:
     call.sendall((json.dumps(what) + "\n").encode())
 
 
@@ -146,7 +146,7 @@ def _call(host: str, port: int, address: str, own: dict, seconds: float) -> sock
         with ExitStack() as opened:
             try:
                 call = opened.enter_context(socket.create_connection((host, port), timeout=left))
-                _tell(call, own)
+                _send(call, own)
                 why = "who is there is another program, or has met all others already"
                 if json.loads(_line(call)) != _SEEN:
                     raise ValueError

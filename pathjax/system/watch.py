@@ -46,12 +46,12 @@ class Watch:
 
     def end(self, reason: str = "") -> None:
         """Tell the others that this process ends: regularly, or for a reason."""
-        self._say(" ".join(reason.split()).encode() or _END)
+        self._send(" ".join(reason.split()).encode() or _END)
 
     def _watch(self) -> None:
         try:
             while self._watched:
-                self._say(_BEAT)
+                self._send(_BEAT)
                 self._listen()
         except _Loss as loss:
             self.end(str(loss))
@@ -61,14 +61,14 @@ class Watch:
         until = time.monotonic() + BEAT
         while self._watched and (left := until - time.monotonic()) > 0:
             for key, _ in self._selector.select(left):
-                self._hear(key.data, self._peers[key.data])
+                self._receive(key.data, self._peers[key.data])
         for number in list(self._watched):
             # Counted in beats, not seconds, as this process may have been stopped itself.
             self._silent[number] += 1
             if self._silent[number] > PATIENCE:
                 raise _Loss(f"process {number} has not answered for {BEAT * PATIENCE:g} s")
 
-    def _hear(self, number: int, peer: socket.socket) -> None:
+    def _receive(self, number: int, peer: socket.socket) -> None:
         try:
             said = peer.recv(_LONGEST)
         except BlockingIOError:
@@ -86,7 +86,7 @@ class Watch:
             self._selector.unregister(peer)
             self._watched.pop(number, None)
 
-    def _say(self, line: bytes) -> None:
+    def _send(self, line: bytes) -> None:
         with self._speaking:
             for peer in self._peers.values():
                 with suppress(OSError):  # a peer that does not listen is detected by its silence

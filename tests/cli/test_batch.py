@@ -169,7 +169,7 @@ def test_outputs_that_are_older_than_their_scene_are_kept_and_told(folder, tmp_p
 
 
 def test_progress_and_the_time_left_are_told_in_lines_where_there_is_no_terminal(folder, tmp_path, run, monkeypatch):
-    monkeypatch.setattr("pathjax.batch.run._TELLS", 0)
+    monkeypatch.setattr("pathjax.batch.run._SECONDS_BETWEEN_LINES", 0)
     for number in range(3):
         (tmp_path / f"{number}.exr").touch()
     _, _, err = run("batch", write_jobs(folder / "lines.jsonl", some_jobs()), "-o", tmp_path)
