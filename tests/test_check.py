@@ -58,6 +58,16 @@ def test_smooth_ior_passes(shipped):
     assert result.passed and result.mean_square < 1.15 + 4 * 0.3
 
 
+@pytest.mark.slow  # its material has a kernel of its own
+def test_black_passes_whose_hue_jumps(make_scene):
+    """Near black, sheen and reflections take the hue of the color; at black they have no hue."""
+    tints = '<float name="spec_tint" value="1"/><float name="sheen" value="0.5"/><float name="sheen_tint" value="1"/>'
+    black = f'<bsdf type="principled" id="it"><rgb name="base_color" value="0"/>{tints}</bsdf>'
+    scene = make_scene(f'<shape type="sphere">{black}</shape><emitter type="constant"/>', res=16)
+    result = pj.check_gradient(scene, "it.base_color", spp=64, seeds=8)
+    assert result.passed and result.kink
+
+
 # ---- any function that renders --------------------------------------------------------------------------------------
 
 
@@ -126,6 +136,39 @@ def test_a_moving_edge_is_seen_by_differences():
         return np.zeros((64, 8, 3))
 
     assert not pj.check_gradient(image, 0.5, derivative=without_edge, reach=0.02).passed
+
+
+KINKS = {
+    # |theta - 0.4| has slope -1 to the left and 1 to the right; a value at 0 alone has no slope.
+    "kink": (lambda theta: theta + abs(theta - 0.4), 0.4, (0, 2)),
+    "jump": (lambda theta: theta + theta**2 + (theta == 0), 0.0, (1, 1)),
+}
+
+
+@pytest.mark.parametrize("case", KINKS)
+def test_at_a_kink_the_slope_of_either_side_passes(case):
+    of, theta, slopes = KINKS[case]
+    noise = Renderer()
+
+    def image(theta, seed):
+        return noise.coefficients(seed, 1)[..., 0] * of(theta)
+
+    def check(slope):
+        def derivative(theta, v, seed):
+            return noise.coefficients(seed, 1)[..., 0] * slope
+
+        return pj.check_gradient(image, theta, derivative=derivative, bounds=(0, 1))
+
+    assert all(check(slope).passed for slope in slopes)
+    for slope in (min(slopes) - 0.1, 1.1, max(slopes) + 0.1):
+        assert check(slope).kink and not check(slope).passed
+
+
+def test_what_is_curved_is_no_kink():
+    """A wrong derivative of a smooth image fails without being reported as a kink, even without noise."""
+    for theta in (0.4, 0.0, 1.0):
+        wrong = Renderer(error=0.02, noise=1e-6).check(theta)
+        assert not wrong.passed and not wrong.kink
 
 
 # ---- the rest -------------------------------------------------------------------------------------------------------

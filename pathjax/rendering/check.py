@@ -42,6 +42,9 @@ class GradientCheck:
     freedom: int  # degrees of freedom of t
     p_value: float  # of the largest |z|, over all blocks (Sidak); 0 where anything is not finite
     passed: bool  # p_value is above the false alarm rate
+    # The slopes on the two sides differ, or the image jumps at a bound, so there is no derivative: z and p_value are
+    # then those of the slope that agrees better with the claimed derivative.
+    kink: bool
     # Relative error of the derivative, the same everywhere, that half of all checks detect; inf: no error is detected,
     # since no image changes.
     resolution: float
@@ -105,7 +108,8 @@ def check_gradient(
     are between 1/2 and 1, or their negatives where the bounds leave no room.
 
     Differences are those of polynomials through five values around the present one; for the IOR of smooth glass through
-    two, at the step that `jacobian` chose, so that both have the same bias.
+    two, at the step that `jacobian` chose, so that both have the same bias. A derivative that does not pass is compared
+    with the differences on either side of theta too, if the images have a kink there.
 
     Args:
         of: a scene; or a function (theta, seed) -> image (H, W, channels).
@@ -141,10 +145,10 @@ def check_gradient(
         raise InputError("derivative is missing: of a function it is what is tested, (theta, v, seed) -> derivative")
     theta, bounds = np.asarray(at, float), bounds or (-math.inf, math.inf)
     direction, nodes = _direction(theta, bounds, reach) if nodes is None else (np.ones(theta.shape), nodes)
-    derivatives, differences = [], []
+    derivatives, differences, weights = [], [], [_weights(nodes), *_sides(nodes)]
     for k in range(seed, seed + seeds):
         images = [_image(of(np.clip(theta + x * direction, *bounds), k)) for x in nodes]
-        differences.append(np.tensordot(_weights(nodes), images, 1))
+        differences.append(np.tensordot(weights, images, 1))
         derivatives.append(_image(derivative(theta, direction, k)))
         if derivatives[-1].shape != images[0].shape:
             raise InputError(f"the derivative has the shape {derivatives[-1].shape}, the image {images[0].shape}")
@@ -214,24 +218,64 @@ def _weights(nodes):
     return np.linalg.solve(nodes[None] ** powers[:, None], (powers == 1).astype(float))
 
 
+def _sides(nodes):
+    """Weights of the slopes to the left and to the right of 0, and of a difference that a kink makes nonzero.
+
+    If all nodes lie on one side, both slopes leave out the node 0, so that a jump there does not affect them. The
+    difference is 0 for cubic polynomials. Empty if the nodes are too few, or none is 0.
+    """
+
+    def of(used):
+        weights = np.zeros(len(nodes))
+        weights[used] = _weights(nodes[used])
+        return weights
+
+    left, right = nodes <= 0, nodes >= 0
+    if len(nodes) < 5 or not (left & right).any():
+        return []
+    if left.all() or right.all():
+        beyond = of(nodes != 0)
+        return [beyond, beyond, _weights(nodes) - beyond]
+    return [of(left), of(right), of(right) - of(left)]
+
+
 def _compared(direction, derivatives, differences, largest, block, false_alarm):
-    """Compare derivatives and differences (seeds, H, W, channels); eps * largest is a difference's rounding error."""
+    """Compare derivatives (seeds, H, W, channels) with differences; eps * largest is a difference's rounding error.
+
+    differences: (seeds, 1, H, W, channels), or (seeds, 4, H, W, channels) with those of `_sides`.
+    """
     seeds = len(derivatives)
     derivatives = np.where(np.isfinite(derivatives), derivatives, np.nan)  # avoids differences of infinities
-    gap, slope = _blocks(derivatives - differences, block), _blocks(differences, block).mean(0)
-    size = _blocks(np.abs(derivatives) + np.abs(differences), block).mean(0)
+    claimed, found = _blocks(derivatives, block), [_blocks(x, block) for x in np.moveaxis(differences, 1, 0)]
     # Rounding error, where both agree to the last bits.
+    size = _blocks(np.abs(derivatives) + np.abs(differences[:, 0]), block).mean(0)
     floor = np.finfo(np.float32).eps * (size + largest)
-    error = np.sqrt(gap.var(0, ddof=1) / seeds + floor**2 + np.finfo(float).tiny)
-    z = gap.mean(0) / error
-    worst, p_value = np.abs(z).max(), 0.0
-    if np.isfinite(worst):
-        p_value = -math.expm1(z.size * math.log1p(-min(2 * stats.t.sf(worst, seeds - 1), 1 - 1e-16)))
+
+    def compared(gap):
+        error = np.sqrt(gap.var(0, ddof=1) / seeds + floor**2 + np.finfo(float).tiny)
+        return gap.mean(0) / error, error
+
+    def chance(z):
+        """Probability that the largest |z| is at least this large, if the derivative is right."""
+        worst = np.abs(z).max()
+        if not np.isfinite(worst):
+            return 0.0
+        return -math.expm1(z.size * math.log1p(-min(2 * stats.t.sf(worst, seeds - 1), 1 - 1e-16)))
+
+    difference, *sides = found
+    z, error = compared(claimed - difference)
     limit = stats.t.isf(-math.expm1(math.log1p(-false_alarm) / z.size) / 2, seeds - 1)
-    found = np.abs(slope) > 0
-    resolution = float((limit * error[found] / np.abs(slope[found])).min()) if found.any() else math.inf
-    means = derivatives.mean(0), differences.mean(0)
-    return GradientCheck(z, seeds - 1, p_value, p_value > false_alarm, resolution, direction, *means)
+    slope = np.abs(difference.mean(0))
+    resolution = float((limit * error[slope > 0] / slope[slope > 0]).min()) if (slope > 0).any() else math.inf
+    p_value, kink = chance(z), False
+    if sides and np.isfinite(z).all() and p_value <= false_alarm:
+        left, right, apart = sides
+        kink = chance(compared(apart)[0]) <= false_alarm
+        if kink:
+            z = max((compared(claimed - side)[0] for side in (left, right)), key=chance)
+            p_value = chance(z)
+    means = derivatives.mean(0), differences[:, 0].mean(0)
+    return GradientCheck(z, seeds - 1, p_value, p_value > false_alarm, kink, resolution, direction, *means)
 
 
 def _blocks(images, side):
