@@ -108,7 +108,8 @@ def test_values_and_densities_are_those_of_mitsuba(mitsuba_values, values):
 ADDED = [
     {},
     {**COLORS, "int_ior": 1.9, "alpha": 0.3, "distribution": "ggx"},
-    {"int_ior": 1.0, "ext_ior": 1.4, "alpha": 0.5},
+    # An IOR whose critical angle is not one of the checks' directions: there is no derivative at that angle.
+    {"int_ior": 1.0, "ext_ior": 1.3, "alpha": 0.5},
     {"alpha_u": 0.1, "alpha_v": 0.5, "distribution": "ggx"},
 ]
 
