@@ -128,7 +128,8 @@ def jacobian(
     named.refuse_constant(scene, wanted)
     count = sum(math.prod(parameter.shape) for parameter in wanted.values())
     needed = 3 * count * math.prod(film.image_shape(scene.film)) * scene.camera.origin.dtype.itemsize
-    memory.check(needed, f"the derivatives of all pixels in {count} numbers", "normal_equations keeps none of them")
+    remedy = "normal_equations keeps none of them, and neither do jax.jvp and jax.vjp of render"
+    memory.check(needed, f"the derivatives of all pixels in {count} numbers", remedy)
     pixels, scene = film.pixels(scene.film), named.nameless(named.attached(scene))
     image, derivatives, bias, used = pixel_jacobians(
         scene, wanted, pixels, 0, spp, seed, options, method=method, step=step

@@ -135,7 +135,8 @@ def check_memory(vector: ParameterVector, dtype) -> None:
     count = vector.count
     # Matrices of groups by channel and by component, each with a copy; and the solver's, in float64.
     needed = 4 * GROUPS * count**2 * np.dtype(dtype).itemsize + 8 * count**2 * 8 + 6 * CHUNK_BYTES
-    memory.check(needed, f"the normal equations of {count} numbers", "name fewer parameters")
+    remedy = "name fewer parameters; fit takes textures without them"
+    memory.check(needed, f"the normal equations of {count} numbers", remedy)
 
 
 def sums(
