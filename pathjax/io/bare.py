@@ -47,7 +47,8 @@ def scene(path: Path, parameters: Mapping[str, object]) -> tuple[dict, list[str]
     if not lit:
         objects[gltf.unused("sky", objects)] = {"type": "constant"}
         notes.append(f"{path}: has no light; a sky of radiance 1 is used")
-    return {"type": "scene", gltf.unused("integrator", objects): {"type": "path"}, **objects, **cameras}, notes, files
+    integrator = {"type": "volpath" if any("interior" in each for each in shapes) else "path"}
+    return {"type": "scene", gltf.unused("integrator", objects): integrator, **objects, **cameras}, notes, files
 
 
 def _mesh(path: Path) -> tuple[dict[str, dict], list[str], list[Path]]:

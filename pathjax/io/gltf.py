@@ -25,8 +25,8 @@ WRAPS = {10497: "repeat", 33648: "mirror", 33071: "clamp"}
 NEAREST = 9728
 # Extensions that are modelled, so that a file may require them.
 KNOWN = re.compile(
-    "KHR_(lights_punctual|mesh_quantization|texture_transform|materials_(ior|emissive_strength|transmission|unlit))"
-    "|EXT_texture_webp"
+    "KHR_(lights_punctual|mesh_quantization|texture_transform"
+    "|materials_(ior|emissive_strength|transmission|unlit|volume))|EXT_texture_webp"
 )
 MOST_PIXELS = 10**9
 NO_LIMIT = 1e10  # far clip distance of a camera without one
@@ -60,6 +60,7 @@ class _Scene:
         self.made: dict[str, dict] = {}
         self.materials: dict[tuple[int | None, bool], str] = {}  # (index, whether vertices have colours) -> name
         self.emissions: dict[int | None, dict | None] = {}
+        self.media: dict[int | None, dict | None] = {}
         self.pictures: dict[int, np.ndarray] = {}
 
     def objects(self) -> tuple[dict[str, dict], list[str]]:
@@ -142,6 +143,10 @@ class _Scene:
             name = self.free(material.get("name") or "material")
             self.made[name], self.materials[kind] = self.bsdf(material, colored=colors is not None), name
         made["bsdf"] = {"type": "ref", "id": self.materials[kind]}
+        if number not in self.media:
+            self.media[number] = self.medium(material)
+        if (medium := self.media[number]) is not None:
+            made["interior"] = medium
         if number not in self.emissions:
             self.emissions[number] = self.emission(material)
         if (radiance := self.emissions[number]) is not None:
@@ -176,13 +181,15 @@ class _Scene:
             bsdf = {"type": "diffuse", "reflectance": color}
         else:
             bsdf = {"type": "principled", "base_color": color}
-            if "KHR_materials_ior" in extensions:
-                bsdf["eta"] = float(extensions["KHR_materials_ior"].get("ior", 1.5))
             both = self.texture(pbr.get("metallicRoughnessTexture"))
             for key, channel, usual in (("roughness", 1, "roughnessFactor"), ("metallic", 2, "metallicFactor")):
                 share = float(pbr.get(usual, 1.0))
                 bsdf[key] = share if both is None else both.times(slice(channel, channel + 1), share, raw=True)
-            if (through := self.transmission(extensions)) is not None:
+            if "KHR_materials_ior" in extensions:
+                bsdf["eta"] = float(extensions["KHR_materials_ior"].get("ior", 1.5))
+            if bsdf.get("eta") == 0:
+                bsdf = _reflecting(bsdf)
+            elif (through := self.transmission(extensions)) is not None:
                 bsdf, two_sided = self.glass(bsdf | {"spec_trans": through}, extensions), False
             if (normals := self.texture(material.get("normalTexture"))) is not None:
                 normal = normals.normals(float(material["normalTexture"].get("scale", 1.0)))
@@ -192,6 +199,8 @@ class _Scene:
         bsdf = {"type": "twosided", "bsdf": bsdf} if two_sided else bsdf
         if (mode := material.get("alphaMode", "OPAQUE")) == "OPAQUE":
             return bsdf
+        if mode not in ("MASK", "BLEND"):
+            raise InputError(f'{self.file.path}: alphaMode must be OPAQUE, MASK or BLEND, is "{str(mode)[:40]}"')
         cutoff = float(material.get("alphaCutoff", 0.5)) if mode == "MASK" else None
         if base is not None:
             opacity = base.alpha(float(factor[3]), cutoff)
@@ -213,6 +222,26 @@ class _Scene:
         if bsdf.pop("metallic") != 0:
             self.note("the metal in its sheets that let light through is left out")
         return bsdf | {"type": "principledthin"}
+
+    def medium(self, material: dict) -> dict | None:
+        """What solid glass absorbs of light inside; None where it is clear."""
+        extensions = material.get("extensions", {})
+        volume = extensions.get("KHR_materials_volume", {})
+        distance = float(volume.get("attenuationDistance", math.inf))
+        color = np.array(volume.get("attenuationColor", [1.0, 1.0, 1.0]))
+        if not volume.get("thicknessFactor", 0.0) or self.transmission(extensions) is None:
+            return None
+        if extensions.get("KHR_materials_ior", {}).get("ior") == 0:
+            return None
+        if not distance > 0 or not ((color >= 0) & (color <= 1)).all():
+            raise InputError(f"{self.file.path}: attenuationDistance must be above 0, attenuationColor in [0, 1]")
+        # Of a colour's 0 there is left what float32 cannot tell from it.
+        absorbed = np.log(1 / np.maximum(color, np.finfo(np.float32).tiny)) / distance
+        if not absorbed.any():
+            return None
+        name = self.free(f"{material.get('name') or 'material'}_inside")
+        self.made[name] = {"type": "homogeneous", "sigma_t": _rgb(absorbed), "albedo": 0.0}
+        return {"type": "ref", "id": name}
 
     def emission(self, material: dict) -> dict | None:
         """Return the emitted radiance; None: the material does not emit."""
@@ -311,6 +340,16 @@ class _Picture:
         if cutoff is None:
             return self.bitmap(alpha, raw=True)
         return self.bitmap((alpha >= cutoff).astype(np.float32), raw=True, filter_type="nearest")
+
+
+def _reflecting(bsdf: dict) -> dict:
+    """A `principled` of an IOR of 0, by which the format means that what is no metal reflects all light, white."""
+    share = bsdf["metallic"]
+    metal = bsdf | {"metallic": 1.0}
+    del metal["eta"]
+    white = metal | {"base_color": 1.0}
+    mixed = {"type": "blendbsdf", "weight": share, "white": white, "metal": metal}
+    return white if share == 0 else metal if share == 1 else mixed
 
 
 def _rgb(color: np.ndarray) -> dict:

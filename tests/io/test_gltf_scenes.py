@@ -161,6 +161,8 @@ def test_normal_maps_turn_the_shading(material):
 
 
 SHEET = {"KHR_materials_transmission": {"transmissionFactor": 0.75}}
+TINTED = {"thicknessFactor": 1, "attenuationDistance": 2, "attenuationColor": [0.25, 0.5, 1]}
+SOLID = {"KHR_materials_volume": TINTED}
 
 
 @pytest.mark.parametrize(("thickness", "kind"), [(None, "principledthin"), (0, "principledthin"), (0.1, "principled")])
@@ -170,6 +172,43 @@ def test_glass_is_solid_where_it_has_a_thickness_and_a_sheet_elsewhere(material,
     bsdf, notes = material(Gltf({"pbrMetallicRoughness": pbr, "extensions": SHEET | solid}))
     assert (bsdf["type"], bsdf["spec_trans"], bsdf["roughness"]) == (kind, 0.75, 0.1)
     assert not notes
+
+
+def test_solid_glass_absorbs_what_its_colour_lacks_over_the_distance(objects):
+    made, notes = objects(Gltf({"extensions": SHEET | SOLID}))
+    inside = made[made["square"]["interior"]["id"]]
+    np.testing.assert_allclose(np.exp(-2 * inside["sigma_t"]["value"]), [0.25, 0.5, 1])
+    assert (inside["type"], inside["albedo"]) == ("homogeneous", 0) and not notes
+
+
+@pytest.mark.parametrize("extensions", [SOLID, SHEET, SHEET | SOLID | {"KHR_materials_ior": {"ior": 0}}])
+def test_what_is_no_solid_glass_absorbs_nothing_inside(objects, extensions):
+    made, _ = objects(Gltf({"extensions": extensions}))
+    assert "interior" not in made["square"]
+
+
+@pytest.mark.slow  # a kernel of its own, for glass with a medium in it
+def test_a_sky_is_seen_through_a_solid_that_absorbs(write):
+    """Of an IOR of 1, so that it does nothing else: two squares, a unit apart."""
+    glass = SHEET | SOLID | {"KHR_materials_ior": {"ior": 1}, "KHR_materials_transmission": {"transmissionFactor": 1}}
+    file = Gltf({"pbrMetallicRoughness": {"metallicFactor": 0, "roughnessFactor": 0}, "extensions": glass})
+    file.node(mesh=0, translation=[0, 0, -1], rotation=[0, 1, 0, 0])
+    file.header["cameras"] = [{"type": "orthographic", "orthographic": {"xmag": 0.1, "ymag": 0.1, "znear": 0.1}}]
+    file.node(camera=0, translation=[0, 0, 3])
+    image = np.asarray(pj.render(pj.load_scene(write(file), res=4), 256))
+    np.testing.assert_allclose(image.mean((0, 1)), [0.5, 0.5**0.5, 1], rtol=5e-3)
+
+
+@pytest.mark.parametrize(("metallic", "kind"), [(0, "principled"), (1, "principled"), (0.25, "blendbsdf")])
+def test_an_ior_of_0_reflects_all_light_where_there_is_no_metal(material, metallic, kind):
+    pbr = {"metallicFactor": metallic, "baseColorFactor": [0.5, 0.25, 0.125, 1]}
+    bsdf = material(Gltf({"pbrMetallicRoughness": pbr, "extensions": {"KHR_materials_ior": {"ior": 0}}}))[0]["bsdf"]
+    assert bsdf["type"] == kind
+    parts = [bsdf["white"], bsdf["metal"]] if kind == "blendbsdf" else [bsdf]
+    assert all(part["metallic"] == 1 and "eta" not in part for part in parts)
+    assert bsdf.get("weight", metallic) == metallic
+    assert metallic == 1 or parts[0]["base_color"] == 1
+    assert metallic == 0 or list(parts[-1]["base_color"]["value"]) == [0.5, 0.25, 0.125]
 
 
 def test_transmission_has_textures_and_lacks_metal(material):
@@ -376,6 +415,13 @@ def everything(alpha="MASK"):
     return file
 
 
+def test_nothing_is_told_of_what_the_file_does_not_hold(write):
+    file = with_node(camera=0, extensions={"KHR_lights_punctual": {"light": 2}})
+    file.header["materials"] = [{"extensions": SHEET | SOLID}]
+    notes = pj.load_scene(write(file)).about.description.notes
+    assert len(notes) == 1 and "is open" in notes[0]
+
+
 def test_a_file_is_a_scene_that_can_be_saved(write, tmp_path):
     scene = pj.load_scene(write(everything()), res=32)
     assert {"glow.base_color", "glow.roughness", "light.intensity"} < set(pj.parameters(scene))
@@ -453,7 +499,12 @@ def _of(change):
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        ({"extensionsRequired": ["KHR_materials_volume"]}, "KHR_materials_volume is not supported"),
+        ({"extensionsRequired": ["KHR_materials_sheen"]}, "KHR_materials_sheen is not supported"),
+        ({"materials": [{"alphaMode": "Blend"}]}, 'alphaMode must be OPAQUE, MASK or BLEND, is "Blend"'),
+        (
+            {"materials": [{"extensions": SHEET | {"KHR_materials_volume": TINTED | {"attenuationDistance": 0}}}]},
+            "attenuationDistance must be above 0",
+        ),
         ({"extensionsRequired": ["KHR_draco_mesh_compression"]}, "KHR_draco_mesh_compression is not supported"),
         ({"skins": [{}]}, "skins is not supported"),
         ({"materials": []}, "materials 0 does not exist"),
