@@ -60,7 +60,7 @@ class _Scene:
         self.made: dict[str, dict] = {}
         self.materials: dict[tuple[int | None, bool], str] = {}  # (index, whether vertices have colours) -> name
         self.emissions: dict[int | None, dict | None] = {}
-        self.media: dict[int | None, dict | None] = {}
+        self.media: dict[int | None, dict | None] = {}  # index of a material -> reference to what is inside
         self.pictures: dict[int, np.ndarray] = {}
 
     def objects(self) -> tuple[dict[str, dict], list[str]]:
@@ -224,7 +224,7 @@ class _Scene:
         return bsdf | {"type": "principledthin"}
 
     def medium(self, material: dict) -> dict | None:
-        """What solid glass absorbs of light inside; None where it is clear."""
+        """Return the medium inside solid glass, which absorbs; None: the glass is clear, or there is none."""
         extensions = material.get("extensions", {})
         volume = extensions.get("KHR_materials_volume", {})
         distance = float(volume.get("attenuationDistance", math.inf))
@@ -235,7 +235,7 @@ class _Scene:
             return None
         if not distance > 0 or not ((color >= 0) & (color <= 1)).all():
             raise InputError(f"{self.file.path}: attenuationDistance must be above 0, attenuationColor in [0, 1]")
-        # Of a colour's 0 there is left what float32 cannot tell from it.
+        # A channel of 0 transmits the least positive float32, since its extinction would be infinite.
         absorbed = np.log(1 / np.maximum(color, np.finfo(np.float32).tiny)) / distance
         if not absorbed.any():
             return None
@@ -343,7 +343,7 @@ class _Picture:
 
 
 def _reflecting(bsdf: dict) -> dict:
-    """A `principled` of an IOR of 0, by which the format means that what is no metal reflects all light, white."""
+    """Return the bsdf for an IOR of 0, by which the format means that all light is reflected, except by metal."""
     share = bsdf["metallic"]
     metal = bsdf | {"metallic": 1.0}
     del metal["eta"]

@@ -44,6 +44,7 @@ def load(path: str | Path, sensor: int | str = 0, /, **parameters: object) -> d.
     scene, notes, files = bare.scene(Path(path), parameters)
     loader = _Loader(dict_reader.read(scene, str(path)))
     loader.notes += notes
+    loader.quiet.add("sampler")
     loader.document.found.update({Element("file", {}, str(path), 0): file for file in files})
     return loader.description(str(path), sensor)
 
@@ -76,6 +77,7 @@ class _Loader:
     def __init__(self, document: Document):
         self.document = document
         self.notes = list(document.notes)
+        self.quiet: set[str] = set()  # tags of elements that the user did not write, which get no notes
         self.integrator = d.Integrator()
         self.names = set(document.ids)
         self.counts: defaultdict[str, Iterator[int]] = defaultdict(count)
@@ -231,7 +233,8 @@ class _Loader:
 
     def note(self, element: Element, text: str) -> None:
         """Add a note about an element, for `info`."""
-        self.notes.append(f"{element.place}: {element} {text}")
+        if element.tag not in self.quiet:
+            self.notes.append(f"{element.place}: {element} {text}")
 
     def make(self, element: Element, kinds: Mapping[str, type], *context: object, read: Callable | None = None):
         """Build an object by the `read` of its kind. Contents that are neither read nor in its `unused` are refused.
