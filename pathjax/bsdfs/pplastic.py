@@ -10,7 +10,7 @@ from pathjax.bsdfs.dielectric import IndexOfRefraction
 from pathjax.bsdfs.ior import IOR
 from pathjax.bsdfs.microfacet import mirrored
 from pathjax.bsdfs.plastic import chance_of_coat, reflectance
-from pathjax.bsdfs.rough import Rough, Roughness
+from pathjax.bsdfs.rough import Rough
 from pathjax.core.math import dot, safe_divide
 from pathjax.core.types import BSDFSample
 from pathjax.core.warp import chosen, square_to_cosine_hemisphere, square_to_cosine_hemisphere_pdf
@@ -28,9 +28,6 @@ class PPlastic(Rough):
     specular_reflectance = Color(1.0)
     int_ior = IndexOfRefraction(IOR["polypropylene"])
     ext_ior = IndexOfRefraction(IOR["air"])
-    alpha = Roughness(0.1)
-    alpha_u = Roughness(None)
-    alpha_v = Roughness(None)
 
     @classmethod
     def read(cls, loader, fields, name):

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import pathjax as pj
 from pathjax import bsdfs, testing
 from pathjax.bsdfs import Plastic, PPlastic, fresnel
 
@@ -135,3 +136,15 @@ def test_values_of_added_lobes_are_those_of_mitsuba(mitsuba_values, values):
 
     f = jax.jit(jax.vmap(ours))(jnp.asarray(wi, jnp.float32), jnp.asarray(wo, jnp.float32))
     np.testing.assert_allclose(f, mitsuba_values("pplastic", values, wi, wo)[0], rtol=2e-3, atol=1e-5)
+
+
+def test_roughness_of_added_lobes_may_be_a_texture():
+    wi, wo = (jnp.asarray(w, jnp.float32) / 3 for w in ([1, 2, 2], [-1, -2, 2]))
+
+    def value(alpha):
+        shape = {"type": "sphere", "bsdf": {"type": "pplastic", "alpha": alpha}}
+        materials = pj.load_dict({"type": "scene", "ball": shape, "sky": {"type": "constant"}}).materials
+        evaluate = jax.jit(lambda: bsdfs.evaluate(materials, jnp.int32(0), jnp.int32(0), testing._SURFACE, wi, wo)[0])
+        return evaluate()
+
+    np.testing.assert_allclose(value(np.full((2, 2), 0.3)), value(0.3), rtol=1e-5)
