@@ -10,7 +10,7 @@ from typing import ClassVar
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from pathjax.kinds import Declared, Kind, Row
+from pathjax.kinds import Declared, Instance, Kind, Row
 
 
 @dataclass(frozen=True)
@@ -112,6 +112,14 @@ class DiracEmitter(Emitter):
     dirac = True
     # With weight 0 it would never be sampled.
     sampling_weight = Weight(None, bounds=(float(np.finfo(np.float32).tiny), math.inf))
+
+    @classmethod
+    def read(cls, loader, fields, name, **known):
+        made = super().read(loader, fields, name, **known)
+        for key, texture in made.values.items():
+            if isinstance(texture, Instance) and not texture.kind.follows_uv(texture):
+                raise fields.error(key, "is a texture that depends on more than uv; use a bitmap")
+        return made
 
     @staticmethod
     @abstractmethod

@@ -75,7 +75,7 @@ def with_values(
             value = part.get(get(scene, part.path)) if value is None else value
             # Concrete values as the builders compute with them, equal to the last bit.
             value = lax.stop_gradient(value) if is_traced(value) else np.asarray(value, np.float64)
-            total = total + share * (value.mean((0, 1)) if part.is_texture else value)
+            total = total + share * (value.reshape(-1, 3).mean(0) if part.is_texture else value)
         scene = put(scene, mean.path, get(scene, mean.path).at[mean.row].set(total))
     changed: dict[tuple, list[str]] = {}
     for parameter in (parameters[name] for name in values):

@@ -24,6 +24,7 @@ class MeshAttribute(Texture):
     names = Setting("")  # of the attributes of all rows, separated by blanks
     number = PerRow()  # () int32 index of its name
     scale = Number(1.0, bounds=(0, math.inf))
+    over_uv = False
 
     @classmethod
     def read(cls, loader, fields, name):

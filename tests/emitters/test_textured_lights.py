@@ -7,6 +7,7 @@ import pytest
 import pathjax as pj
 from pathjax import transport
 from pathjax.images import write_exr
+from pathjax.media.gridvolume import write_vol
 
 FLOOR = """<shape type="rectangle"><transform name="to_world"><rotate x="1" angle="-90"/><scale value="2"/></transform>
   <bsdf type="diffuse" id="floor"><rgb name="reflectance" value="0.2, 0.5, 0.8"/></bsdf></shape>"""
@@ -18,6 +19,20 @@ def lamp(inside, x=0.0, z=0.0, half=1.0, name="lamp"):
     """Return a square lamp above the floor that faces down; u grows with x, v with z."""
     return f"""<shape type="rectangle" id="{name}"><transform name="to_world"><rotate x="1" angle="90"/>
       <scale value="{half}"/><translate x="{x}" y="1.5" z="{z}"/></transform>{inside}</shape>"""
+
+
+def volume_of(file, name="radiance"):
+    return f"""<texture type="volume" name="{name}"><volume type="gridvolume" name="volume">
+      <string name="filename" value="{file}"/><transform name="to_world"><translate x="-0.5" y="1" z="-0.5"/>
+      <scale value="0.9"/></transform></volume></texture>"""
+
+
+@pytest.fixture(scope="module")
+def volume(tmp_path_factory):
+    """A texture of twelve colours in space, around the lamp."""
+    file = tmp_path_factory.mktemp("volumes") / "twelve.vol"
+    write_vol(file, np.random.default_rng(2).random((2, 3, 2, 3)) * 5)
+    return volume_of(file)
 
 
 def area(inside):
@@ -69,17 +84,18 @@ def test_lights_are_chosen_by_the_mean_of_what_covers_them(make_scene, picture):
     np.testing.assert_allclose(lights.power(), [4 * power, 4], rtol=1e-5)
 
 
-def test_what_lights_are_chosen_by_follows_the_parameters_of_what_covers_them(make_scene, picture, tmp_path):
-    """For checkerboards of colours, numbers, images or checkerboards: as if the file had the new values."""
+def test_what_lights_are_chosen_by_follows_the_parameters_of_what_covers_them(make_scene, picture, volume, tmp_path):
+    """For checkerboards of colours, numbers, images, volumes or checkerboards: as if the file had the new values."""
     board = '<texture type="checkerboard" name="{}" id="{}">{}</texture>'.format
     uniform = '<texture type="uniform" name="color1" id="even"><float name="value" value="0.25"/></texture>'
     inner = board("color0", "inner", '<rgb name="color0" value="0.5, 0, 0"/>' + uniform)
     outer = board("radiance", "outer", inner + picture.replace("radiance", "color1"))
-    covers = [CHECKS, outer, picture.replace("nearest", "bilinear")]
+    mixed = board("radiance", "mixed", volume.replace("radiance", "color0"))
+    covers = [CHECKS, outer, picture.replace("nearest", "bilinear"), volume.replace("0.9", "0.8"), mixed]
     scene = make_scene(FLOOR + "".join(lamp(area(each), 3 * k, name=f"l{k}") for k, each in enumerate(covers)))
     about = scene.about.parameters
     names = [name for name in pj.parameters(scene) if about[name].means]
-    assert len(names) == 6
+    assert len(names) == 9
     random = np.random.default_rng(1)
     moved = pj.with_parameters(scene, {name: np.float32(random.random(about[name].shape)) for name in names})
     pj.save_scene(moved, tmp_path / "moved.xml")
@@ -144,19 +160,23 @@ def test_what_cannot_cover_a_light_is_refused(make_scene, tmp_path):
 
 
 @pytest.mark.slow
-def test_light_samples_find_what_bsdf_samples_do(make_scene, picture, estimate, agree):
+@pytest.mark.parametrize("cover", ["picture", "volume"])
+def test_light_samples_find_what_bsdf_samples_do(make_scene, request, estimate, agree, cover):
     """For a cube, whose faces share one image."""
-    scene = make_scene(FLOOR + lamp(area(picture), half=0.4).replace('"rectangle"', '"cube"'), **VIEW)
+    cover = request.getfixturevalue(cover)
+    scene = make_scene(FLOOR + lamp(area(cover), half=0.4).replace('"rectangle"', '"cube"'), **VIEW)
     agree(estimate(scene, 256, strategy="bsdf"), estimate(scene, 256, strategy="light", first_seed=90))
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["rectangle", "sphere"])
-def test_images_are_mitsubas(make_scene, write_scene, picture, estimate, estimate_type, agree, kind):
+@pytest.mark.parametrize("kind, inside", [("rectangle", "picture"), ("sphere", "picture"), ("sphere", "volume")])
+def test_images_are_mitsubas(make_scene, write_scene, request, estimate, estimate_type, agree, kind, inside):
     mi = pytest.importorskip("mitsuba")
     mi.set_variant("scalar_rgb")
     turned = '<transform name="to_uv"><rotate z="1" angle="30"/><scale x="2" y="3"/></transform></texture>'
-    light = lamp(area(picture.replace("</texture>", turned)), half=0.4).replace('"rectangle"', f'"{kind}"')
+    cover = request.getfixturevalue(inside)
+    cover = cover.replace("</texture>", turned) if inside == "picture" else cover
+    light = lamp(area(cover), half=0.4).replace('"rectangle"', f'"{kind}"')
     body = FLOOR + light
     theirs = mi.load_file(str(write_scene(body, **VIEW)))
     images = np.stack([np.array(mi.render(theirs, spp=128, seed=seed), float) for seed in range(16)])

@@ -124,14 +124,17 @@ def test_volumes_are_saved_with_their_values(tmp_path, changed):
 
 
 GRID = volume(np.ones((1, 1, 2)))["reflectance"]
+CHECKS = {"type": "checkerboard", "color0": 0.5}
+ATTRIBUTE = {"type": "mesh_attribute", "name": "vertex_color"}
 
 
 @pytest.mark.parametrize(
     ("more", "says"),
     [
-        ({"a": {"type": "sphere", "emitter": {"type": "area", "radiance": GRID}}}, "without a mean over uv"),
-        ({"a": {"type": "projector", "irradiance": GRID}}, "without a mean over uv"),
+        ({"a": {"type": "projector", "irradiance": GRID}}, "irradiance.*depends on more than uv"),
+        ({"a": {"type": "spot", "texture": {**CHECKS, "color1": GRID}}}, "texture.*depends on more than uv"),
         ({"a": {"type": "sphere", "b": {"type": "bumpmap", "b": {"type": "diffuse"}, "c": GRID}}}, "has no slope"),
+        ({"a": {"type": "sphere", "b": {"type": "bumpmap", "b": {"type": "diffuse"}, "c": ATTRIBUTE}}}, "has no slope"),
         ({"a": {"type": "diffuse", "reflectance": {**GRID, "to_uv": np.eye(4)}}}, "to_uv.*is not a parameter"),
     ],
 )
