@@ -1008,6 +1008,10 @@ def test_mitsuba_takes_what_has_no_effect(mitsuba, picture, tmp_path, place, nam
         ),
         ('<integrator type="moment"><integrator type="path">{}</integrator></integrator>', "--aov error"),
         ('<integrator type="stokes"><integrator type="volpath">{}</integrator></integrator>', "no polarisation"),
+        (
+            '<integrator type="moment"><integrator type="volpath">{}</integrator></integrator>',
+            '<integrator type="volpath"> without media',
+        ),
     ],
 )
 def test_integrators_that_estimate_the_same_are_path_and_noted(read, integrator, words):

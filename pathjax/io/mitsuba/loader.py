@@ -217,6 +217,8 @@ class _Loader:
     ) -> None:
         """Check that the integrator suits the media, with notes or an error; elements: the integrator, if present."""
         root = elements[0] if elements else self.document.root
+        while inside := [each for each in root.children if elements and each.tag == "integrator"]:
+            root = inside[0]
         present = medium is not None or any(shape.interior or shape.exterior for shape in shapes)
         media = self.integrator.media
         if media and not present:
