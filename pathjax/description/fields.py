@@ -23,6 +23,7 @@ OBJECTS = ("integrator", "sensor", "sampler", "film", "rfilter", "shape", "bsdf"
 # Spectra that are plugins, which are also textures of one colour. (`uniform` is a kind of texture here.)
 TYPED = ("uniform", "d65", "srgb", "rawconstant")
 ONE_COLOR = TYPED[1:]
+BAND = dict.fromkeys(("wavelength_min", "wavelength_max"), Unused("float", "colours are linear RGB"))  # of a uniform
 REQUIRED = object()
 # Tag of an element -> the form of its value in dictionaries, for messages.
 IN_DICTIONARIES = {
@@ -171,6 +172,7 @@ class Fields:
         match fields.type:
             case "uniform":
                 color = np.full(3, fields.float("value", at_least=0, at_most=at_most))
+                self.notes += fields.without_effect(BAND)
             case "srgb":
                 color = fields.triple_or_color("color", at_most=at_most)
             case "rawconstant":

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from pathjax.core.types import Surface
+from pathjax.description.fields import BAND
 from pathjax.kinds import Instance, Number, Row
 from pathjax.textures.texture import Texture
 
@@ -16,6 +17,7 @@ class Uniform(Texture):
     """One number for all channels."""
 
     value = Number(bounds=(0, math.inf))
+    unused = BAND
 
     @classmethod
     def read(cls, loader, fields, name):

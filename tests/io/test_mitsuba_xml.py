@@ -892,6 +892,7 @@ def test_objects_that_nothing_uses_are_checked_and_noted_but_may_be_of_any_kind_
 
 PICTURE = '<string name="filename" value="picture.png"/>'
 FOV = '<float name="fov" value="40"/>'
+HALF = '<float name="value" value="0.5"/>'
 WITHOUT_EFFECT = [
     (
         "perspective",
@@ -935,6 +936,14 @@ WITHOUT_EFFECT = [
         with_bsdf("diffuse", f'<texture type="bitmap" name="reflectance">{PICTURE}{{}}</texture>'),
         ["accel", "format"],
     ),
+    *(
+        (
+            f"uniform {tag}",
+            with_bsdf("diffuse", f'<{tag} type="uniform" name="reflectance">{HALF}{{}}</{tag}>'),
+            ["wavelength_min", "wavelength_max"],
+        )
+        for tag in ("texture", "spectrum")
+    ),
     ("scene", "{}", ["embree_use_robust_intersections", "allow_thread_reordering"]),
     (
         "scene's tree",
@@ -946,6 +955,7 @@ WITHOUT_EFFECT = [
 VALUE_OF = {
     **dict.fromkeys(("focus_distance", "shutter_open", "shutter_close", "timeout"), ("float", "1")),
     "silhouette_sampling_weight": ("float", "0.5"),
+    **dict.fromkeys(("wavelength_min", "wavelength_max"), ("float", "400")),
     **dict.fromkeys(("kd_traversal_cost", "kd_intersection_cost", "kd_empty_space_bonus"), ("float", "0.5")),
     **dict.fromkeys(("block_size", "samples_per_pass", "seed", "strength"), ("integer", "2")),
     **dict.fromkeys(("shading_samples", "emitter_samples", "bsdf_samples"), ("integer", "4")),
