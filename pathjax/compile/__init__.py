@@ -6,7 +6,7 @@
   change no result, only what is computed and when. `together` updates the memory of a `native_fold`.
 - `linear` is a linear function with a transpose of its own.
 - `register_dataclass` makes a dataclass a pytree; with JAX's own function it may get the kernel of another dataclass.
-- `on_all_devices` keeps large arrays from being copied at each call.
+- `on_all_devices` keeps arrays from being copied at each call.
 - `concurrently` calls one kernel several times at once.
 - `setup` prepares XLA. It runs here, so that importing pathjax is enough. `keep_kernels` is for programs; `compiled`
   then loads kernels from disk without tracing them.

@@ -1,8 +1,9 @@
-"""Large arrays on all devices, which JAX copies at each call that needs them there; and on one without copies."""
+"""Replicate arrays on all devices once, instead of at each call; and read results on one device without a copy."""
 
 from __future__ import annotations
 
 import weakref
+from functools import partial
 from typing import TypeVar
 
 import jax
@@ -12,48 +13,50 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from pathjax.compile.jax_compat import is_traced
 
 Tree = TypeVar("Tree")
-# Bytes of an array that is worth it: less is copied in some ten microseconds, which keeping it takes, too.
-_LARGE = 1 << 18
-# By the address of an array: a reference to it, and the same numbers on all devices, for as long as it lives.
+# id of an array -> (weak reference to it, its replica). An entry lives as long as its array.
 _kept: dict[int, tuple[weakref.ref, jax.Array]] = {}
 
 
 def on_all_devices(tree: Tree, devices: int | None = None) -> Tree:
-    """The tree, whose large arrays are those on all devices, for kernels that run there.
+    """Return a pytree with its arrays replicated on all devices, for kernels that run on all of them.
 
-    CPU devices share one memory, so nothing is copied there. Traced values, and arrays that someone placed, stay.
+    CPU devices share one memory, so their replicas are views. Traced values, and arrays that a user has placed on
+    devices, stay as they are.
 
     Args:
-        devices: of `native_map`; if given, the tree stays.
+        devices: as in `native_map`; if given, the pytree is returned as it is.
     """
     if devices is not None or len(jax.devices()) == 1:
         return tree
-    return jax.tree.map(lambda x: _replica(x) if _is_copied(x) else x, tree)
+    leaves, structure = jax.tree.flatten(tree)
+    copied = [x for x in leaves if isinstance(x, jax.Array) and not is_traced(x) and not x.committed]
+    new = list({id(x): x for x in copied if id(x) not in _kept}.values())
+    for x, replica in zip(new, _replicas(new), strict=True):
+        _kept[id(x)] = weakref.ref(x, partial(_forget, id(x))), replica
+    found = {id(x): _kept[id(x)][1] for x in copied}
+    return jax.tree.unflatten(structure, [found.get(id(x), x) for x in leaves])
 
 
-def _is_copied(x) -> bool:
-    return isinstance(x, jax.Array) and not is_traced(x) and x.nbytes >= _LARGE and not x.committed
+def _forget(key: int, _: weakref.ref) -> None:
+    _kept.pop(key, None)
 
 
-def _replica(x: jax.Array) -> jax.Array:
-    kept = _kept.get(id(x))
-    if kept is not None and kept[0]() is x:
-        return kept[1]
+def _replicas(arrays: list[jax.Array]) -> list[jax.Array]:
     here, used = jax.local_devices(), jax.devices()
-    # A view of a CPU device's memory, which other CPU devices take as it is. It keeps the memory, and not x.
-    source = np.from_dlpack(x) if here[0].platform == "cpu" else x  # type: ignore[arg-type]
-    copies = [x if {device} == x.devices() else jax.device_put(source, device) for device in here]
+    # CPU devices use views of each other's memory without a copy. Views keep the memory alive, but not the arrays.
+    sources = [np.from_dlpack(x) for x in arrays] if here[0].platform == "cpu" else arrays  # type: ignore[arg-type]
     everywhere = NamedSharding(Mesh(np.array(used), ("device",)), PartitionSpec())
-    replica = jax.make_array_from_single_device_arrays(x.shape, everywhere, copies)
-    key = id(x)
-    _kept[key] = weakref.ref(x, lambda _: _kept.pop(key, None)), replica
-    return replica
+    if here == used:
+        return jax.device_put(sources, everywhere)
+    copies = zip(*(jax.device_put(sources, device) for device in here), strict=True)
+    pairs = zip(arrays, copies, strict=True)
+    return [jax.make_array_from_single_device_arrays(x.shape, everywhere, list(each)) for x, each in pairs]
 
 
 def on_one_device(x: jax.Array, axis: int) -> tuple[jax.Array, ...]:
-    """What several CPU devices hold of an array, along an axis, as arrays of one of them: they share one memory.
+    """Return an array that is sharded over CPU devices along an axis as arrays of one device: they share one memory.
 
-    An array of which this cannot be said is returned as it is.
+    Any other array is returned as it is.
     """
     if not isinstance(x, jax.Array) or is_traced(x) or not x.is_fully_addressable or len(x.devices()) == 1:
         return (x,)

@@ -1,4 +1,4 @@
-"""Large arrays on all devices: the same memory, freed with the array, in every kernel of all devices."""
+"""Arrays on all devices: the same memory, freed with the array, in every kernel of all devices."""
 
 import gc
 import weakref
@@ -25,16 +25,16 @@ def addresses(x):
     return {shard.data.unsafe_buffer_pointer() for shard in x.addressable_shards}
 
 
-def test_large_arrays_are_on_all_devices_without_a_copy():
-    flags = jax.device_put(np.tile(LARGE > 5, 4))
-    given = {"large": jax.device_put(LARGE), "flags": flags, "small": jnp.zeros(3), "none": None}
+def test_arrays_are_on_all_devices_and_large_ones_without_a_copy():
+    flags, small = jax.device_put(np.tile(LARGE > 5, 4)), jnp.zeros(3)
+    given = {"large": jax.device_put(LARGE), "flags": flags, "small": small, "again": small, "none": None}
     found = on_all_devices(given)
-    for name in ("large", "flags"):
+    for name in ("large", "flags", "small"):
         assert found[name].is_fully_replicated and found[name].devices() == set(jax.devices())
         np.testing.assert_array_equal(found[name], given[name])
     assert addresses(found["large"]) == addresses(given["large"])
-    assert found["small"] is given["small"] and found["none"] is None
-    assert on_all_devices(given)["large"] is found["large"], "it is made once"
+    assert found["again"] is found["small"] and found["none"] is None
+    assert all(on_all_devices(given)[name] is x for name, x in found.items()), "each is made once"
 
 
 @pytest.mark.parametrize("axis", [0, 1])
