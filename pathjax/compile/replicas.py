@@ -43,14 +43,15 @@ def _forget(key: int, _: weakref.ref) -> None:
 
 def _replicas(arrays: list[jax.Array]) -> list[jax.Array]:
     here, used = jax.local_devices(), jax.devices()
-    # CPU devices use views of each other's memory without a copy. Views keep the memory alive, but not the arrays.
-    sources = [np.from_dlpack(x) for x in arrays] if here[0].platform == "cpu" else arrays  # type: ignore[arg-type]
     everywhere = NamedSharding(Mesh(np.array(used), ("device",)), PartitionSpec())
-    if here == used:
-        return jax.device_put(sources, everywhere)
-    copies = zip(*(jax.device_put(sources, device) for device in here), strict=True)
-    pairs = zip(arrays, copies, strict=True)
-    return [jax.make_array_from_single_device_arrays(x.shape, everywhere, list(each)) for x, each in pairs]
+    with jax.ensure_compile_time_eval():  # also within a user's jit, of which replicas must hold no tracers
+        # CPU devices use views of each other's memory without a copy. Views keep the memory alive, but not the arrays.
+        sources = [np.from_dlpack(x) for x in arrays] if here[0].platform == "cpu" else arrays  # type: ignore[arg-type]
+        if here == used:
+            return jax.device_put(sources, everywhere)
+        copies = zip(*(jax.device_put(sources, device) for device in here), strict=True)
+        pairs = zip(arrays, copies, strict=True)
+        return [jax.make_array_from_single_device_arrays(x.shape, everywhere, list(each)) for x, each in pairs]
 
 
 def on_one_device(x: jax.Array, axis: int) -> tuple[jax.Array, ...]:

@@ -61,6 +61,12 @@ def test_what_was_placed_or_is_traced_stays_and_so_does_all_for_one_device():
     np.testing.assert_array_equal(jax.jit(lambda x: on_all_devices(x) + 1)(free), LARGE + 1)
 
 
+def test_arrays_that_a_users_jit_closes_over_have_replicas_without_tracers():
+    x = jax.device_put(LARGE.copy())
+    np.testing.assert_array_equal(jax.jit(lambda y: on_all_devices(x) + y)(1), LARGE + 1)
+    np.testing.assert_array_equal(on_all_devices(x), LARGE)
+
+
 def test_memory_is_freed_with_the_array():
     x = jax.device_put(LARGE.copy())
     replica = weakref.ref(on_all_devices(x))
