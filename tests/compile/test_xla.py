@@ -224,7 +224,7 @@ def test_import_is_light(python, tmp_path):
     The test uses the bytecode cache, as installed packages do; some environments turn it off.
     """
     bytecode = {"PYTHONDONTWRITEBYTECODE": "", "PYTHONPYCACHEPREFIX": str(tmp_path)}
-    for _ in range(4):  # the first try writes the bytecode
+    for _ in range(8):  # the first try writes the bytecode
         (seconds, heavy), _ = python(IMPORTS, **bytecode)
         assert heavy == []
         if seconds < 0.3:
