@@ -42,16 +42,17 @@ def _forget(key: int, _: weakref.ref) -> None:
 
 
 def _replicas(arrays: list[jax.Array]) -> list[jax.Array]:
-    here, used = jax.local_devices(), jax.devices()
-    everywhere = NamedSharding(Mesh(np.array(used), ("device",)), PartitionSpec())
-    with jax.ensure_compile_time_eval():  # also within a user's jit, of which replicas must hold no tracers
+    """Return the arrays replicated on all devices of all processes, of which each process makes its own copies."""
+    here = jax.local_devices()
+    everywhere = NamedSharding(Mesh(np.array(jax.devices()), ("device",)), PartitionSpec())
+    with jax.ensure_compile_time_eval():  # within a user's jit too, where replicas must not be tracers
         # CPU devices use views of each other's memory without a copy. Views keep the memory alive, but not the arrays.
         sources = [np.from_dlpack(x) for x in arrays] if here[0].platform == "cpu" else arrays  # type: ignore[arg-type]
-        if here == used:
-            return jax.device_put(sources, everywhere)
         copies = zip(*(jax.device_put(sources, device) for device in here), strict=True)
-        pairs = zip(arrays, copies, strict=True)
-        return [jax.make_array_from_single_device_arrays(x.shape, everywhere, list(each)) for x, each in pairs]
+        return [
+            jax.make_array_from_single_device_arrays(x.shape, everywhere, list(of_devices))
+            for x, of_devices in zip(arrays, copies, strict=True)
+        ]
 
 
 def on_one_device(x: jax.Array, axis: int) -> tuple[jax.Array, ...]:

@@ -59,8 +59,9 @@ def _accept(host: str, port: int, address: str, own: dict, seconds: float) -> di
     except OSError as error:
         problem = ""
         with suppress(OSError, ValueError), socket.create_connection((host, port), timeout=_SLOWEST) as call:
-            _send(call, own)  # another one with the number 0 tells all of it
-            problem = json.loads(_line(call)) == _SEEN and json.loads(_line(call))
+            _send(call, own)  # another process with the number 0 notices, and tells all processes
+            if json.loads(_line(call)) == _SEEN:
+                problem = json.loads(_line(call))
         unusable = f"process 0 cannot be found at {address}: {error.strerror}"
         raise InputError(problem or f"{unusable}; stop what uses the port, or name another") from None
     with server, selectors.DefaultSelector() as selector, ExitStack() as opened:
